@@ -1,0 +1,154 @@
+"""What sensors deliver and what estimators return: the only vocabulary that `nav` and `testbed` share.
+
+The consumer defines these structures and the simulator fills the same ones. Every field is SI with radians;
+frames are those of the conventions page (`nav`). Aiding samples carry two times: ``t`` is when the measurement
+was true, ``t_arrival`` when the receiver of it could first have known (``t_arrival >= t``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+Array: TypeAlias = npt.NDArray[np.float64]
+
+
+class FixType(IntEnum):
+    """GNSS fix type, numbered as in MAVLink's GPS_FIX_TYPE."""
+
+    NO_FIX = 1
+    FIX_2D = 2
+    FIX_3D = 3
+
+
+class Status(IntFlag):
+    """What an estimator says of itself."""
+
+    ALIGNING = 1  # no attitude, velocity or position yet: every number in the estimate is NaN
+    ALIGNED = 2
+    GNSS_FUSED = 4  # a GNSS sample was fused within the last two seconds
+    DEAD_RECKONING = 8  # aligned, and no position aid is being fused
+    BAD_SAMPLE = 16  # a non-finite or out-of-range sample was refused since the last estimate
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """A block of N consecutive inertial increments.
+
+    ``t`` (N,) end of each interval [s]; ``dt`` (N,) its length [s]; ``dtheta`` (N, 3) integrated angular rate
+    of b relative to i [rad]; ``dv`` (N, 3) integrated specific force [m/s], both in rotating body axes.
+    Averages over the interval are ``dtheta/dt`` and ``dv/dt``.
+    """
+
+    t: Array
+    dt: Array
+    dtheta: Array
+    dv: Array
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True, slots=True)
+class GnssSample:
+    """One GNSS epoch at the antenna. ``sigma_position_n`` and ``sigma_velocity_n`` are the receiver's own 1-sigma.
+
+    Without a fix (``fix_type`` NO_FIX) position and velocity are NaN and the sample only says that there is none.
+    """
+
+    t: float
+    t_arrival: float
+    lat: float
+    lon: float
+    h: float
+    v_n: Array
+    sigma_position_n: Array
+    sigma_velocity_n: Array
+    fix_type: FixType
+    satellites: int
+    hdop: float
+    vdop: float
+    sensor: str = "gnss"
+
+
+@dataclass(frozen=True, slots=True)
+class BarometerSample:
+    """Static pressure [Pa]."""
+
+    t: float
+    t_arrival: float
+    pressure: float
+    sensor: str = "barometer"
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetometerSample:
+    """Magnetic flux density in body axes (3,) [T]."""
+
+    t: float
+    t_arrival: float
+    field_b: Array
+    sensor: str = "magnetometer"
+
+
+@dataclass(frozen=True, slots=True)
+class AirspeedSample:
+    """Equivalent airspeed along the pitot tube (body x) [m/s]: sqrt(2 q / rho0), rho0 = 1.225 kg/m^3."""
+
+    t: float
+    t_arrival: float
+    eas: float
+    sensor: str = "airspeed"
+
+
+Sample: TypeAlias = GnssSample | BarometerSample | MagnetometerSample | AirspeedSample
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateReport:
+    """What became of one aiding sample, one report per aid (a GNSS sample gives position and velocity).
+
+    ``t`` is the sample's time of validity; ``aid`` the measurement's name, such as ``gnss_position``; ``innovation``
+    (m,) = measurement - prediction; ``S`` (m, m) its covariance before the update; ``nis`` = innovation' S^-1
+    innovation; ``threshold`` the gate for it; ``weight`` the factor on the information of the sample (1 taken as
+    it is, 0 rejected).
+    """
+
+    t: float
+    sensor: str
+    aid: str
+    innovation: Array
+    S: Array
+    nis: float
+    threshold: float
+    weight: float
+    reason: str = ""  # why it was refused or weakened, empty when it was simply fused
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """State of an estimator at ``t``.
+
+    ``covariance`` (9, 9) is of [position error NED m, velocity error NED m/s, attitude error phi rad], in that
+    order. ``extra`` holds further states by name (wind, aid biases) as (value, sigma) pairs, each array (k,).
+    While aligning all numbers are NaN and ``status`` says so.
+    """
+
+    t: float
+    lat: float
+    lon: float
+    h: float
+    v_n: Array
+    q_nb: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+    sigma_gyro_bias: Array
+    sigma_accel_bias: Array
+    status: Status
+    extra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
