@@ -1,0 +1,25 @@
+"""The harness around `nav`: flight, sensors, the run, its record and its report."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from testbed.loop import RunResult, run
+    from testbed.scenario import Scenario
+
+__all__ = ["RunResult", "Scenario", "run"]
+
+
+def __getattr__(name: str) -> Any:
+    # The command line must answer at once: nothing heavy is imported before it is asked for. (The loop's module is not
+    # called run.py because importing such a submodule would replace the function `testbed.run` by the module.)
+    if name == "Scenario":
+        from testbed.scenario import Scenario
+
+        return Scenario
+    if name in ("run", "RunResult"):
+        import testbed.loop
+
+        return getattr(testbed.loop, name)
+    raise AttributeError(f"module 'testbed' has no attribute {name!r}")

@@ -1,0 +1,261 @@
+"""The one loop: motion, sensors, estimators, record, link. Data goes one way; nothing downstream is heard upstream."""
+
+from __future__ import annotations
+
+import heapq
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
+from testbed import estimators, metrics, sensors
+from testbed.pacer import Pacer
+from testbed.record import Recorder
+from testbed.scenario import FlightTruth, Scenario
+from testbed.truth import MotionSource, TruthBlock
+
+if TYPE_CHECKING:
+    import xarray
+
+BATCH_S = 1.0  # simulated time per turn of the loop when nobody is watching
+BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a run stands: simulated time and duration [s], simulated over wall time, what is going on."""
+
+    t: float
+    duration: float
+    realtime_factor: float
+    activity: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What `run` gives back: the recorded dataset, its metrics, and the folder written (None when in memory)."""
+
+    dataset: xarray.DataTree
+    metrics: dict[str, float]
+    path: Path | None
+
+
+class Publisher(Protocol):
+    """Whoever watches a run: handed plain data every ``period_s`` of simulated time, never asked anything."""
+
+    period_s: float
+
+    def publish(
+        self,
+        truth: TruthBlock,
+        estimate: Estimate,
+        samples: Mapping[str, Sample],
+        imu: ImuSamples | None,
+        others: Sequence[tuple[str, Estimate]],
+    ) -> None:
+        """One row of truth, the first estimator's estimate, the newest sample of each sensor, the other estimates."""
+        ...
+
+    def event(self, t: float, severity: str, text: str) -> None:
+        """Something happened at ``t``; severity is info, warning or error."""
+        ...
+
+    def close(self) -> None:
+        """The run is over."""
+        ...
+
+
+def motion(scenario: Scenario, seed: int) -> MotionSource:
+    """The motion source that the scenario asks for, at its first tick."""
+    if isinstance(scenario.truth, FlightTruth):
+        from testbed.flight import Flight
+
+        return Flight(scenario.truth, scenario.plan, seed)
+    from testbed.kinematic import Kinematic
+
+    return Kinematic(scenario.truth.start, scenario.truth.rate_hz)
+
+
+@dataclass(slots=True)
+class _EventWatch:
+    """Turns changes in samples, reports, estimates and legs into events."""
+
+    emit: Callable[[float, str, str], None]
+    fix: dict[str, bool] = field(default_factory=dict)
+    aligned: dict[str, bool] = field(default_factory=dict)
+    refused: dict[tuple[str, str], float] = field(default_factory=dict)
+    leg: float = -2.0
+
+    @property
+    def denied(self) -> bool:
+        """Whether some GNSS receiver that had a fix has none now."""
+        return not all(self.fix.values())
+
+    def sample(self, sample: Sample) -> None:
+        if not isinstance(sample, GnssSample):
+            return
+        has_fix = sample.fix_type != FixType.NO_FIX
+        before = self.fix.get(sample.sensor)
+        if before is not None and before != has_fix:
+            severity, what = ("info", "reacquired") if has_fix else ("warning", "denied")
+            self.emit(sample.t, severity, f"{sample.sensor} {what}")
+        self.fix[sample.sensor] = has_fix
+
+    def report(self, estimator: str, report: UpdateReport) -> None:
+        if not report.reason or report.weight > 0.0:
+            return
+        key = (estimator, report.aid)
+        if report.t - self.refused.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
+            self.emit(report.t, "warning", f"{estimator}: {report.aid} refused, {report.reason}")
+            self.refused[key] = report.t
+
+    def estimate(self, estimator: str, estimate: Estimate) -> None:
+        aligned = Status.ALIGNED in estimate.status
+        if aligned and not self.aligned.get(estimator, False):
+            self.emit(estimate.t, "info", f"{estimator} aligned")
+        self.aligned[estimator] = aligned
+
+    def row(self, t: float, leg: float, plan: Sequence[str]) -> None:
+        if leg != self.leg and 0 <= leg < len(plan):
+            self.emit(t, "info", f"leg {int(leg) + 1}/{len(plan)} {plan[int(leg)]}")
+        self.leg = leg
+
+
+class _Latest:
+    """The newest sample of each sensor that has arrived by a time, however far ahead the sensors were computed."""
+
+    def __init__(self) -> None:
+        self.by_sensor: dict[str, Sample] = {}
+        self._pending: list[tuple[float, int, Sample]] = []
+        self._count = 0
+
+    def add(self, samples: Sequence[Sample]) -> None:
+        for sample in samples:
+            heapq.heappush(self._pending, (sample.t_arrival, self._count, sample))
+            self._count += 1
+
+    def until(self, t: float) -> list[Sample]:
+        """Samples that arrive up to ``t``, in order of arrival."""
+        arrived = []
+        while self._pending and self._pending[0][0] <= t:
+            sample = heapq.heappop(self._pending)[2]
+            self.by_sensor[sample.sensor] = sample
+            arrived.append(sample)
+        return arrived
+
+
+def run(
+    scenario: Scenario,
+    *,
+    seed: int | None = None,
+    out: Path | None = None,
+    links: Sequence[Publisher] = (),
+    realtime: float | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    source: MotionSource | None = None,
+) -> RunResult:
+    """Fly, sense, estimate and record one scenario.
+
+    ``seed`` replaces the scenario's own. With ``out`` the record goes to ``out/run.nc`` as it is made, and
+    metrics.json beside it; without, everything stays in memory. ``links`` watch; ``realtime`` paces the run (1 = wall
+    clock).
+    ``source`` replaces the motion, to share one flown truth between runs. Same scenario and seed, same bits.
+    Raises UserError when the folder can't be written or the motion can't be started.
+    """
+    seed = scenario.seed if seed is None else seed
+    started = time.perf_counter()
+    source = motion(scenario, seed) if source is None else source
+    rate_hz = source.rate_hz
+    site = scenario.site()
+    inertial = {}
+    aiding = {}
+    for name, config in scenario.sensors.items():
+        sensor = sensors.build(name, config, rate_hz, seed, site)
+        (inertial if isinstance(sensor, sensors.Imu) else aiding)[name] = sensor
+    filters = estimators.build(scenario)
+    plan = [leg.leg for leg in scenario.plan]
+
+    ticks = round(scenario.duration_s * rate_hz) + 1
+    record_every = round(rate_hz / scenario.record.rate_hz)
+    publish_every = round(min(link.period_s for link in links) * rate_hz) if links else 0
+    chunk = publish_every if realtime and links else round(BATCH_S * rate_hz)
+    pacer = Pacer(realtime) if realtime else None
+    recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
+
+    def emit(t: float, severity: str, text: str) -> None:
+        recorder.event(t, severity, text)
+        for link in links:
+            link.event(t, severity, text)
+
+    watch = _EventWatch(emit)
+    latest = _Latest()
+    truth_s = 0.0
+    try:
+        tick = 0
+        while tick < ticks:
+            before = time.perf_counter()
+            block = source.advance(min(chunk, ticks - tick))
+            truth_s += time.perf_counter() - before
+            if not len(block):
+                break
+            imu = {name: sensor.sense(block) for name, sensor in inertial.items()}
+            samples = {name: sensor.sense(block) for name, sensor in aiding.items()}
+            for own in samples.values():
+                latest.add(own)
+            outputs = [
+                k
+                for k in range(len(block))
+                if (tick + k) % record_every == 0 or (publish_every and (tick + k) % publish_every == 0)
+            ]
+            times = [float(block.t[k]) for k in outputs]
+            estimates: dict[str, list[Estimate]] = {}
+            for name, one in filters.items():
+                reports, estimates[name] = one.horizon.push(
+                    imu[one.imu], [s for aid in one.sensors for s in samples[aid]], times
+                )
+                recorder.reports(name, reports)
+                for report in reports:
+                    watch.report(name, report)
+            recorder.truth(block)
+            for name, increments in imu.items():
+                recorder.imu(name, increments)
+            for name, own in samples.items():
+                recorder.samples(name, own)
+            for i, k in enumerate(outputs):
+                for sample in latest.until(times[i]):
+                    watch.sample(sample)
+                watch.row(times[i], block.leg[k], plan)
+                now = [(name, values[i]) for name, values in estimates.items()]
+                for name, estimate in now:
+                    watch.estimate(name, estimate)
+                    if (tick + k) % record_every == 0:
+                        recorder.estimate(name, estimate)
+                if publish_every and (tick + k) % publish_every == 0 and now:
+                    increments = next(iter(imu.values()), None)
+                    for link in links:
+                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, increments, now[1:])
+            tick += len(block)
+            t = float(block.t[-1])
+            if pacer is not None:
+                pacer.wait(t)
+            if progress is not None:
+                activity = "GNSS denied" if watch.denied else source.activity()
+                factor = t / max(time.perf_counter() - started, 1e-9)
+                progress(Progress(t, scenario.duration_s, factor, activity))
+    finally:
+        recorder.close()
+        for link in links:
+            link.close()
+    dataset = recorder.dataset()
+    wall_s = time.perf_counter() - started
+    results = metrics.compute(dataset)
+    results |= {
+        "run.wall_s": wall_s,
+        "run.truth_s": truth_s,
+        "run.realtime_factor": (tick - 1) / rate_hz / wall_s,
+    }
+    if out is not None:
+        metrics.save(results, out / "metrics.json")
+    return RunResult(dataset, results, out)
