@@ -1,0 +1,193 @@
+"""Rotations as quaternions, direction cosine matrices, rotation vectors and Euler angles.
+
+A quaternion ``q_ab`` (scalar first, unit) and a matrix ``C_ab`` take components in b to components in a:
+``x_a = C_ab @ x_b``; they compose as ``C_ac = C_ab @ C_bc``, ``q_ac = q_ab * q_bc``. ``q`` and ``-q`` are the same
+rotation. Every function takes one rotation, allocates its result, and can be called from a kernel.
+
+Source of the formulae: Titterton and Weston, Strapdown Inertial Navigation Technology, 2nd ed., section 3.6;
+the Jacobian of the rotation vector: Barfoot, State Estimation for Robotics, section 7.1.5.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nav._jit import njit
+from nav.samples import Array
+
+# Below this squared angle the power series replace sin and cos: six terms are exact to rounding there, and faster.
+SMALL_ANGLE_SQUARED = 0.04
+
+
+@njit
+def rotation_coefficients(angle_squared: float) -> tuple[float, float, float]:
+    """sin(x)/x, (1 - cos x)/x^2 and (x - sin x)/x^3 at x = sqrt(``angle_squared``)."""
+    s = angle_squared
+    if s < SMALL_ANGLE_SQUARED:
+        return (
+            1 + s * (-1 / 6 + s * (1 / 120 + s * (-1 / 5040 + s * (1 / 362880 - s / 39916800)))),
+            1 / 2 + s * (-1 / 24 + s * (1 / 720 + s * (-1 / 40320 + s * (1 / 3628800 - s / 479001600)))),
+            1 / 6 + s * (-1 / 120 + s * (1 / 5040 + s * (-1 / 362880 + s * (1 / 39916800 - s / 6227020800)))),
+        )
+    x = math.sqrt(s)
+    sine, sine_of_half = math.sin(x), math.sin(0.5 * x)
+    return sine / x, 2 * sine_of_half * sine_of_half / s, (x - sine) / (s * x)
+
+
+@njit
+def skew(v: Array) -> Array:
+    """Matrix [v x] (3, 3) with ``skew(v) @ u = v x u``."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@njit
+def quat_multiply(p: Array, q: Array) -> Array:
+    """Product (4,) of two quaternions: the rotation q first, then p."""
+    return np.array(
+        [
+            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+        ]
+    )
+
+
+@njit
+def quat_conjugate(q: Array) -> Array:
+    """The inverse rotation (4,): ``q_ba`` from ``q_ab``."""
+    return np.array([q[0], -q[1], -q[2], -q[3]])
+
+
+@njit
+def quat_normalise(q: Array) -> Array:
+    """``q`` (4,) scaled to unit norm."""
+    return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+
+
+@njit
+def quat_from_rotvec(phi: Array) -> Array:
+    """Quaternion (4,) of the rotation by |phi| [rad] about phi: exp(phi / 2)."""
+    quarter = 0.25 * (phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+    sinc, versine, _ = rotation_coefficients(quarter)
+    return np.array([1 - quarter * versine, 0.5 * sinc * phi[0], 0.5 * sinc * phi[1], 0.5 * sinc * phi[2]])
+
+
+@njit
+def rotvec_from_quat(q: Array) -> Array:
+    """Rotation vector (3,) [rad] of a unit quaternion, the shorter way round: |phi| <= pi."""
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    if sine == 0.0:
+        return np.zeros(3)
+    scale = 2 * math.atan2(sine, q[0]) / sine if q[0] >= 0 else -2 * math.atan2(sine, -q[0]) / sine
+    return scale * q[1:4]
+
+
+@njit
+def dcm_from_quat(q: Array) -> Array:
+    """Direction cosine matrix (3, 3) of a unit quaternion."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@njit
+def quat_from_dcm(C: Array) -> Array:
+    """Unit quaternion (4,) of a direction cosine matrix, scalar part not negative.
+
+    Divides by the largest component, so it keeps full accuracy at every rotation, half turns included.
+    """
+    trace = C[0, 0] + C[1, 1] + C[2, 2]
+    q = np.empty(4)
+    i = int(np.argmax(np.array([trace, C[0, 0], C[1, 1], C[2, 2]])))
+    if i == 0:
+        q[0] = 1 + trace
+        q[1] = C[2, 1] - C[1, 2]
+        q[2] = C[0, 2] - C[2, 0]
+        q[3] = C[1, 0] - C[0, 1]
+    else:
+        a, b, c = i - 1, i % 3, (i + 1) % 3
+        q[0] = C[c, b] - C[b, c]
+        q[1 + a] = 1 + 2 * C[a, a] - trace
+        q[1 + b] = C[a, b] + C[b, a]
+        q[1 + c] = C[a, c] + C[c, a]
+    if q[0] < 0:
+        q = -q
+    return quat_normalise(q)
+
+
+@njit
+def quat_from_euler(roll: float, pitch: float, heading: float) -> Array:
+    """``q_nb`` (4,) from Euler angles [rad], turning by heading about z, then pitch about y, then roll about x."""
+    sr, cr = math.sin(0.5 * roll), math.cos(0.5 * roll)
+    sp, cp = math.sin(0.5 * pitch), math.cos(0.5 * pitch)
+    sh, ch = math.sin(0.5 * heading), math.cos(0.5 * heading)
+    return np.array(
+        [
+            ch * cp * cr + sh * sp * sr,
+            ch * cp * sr - sh * sp * cr,
+            ch * sp * cr + sh * cp * sr,
+            sh * cp * cr - ch * sp * sr,
+        ]
+    )
+
+
+@njit
+def euler_from_quat(q: Array) -> Array:
+    """[roll, pitch, heading] (3,) [rad] of a unit ``q_nb``: roll, heading in [-pi, pi], pitch in [-pi/2, pi/2].
+
+    At pitch +-90 deg only the sum or difference of heading and roll is defined; near there both are ill-conditioned.
+    """
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    sin_pitch = min(1.0, max(-1.0, 2 * (w * y - x * z)))
+    return np.array(
+        [
+            math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+            math.asin(sin_pitch),
+            math.atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+
+
+@njit
+def quat_rotate(q: Array, v: Array) -> Array:
+    """``C(q) @ v`` (3,) for a unit quaternion."""
+    tx = 2 * (q[2] * v[2] - q[3] * v[1])
+    ty = 2 * (q[3] * v[0] - q[1] * v[2])
+    tz = 2 * (q[1] * v[1] - q[2] * v[0])
+    return np.array(
+        [
+            v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
+            v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
+            v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
+        ]
+    )
+
+
+@njit
+def left_jacobian(phi: Array) -> Array:
+    """J (3, 3), the mean over the turn of the rotation: ``integral of exp(s [phi x]) ds`` for s from 0 to 1.
+
+    A vector f that is constant in axes turning by ``phi`` has the mean ``J @ f`` in the axes where the turn began.
+    """
+    _, b, c = rotation_coefficients(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+    X = skew(phi)
+    return np.eye(3) + b * X + c * (X @ X)
+
+
+@njit
+def left_jacobian_inverse(phi: Array) -> Array:
+    """Inverse (3, 3) of `left_jacobian`: ``I - [phi x]/2 + k [phi x]^2``, for |phi| < 2 pi."""
+    s = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    a, b, _ = rotation_coefficients(s)
+    # The rounding error of k grows as 1/s, but k multiplies terms of order s.
+    k = (1 - 0.5 * a / b) / s if s > 1e-8 else 1 / 12
+    X = skew(phi)
+    return np.eye(3) - 0.5 * X + k * (X @ X)
