@@ -131,6 +131,15 @@ def dcm_en(lat: float, lon: float) -> Array:
 
 
 @njit
+def quat_en(lat: float, lon: float) -> Array:
+    """q_en (4,): the same rotation as `dcm_en`, continuous in longitude up to its sign."""
+    half_turn = -0.5 * (0.5 * math.pi + lat)
+    sin_turn, cos_turn = math.sin(half_turn), math.cos(half_turn)
+    sin_lon, cos_lon = math.sin(0.5 * lon), math.cos(0.5 * lon)
+    return np.array([cos_lon * cos_turn, -sin_lon * sin_turn, cos_lon * sin_turn, sin_lon * cos_turn])
+
+
+@njit
 def position_difference_n(lat: Scalar, lon: Scalar, h: Scalar, lat0: Scalar, lon0: Scalar, h0: Scalar) -> Array:
     """Position minus reference position in metres north-east-down, (3,), or (N, 3) when ``lat`` is an array.
 

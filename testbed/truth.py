@@ -5,11 +5,15 @@ A motion source (`testbed.flight`, `testbed.kinematic`) fills blocks of rows; se
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Protocol
 
 import numpy as np
 
+from nav._jit import njit
+from nav.earth import OMEGA_IE, ecef_from_geodetic, gravity, quat_en
+from nav.rotation import left_jacobian_solve, quat_conjugate, quat_multiply, quat_rotate, rotvec_from_quat
 from nav.samples import Array
 
 
@@ -101,9 +105,52 @@ class MotionSource(Protocol):
     rate_hz: float
 
     def advance(self, ticks: int) -> TruthBlock:
-        """The next ``ticks`` rows, fewer when the motion ends, none when it has ended. The first call starts at tick 0."""
+        """The next ``ticks`` rows, fewer when the motion ends, none when it has ended; the first call starts at tick 0."""
         ...
 
     def activity(self) -> str:
         """What is going on, in a few words: ``loiter 3/12 turns``."""
         ...
+
+
+@njit
+def _inertial(lat: float, lon: float, h: float, v_n: Array, q_nb: Array) -> tuple[Array, Array, Array]:
+    """Attitude q_eb, inertial velocity [m/s] and gravitation [m/s^2] of one row, both vectors in e axes."""
+    q_en = quat_en(lat, lon)
+    r_e = ecef_from_geodetic(lat, lon, h)
+    v_e = quat_rotate(q_en, v_n)
+    # Gravity is gravitation less the centripetal acceleration of the turning Earth.
+    gravitation = quat_rotate(q_en, np.array([0.0, 0.0, gravity(lat, h)]))
+    for axis in range(2):
+        gravitation[axis] -= OMEGA_IE**2 * r_e[axis]
+    v_i = np.array([v_e[0] - OMEGA_IE * r_e[1], v_e[1] + OMEGA_IE * r_e[0], v_e[2]])
+    return quat_multiply(q_en, q_nb), v_i, gravitation
+
+
+@njit
+def increments(t: Array, lat: Array, lon: Array, h: Array, v_n: Array, q_nb: Array) -> tuple[Array, Array]:
+    """Exact IMU increments ``(dtheta, dv)``, each (N, 3), of motion given at N rows; row 0 is zero.
+
+    Row k covers the interval from row k - 1: to join blocks, put the last row of the previous block first and drop
+    row 0 of the result. Formed in inertial axes, without any navigation equation:
+
+    dtheta = log(C_ib(k-1)^T C_ib(k))                                                           [rad]
+    dv = J(dtheta)^-1 C_bi(k-1) (v_i(k) - v_i(k-1) - integral of gravitation)                     [m/s]
+
+    with J the left Jacobian, so that they are the integrals of rate and specific force over the interval in turning
+    body axes when both are constant in those axes between rows. The inertial axes are those of e at row k - 1, so
+    nothing grows with time. The trapezoid of gravitation is good to 1e-10 m/s^2 at 200 Hz.
+    """
+    dtheta, dv = np.zeros(v_n.shape), np.zeros(v_n.shape)
+    q, v, gravitation = _inertial(lat[0], lon[0], h[0], v_n[0], q_nb[0])
+    for k in range(1, len(t)):
+        dt = t[k] - t[k - 1]
+        q_next, v_next, gravitation_next = _inertial(lat[k], lon[k], h[k], v_n[k], q_nb[k])
+        earth_turn = np.array([math.cos(0.5 * OMEGA_IE * dt), 0.0, 0.0, math.sin(0.5 * OMEGA_IE * dt)])
+        q_bi = quat_conjugate(q)
+        dtheta[k] = rotvec_from_quat(quat_multiply(q_bi, quat_multiply(earth_turn, q_next)))
+        arrived = quat_rotate(earth_turn, v_next - 0.5 * dt * gravitation_next)
+        left = v + 0.5 * dt * gravitation
+        dv[k] = left_jacobian_solve(dtheta[k], quat_rotate(q_bi, arrived - left))
+        q, v, gravitation = q_next, v_next, gravitation_next
+    return dtheta, dv
