@@ -1,0 +1,550 @@
+"""The scenario file: what to fly, sense, estimate and expect. Whatever can be found wrong with it is found here.
+
+A scenario is one TOML file. Sensors and plan legs declare their own keys beside their code (`testbed.sensors`,
+`testbed.guidance`); the sections that belong to nobody else are here. `Scenario.load` reports every mistake of a file at
+once, each with its line and key path.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import difflib
+import json
+import re
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
+
+from pydantic import Field, PlainValidator, PrivateAttr, ValidationError, model_validator
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+
+from testbed import guidance, keypath
+from testbed.data import data_dir
+from testbed.errors import UserError
+from testbed.keypath import KeyPath
+from testbed.schema import Section
+from testbed.sensors import CONFIGS
+
+LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
+LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a slip of the keyboard beyond that
+LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
+ERRORS_SHOWN = 20
+
+Latitude: TypeAlias = Annotated[float, Field(gt=-LATITUDE_LIMIT_DEG, lt=LATITUDE_LIMIT_DEG)]
+Longitude: TypeAlias = Annotated[float, Field(ge=-180, le=180)]
+Altitude: TypeAlias = Annotated[float, Field(ge=-500, le=10_000)]
+Heading: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
+WindSpeed: TypeAlias = Annotated[float, Field(ge=0, le=50)]
+TickRate: TypeAlias = Annotated[float, Field(ge=50, le=1000)]
+
+# What each kind of estimator can be aided by.
+AIDS: Mapping[str, frozenset[str]] = {"ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"})}
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
+_RESERVED = frozenset({"run", "truth"})  # `run.wall_s` and the like would become ambiguous
+
+
+class Start(Section):
+    """Where and how a flight starts: trimmed, straight and level."""
+
+    lat_deg: Latitude
+    lon_deg: Longitude
+    alt_m: Altitude
+    heading_deg: Heading
+    airspeed_mps: float = Field(gt=0, le=100)
+
+
+class Wind(Section):
+    """Wind over ground: one vector, or a profile of rows [alt_m, from_deg, speed_mps]; and turbulence on top."""
+
+    from_deg: Heading = 0.0
+    speed_mps: WindSpeed = 0.0
+    turbulence: Literal["none", "light", "moderate", "severe"] = "none"
+    profile: list[tuple[Altitude, Heading, WindSpeed]] = []
+
+    @model_validator(mode="after")
+    def _one_wind(self) -> Self:
+        if self.profile and self.model_fields_set & {"from_deg", "speed_mps"}:
+            raise ValueError("a profile replaces from_deg and speed_mps: give one or the other")
+        heights = [row[0] for row in self.profile]
+        if any(upper <= lower for lower, upper in zip(heights, heights[1:], strict=False)):
+            raise ValueError("the rows of profile must climb: sort them by alt_m, each altitude once")
+        return self
+
+
+class FlightTruth(Section):
+    """Motion from JSBSim: an aircraft flies the scenario's plan."""
+
+    source: Literal["flight"]
+    aircraft: str = "loiter"
+    rate_hz: TickRate = 200.0
+    start: Start
+    wind: Wind = Wind()
+
+
+class Rest(Section):
+    """Where and how a body at rest stands."""
+
+    lat_deg: Latitude
+    lon_deg: Longitude
+    alt_m: Altitude
+    heading_deg: Heading = 0.0
+    pitch_deg: float = Field(0.0, ge=-90, le=90)
+    roll_deg: float = Field(0.0, ge=-180, le=180)
+
+
+class KinematicTruth(Section):
+    """Motion from a formula: a body at rest on the turning Earth."""
+
+    source: Literal["kinematic"]
+    motion: Literal["static"] = "static"
+    rate_hz: TickRate = 200.0
+    start: Rest
+
+
+def _sensor(table: object) -> Section:
+    """One ``[sensors.<name>]`` table, by the kind that it says or that its name says."""
+    if not isinstance(table, dict):
+        raise PydanticCustomError("dict_type", "Input should be a table")
+    kind = table.get("kind")
+    if not isinstance(kind, str) or kind not in CONFIGS:
+        raise PydanticCustomError("sensor_kind", "unknown sensor kind")
+    return CONFIGS[kind].model_validate_json(json.dumps(table), strict=True)
+
+
+class EstimatorConfig(Section):
+    """One ``[[estimator]]``: which IMU it integrates and which sensors aid it."""
+
+    name: str
+    kind: Literal["ins"] = "ins"
+    imu: str = "imu"
+    aids: list[str]
+
+
+class AutopilotConfig(Section):
+    """What the autopilot flies on."""
+
+    feedback: Literal["truth"] = "truth"
+
+
+class RecordConfig(Section):
+    """What goes into the run file: rate of truth and estimates, and whether every IMU sample is kept."""
+
+    rate_hz: float = Field(10.0, gt=0)
+    imu: bool = True
+
+
+class Bounds(Section):
+    """What a metric may be, both ends included. In the file a plain number is a maximum."""
+
+    min: float | None = None
+    max: float | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _maximum(cls, value: Any) -> Any:
+        return value if isinstance(value, dict) else {"max": value}
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min is None and self.max is None:
+            raise ValueError("give a maximum, or a table with min, max or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is above max {self.max:g}")
+        return self
+
+    def hold(self, value: float) -> bool:
+        """Whether ``value`` lies inside; NaN never does."""
+        return (self.min is None or value >= self.min) and (self.max is None or value <= self.max) and value == value
+
+    def __str__(self) -> str:
+        if self.min is None:
+            return f"≤ {self.max:g}"
+        return f"≥ {self.min:g}" if self.max is None else f"{self.min:g} … {self.max:g}"
+
+
+class Scenario(Section):
+    """One run, described. Made by `Scenario.load`; a changed one comes from loading with overrides."""
+
+    title: str = Field(min_length=1)
+    description: str = ""
+    seed: int = Field(0, ge=0, lt=2**63)
+    duration_s: float = Field(gt=0, le=LONGEST_RUN_S)
+    date: dt.date = dt.date(2026, 1, 1)
+    truth: FlightTruth | KinematicTruth = Field(discriminator="source")
+    plan: list[guidance.Leg] = []
+    sensors: dict[str, Annotated[Section, PlainValidator(_sensor)]] = {}
+    estimator: list[EstimatorConfig] = []
+    autopilot: AutopilotConfig = AutopilotConfig()
+    record: RecordConfig = RecordConfig()
+    expect: dict[str, Bounds] = {}
+
+    _text: str = PrivateAttr("")
+    _path: Path | None = PrivateAttr(None)
+    _overrides: tuple[str, ...] = PrivateAttr(())
+
+    @property
+    def text(self) -> str:
+        """The file's text as written, before overrides."""
+        return self._text
+
+    @property
+    def path(self) -> Path | None:
+        """The file it came from, None when it did not come from one."""
+        return self._path
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """The ``key=value`` overrides applied to the text, in order: text and overrides make the scenario again."""
+        return self._overrides
+
+    @classmethod
+    def load(cls, path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+        """Read a scenario file, or a shipped scenario by name, and check all of it.
+
+        ``overrides`` are ``key=value`` strings as `testbed.keypath.assign` takes them. Raises UserError with every
+        mistake found: file, line, key path and what to do.
+        """
+        path = _find(path_or_name)
+        return cls.parse(_read(path), overrides, path)
+
+    @classmethod
+    def parse(cls, text: str, overrides: Sequence[str] = (), path: Path | None = None) -> Scenario:
+        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does."""
+        place = str(path) if path else "scenario"
+        data = _toml(text, place)
+        if not data:
+            raise UserError(f"{place}: is empty: begin with a copy of {data_dir('scenarios') / 'u_turn.toml'}")
+        set_paths = {keypath.assign(data, override): override for override in overrides}
+        sensors = data.get("sensors")
+        for name, table in sensors.items() if isinstance(sensors, dict) else ():
+            if isinstance(table, dict):
+                table.setdefault("kind", name)
+        try:
+            # By way of JSON because pydantic's strict mode then still takes a list for a tuple, and refuses "5" for 5.
+            scenario = cls.model_validate_json(json.dumps(data, default=str), strict=True)
+        except ValidationError as error:
+            raise UserError(_report(error, data, text, place, set_paths)) from None
+        except RecursionError:
+            raise UserError(f"{place}: tables or lists are nested too deeply") from None
+        scenario._text, scenario._path, scenario._overrides = text, path, tuple(overrides)
+        return scenario
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        found = [
+            InitErrorDetails(type=PydanticCustomError("scenario", "{text}", {"text": text}), loc=path, input=None)
+            for path, text in _inconsistencies(self)
+        ]
+        if found:
+            raise ValidationError.from_exception_data("Scenario", found)
+        return self
+
+
+def shipped() -> dict[str, Path]:
+    """The shipped scenarios by name."""
+    return {path.stem: path for path in sorted(data_dir("scenarios").glob("*.toml"))}
+
+
+# --- reading
+
+
+def _find(path_or_name: str | Path) -> Path:
+    """The file meant by a path or by the name of a shipped scenario."""
+    named = str(path_or_name)
+    known = shipped()
+    if named in known:
+        return known[named]
+    path = Path(path_or_name)
+    try:
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder: give a scenario file in it")
+        if path.exists():
+            return path
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise UserError(f"{named!r}: {error}") from None
+    if path.suffix or path.parent != Path():
+        raise UserError(f"{path}: no such file")
+    near = difflib.get_close_matches(named, known, n=3)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"shipped are {', '.join(known)}"
+    raise UserError(f"{named}: no such file and no shipped scenario of that name: {hint}")
+
+
+def _read(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            raw = file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror}") from None
+    if len(raw) > LARGEST_FILE:
+        raise UserError(f"{path}: is larger than {LARGEST_FILE // 1000} kB: is this a scenario file?")
+    try:
+        return raw.decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        line = raw[: error.start].count(b"\n") + 1
+        raise UserError(f"{path}:{line}: is not UTF-8 text: save the file as UTF-8") from None
+
+
+def _toml(text: str, place: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        what, _, position = str(error).rpartition(" (at ")
+        line = re.match(r"line (\d+)", position)
+        at = line.group(1) if line else str(text.count("\n") + 1)
+        raise UserError(f"{place}:{at}: is not valid TOML: {what}") from None
+    except RecursionError:
+        raise UserError(f"{place}: tables or lists are nested too deeply") from None
+    except ValueError as error:  # an integer of thousands of digits
+        raise UserError(f"{place}: is not valid TOML: {error}") from None
+
+
+# --- what one key can't know
+
+
+def _inconsistencies(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    """What is wrong between keys that are each right."""
+    tick_hz = scenario.truth.rate_hz
+    yield from _divides(("record", "rate_hz"), scenario.record.rate_hz, tick_hz)
+    for name, config in scenario.sensors.items():
+        yield from _sensor_faults(("sensors", name), config, tick_hz, scenario.duration_s)
+    yield from _plan_faults(scenario)
+    taken: set[str] = set()
+    for index, estimator in enumerate(scenario.estimator):
+        yield from _estimator_faults(("estimator", index), estimator, scenario.sensors, taken)
+        taken.add(estimator.name)
+    for key in scenario.expect:
+        yield from _expect_faults(key, taken)
+
+
+def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    if not isinstance(scenario.truth, FlightTruth):
+        if scenario.plan:
+            yield ("plan",), f"a body of source {scenario.truth.source!r} flies no plan: leave it out"
+        return
+    if not scenario.plan:
+        yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
+        return
+    aircraft = sorted(file.name for file in data_dir("aircraft").iterdir() if file.is_dir())
+    if scenario.truth.aircraft not in aircraft:
+        yield ("truth", "aircraft"), _unknown("aircraft", scenario.truth.aircraft, aircraft)
+    try:
+        guidance.check_plan(scenario.plan)
+    except ValueError as error:
+        yield ("plan",), str(error)
+
+
+def _sensor_faults(path: KeyPath, config: Section, tick_hz: float, duration_s: float) -> Iterator[tuple[KeyPath, str]]:
+    name = str(path[-1])
+    if not _IDENTIFIER.fullmatch(name):
+        yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
+    rate_hz = getattr(config, "rate_hz", None)
+    if rate_hz is not None:
+        yield from _divides((*path, "rate_hz"), rate_hz, tick_hz)
+    offset_s = getattr(config, "offset_s", 0.0)
+    if not _whole(offset_s * tick_hz):
+        nearest = round(offset_s * tick_hz) / tick_hz
+        yield (*path, "offset_s"), f"is not a multiple of the tick {1 / tick_hz:g} s: the nearest is {nearest:g}"
+    yield from _window_faults((*path, "denied"), getattr(config, "denied", ()), duration_s)
+
+
+def _window_faults(
+    path: KeyPath, windows: Iterable[tuple[float, float]], duration_s: float
+) -> Iterator[tuple[KeyPath, str]]:
+    last_end = -1.0
+    for index, (start, end) in enumerate(windows):
+        shown = f"window [{start:g}, {end:g}]"
+        if start < 0:
+            yield (*path, index), f"{shown} starts before the run"
+        elif end <= start:
+            yield (*path, index), f"{shown} is reversed or empty: give its start, then its end"
+        elif start >= duration_s:
+            yield (*path, index), f"{shown} starts after the end of the run: duration_s is {duration_s:g}"
+        elif start <= last_end:
+            yield (*path, index), f"{shown} overlaps the one before it or comes out of order: sort and merge them"
+        last_end = max(last_end, end)
+
+
+def _estimator_faults(
+    path: KeyPath, config: EstimatorConfig, sensors: Mapping[str, Section], taken: set[str]
+) -> Iterator[tuple[KeyPath, str]]:
+    if not _IDENTIFIER.fullmatch(config.name):
+        yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
+    elif config.name in taken:
+        yield (*path, "name"), f"{config.name!r} is taken by an estimator above: give each its own name"
+    elif config.name in _RESERVED:
+        yield (*path, "name"), f"{config.name!r} is reserved: choose another name"
+    kinds = {name: _kind(sensor) for name, sensor in sensors.items()}
+    imus = [name for name, kind in kinds.items() if kind == "imu"]
+    if config.imu not in imus:
+        yield (*path, "imu"), _unknown("IMU", config.imu, imus)
+    usable = [name for name, kind in kinds.items() if kind in AIDS[config.kind]]
+    for index, aid in enumerate(config.aids):
+        if aid in sensors and aid not in usable:
+            yield (*path, "aids", index), f"{aid!r} is of kind {kinds[aid]!r}, which does not aid {config.kind!r}"
+        elif aid not in sensors:
+            yield (*path, "aids", index), _unknown("sensor", aid, usable)
+        elif aid in config.aids[:index]:
+            yield (*path, "aids", index), f"{aid!r} is listed twice"
+
+
+def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
+    match = _EXPECT_KEY.fullmatch(key)
+    if not match:
+        yield (
+            ("expect", key),
+            'is no metric: write it quoted as "<estimator>.<quantity>_<statistic>_<unit>", such as'
+            ' "ins.position_horizontal_rms_m" = 5.0',
+        )
+    elif match["whose"] not in estimators | {"run"}:
+        yield ("expect", key), _unknown("estimator", match["whose"], sorted(estimators | {"run"}))
+
+
+def _kind(config: Section) -> str:
+    return next(kind for kind, section in CONFIGS.items() if type(config) is section)
+
+
+def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:
+    if rate_hz > tick_hz:
+        yield path, f"{rate_hz:g} Hz is faster than the tick rate of {tick_hz:g} Hz (truth.rate_hz)"
+    elif not _whole(tick_hz / rate_hz):
+        ticks = int(tick_hz / rate_hz)
+        slower, faster = tick_hz / (ticks + 1), tick_hz / ticks
+        near = " or ".join(f"{rate!r}" for rate in (slower, faster))
+        yield path, f"{rate_hz:g} Hz does not divide the tick rate of {tick_hz:g} Hz (truth.rate_hz): try {near}"
+
+
+def _whole(value: float) -> bool:
+    return abs(value - round(value)) <= 1e-9 * max(1.0, abs(value))
+
+
+def _unknown(what: str, given: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(given, known, n=1)
+    hint = f"did you mean {near[0]}? " if near else ""
+    return f"there is no {what} {given!r}: {hint}There is {', '.join(known) if known else 'none'}"
+
+
+# --- saying what is wrong
+
+
+def _report(
+    error: ValidationError, data: dict[str, Any], text: str, place: str, set_paths: Mapping[KeyPath, str]
+) -> str:
+    """Every error on a line of its own: file, line, key path, what is wrong and what to do."""
+    said: dict[KeyPath, list[str]] = {}
+    for details in error.errors(include_url=False):
+        path, models = _locate(details, data)
+        said.setdefault(path, []).append(_say(details, path, models))
+    lines = keypath.line_numbers(text)
+    messages = []
+    for path, texts in said.items():
+        above = [path[:length] for length in range(len(path), -1, -1)]
+        override = next((set_paths[p] for p in above if p in set_paths), None)
+        line = next((lines[p] for p in above if p in lines), None)
+        at = f" (--set {override})" if override else f":{line}" if line else ""
+        key = f" {keypath.written(path)}:" if path else ""
+        messages.append((line or 0, f"{place}{at}:{key} {', or '.join(dict.fromkeys(texts))}"))
+    messages.sort(key=lambda message: message[0])
+    shown = [message for _, message in messages[:ERRORS_SHOWN]]
+    if len(messages) > ERRORS_SHOWN:
+        shown.append(f"{place}: and {len(messages) - ERRORS_SHOWN} more")
+    return "\n".join(shown)
+
+
+def _locate(details: ErrorDetails, data: dict[str, Any]) -> tuple[KeyPath, list[type[Section]]]:
+    """The key path of an error, and the sections whose keys may stand beside it.
+
+    Pydantic's location also names the branch that it took in a union, which is no part of the file's path.
+    """
+    here: Any = data
+    path: KeyPath = ()
+    models: list[type[Section]] = [Scenario]
+    *steps, last = details["loc"] or ("",)
+    for step in steps:
+        if isinstance(here, dict) and step in (here.get("leg"), here.get("source")) and len(models) > 1:
+            models = [m for m in models if step in (*_tags(m, "leg"), *_tags(m, "source"))]
+        elif (isinstance(here, dict) and step in here) or (isinstance(here, list) and isinstance(step, int)):
+            here = here[step]
+            if path == ("sensors",):
+                models = [CONFIGS[here["kind"]]] if isinstance(here, dict) and here.get("kind") in CONFIGS else []
+            elif isinstance(step, str):
+                fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
+                models = [model for annotation in fields for model in _sections(annotation)]
+            path = (*path, step)
+    in_file = (isinstance(here, dict) and last in here) or (isinstance(here, list) and isinstance(last, int))
+    if details["loc"] and (in_file or details["type"] == "missing"):
+        path = (*path, last)
+    if "discriminator" in details.get("ctx", {}):
+        path = (*path, details["ctx"]["discriminator"].strip("'"))
+    if details["type"] == "sensor_kind":
+        path = (*path, "kind")
+    return path, models
+
+
+def _sections(annotation: Any) -> list[type[Section]]:
+    """The sections inside a type annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation]
+    return [section for argument in get_args(annotation) for section in _sections(argument)]
+
+
+def _tags(model: type[Section], key: str) -> tuple[Any, ...]:
+    return get_args(model.model_fields[key].annotation) if key in model.model_fields else ()
+
+
+def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) -> str:
+    """What is wrong and what to do, in the words of this house."""
+    kind, given, context = details["type"], details["input"], details.get("ctx", {})
+    match kind:
+        case "extra_forbidden":
+            known = list(dict.fromkeys(key for model in models for key in model.model_fields))
+            near = difflib.get_close_matches(str(path[-1]), known, n=1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            return f"unknown key: {hint}Known here are {', '.join(known)}"
+        case "missing":
+            return "is missing: this item needs one more value" if isinstance(path[-1], int) else "is missing: add it"
+        case "sensor_kind":
+            return _unknown("sensor of kind", str(given.get("kind")), list(CONFIGS))
+        case "union_tag_not_found":
+            known = [tag for model in models for tag in _tags(model, str(path[-1]))]
+            return f"is missing: add it, one of {', '.join(known)}" if known else "is missing: add it"
+        case "union_tag_invalid":
+            return _unknown(str(path[-1]), str(context["tag"]), re.findall(r"'([^']*)'", context["expected_tags"]))
+        case "literal_error":
+            known = re.findall(r"'([^']*)'", context["expected"])
+            return f"must be {context['expected']}, not {_shown(given)}{_near(given, known)}"
+        case "value_error":
+            return str(context["error"])
+        case "scenario":
+            return str(context["text"])
+        case "json_invalid":
+            return "tables or lists are nested too deeply"
+        case "model_type" | "dict_type" | "model_attributes_type":
+            return f"must be a table, not {_shown(given)}"
+        case "list_type" | "tuple_type":
+            return f"must be a list, not {_shown(given)}"
+        case "finite_number":
+            return f"must be a finite number, not {_shown(given)}"
+        case "float_type":
+            return f"must be a number, not {_shown(given)}"
+        case "int_type" | "int_from_float":
+            return f"must be a whole number, not {_shown(given)}"
+        case "string_type":
+            return f'must be text in quotes, such as "text", not {_shown(given)}'
+        case "bool_type":
+            return f"must be true or false, not {_shown(given)}"
+    return f"{details['msg'].replace('Input should be', 'must be')}, not {_shown(given)}"
+
+
+def _near(given: object, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(str(given), known, n=1)
+    return f": did you mean {near[0]}?" if near else ""
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return repr(value)
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= 60 else text[:57] + "..."
