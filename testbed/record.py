@@ -1,0 +1,714 @@
+"""One netCDF-4/HDF5 file per run: truth, sensors, estimators with every innovation, and events.
+
+Layout, one group each, every group with its own time axis::
+
+    truth                                    the true state at the record rate
+    sensors/<name>                           what the sensor delivered
+    estimators/<name>                        state, sigmas, 9x9 covariance, further states
+    estimators/<name>/innovations/<aid>      what became of each aiding sample
+    events                                   severity and text
+
+Every variable carries ``units``, ``long_name`` and, where it has one, ``frame``. The root carries the scenario text,
+seed and versions. The dimension is ``time``, except ``sample_time`` for innovations: a nested group may not reuse its
+parent's dimension with other values.
+
+A record survives the death of its writer. Its HDF5 structure never changes in place: a new column, a new group or more
+room means a new file beside it, renamed over the old one when complete. In between, rows are written straight into the
+space that the contiguous datasets already own, the time column last, so that a finite time marks a complete row.
+Room not yet written reads NaN (-1 for codes, empty for text).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from importlib.metadata import PackageNotFoundError, version
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from nav.samples import Estimate, FixType, ImuSamples, Sample, Status, UpdateReport
+from testbed.errors import UserError
+from testbed.truth import COLUMNS, TruthBlock
+
+if TYPE_CHECKING:
+    import h5py
+    import xarray
+
+    from testbed.scenario import Scenario
+
+Data: TypeAlias = npt.NDArray[Any]
+
+FORMAT = "navigation-testbed run 1"
+FLUSH_WALL_S = 0.5  # a killed run loses at most this much work
+GROWTH = 4  # room made for each row present when the file has to be laid out anew
+
+# What the components of a vector mean; coordinates of the file's root, shared by all groups.
+AXES: dict[str, tuple[str, ...]] = {
+    "ned": ("north", "east", "down"),
+    "body": ("forward", "right", "down"),
+    "quaternion": ("w", "x", "y", "z"),
+    "surface": ("aileron", "elevator", "rudder", "throttle"),
+    "command": ("bank", "altitude", "airspeed"),
+    "error": tuple(
+        f"{what}_{axis}" for what in ("position", "velocity", "attitude") for axis in ("north", "east", "down")
+    ),
+}
+AXES["error_column"] = AXES["error"]
+_FRAME = {
+    "ned": "n: local north-east-down",
+    "body": "b: forward-right-down",
+    "quaternion": "from b (forward-right-down) to n (north-east-down)",
+    "error": "n: local north-east-down",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """Unit, meaning, dimensions after time, element type and further attributes of one recorded column."""
+
+    unit: str
+    meaning: str
+    dims: tuple[str, ...] = ()
+    dtype: str = "<f8"
+    attributes: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def frame(self) -> str:
+        """Frame of the components, empty for scalars."""
+        return next((_FRAME[d] for d in self.dims if d in _FRAME), "")
+
+
+def _truth_dims(name: str, width: int) -> tuple[str, ...]:
+    if width == 1:
+        return ()
+    if name.startswith("q_"):
+        return ("quaternion",)
+    if name.endswith("_n"):
+        return ("ned",)
+    return {"controls": ("surface",), "commands": ("command",)}.get(name, ("body",))
+
+
+TRUTH = {name: Variable(c.unit, c.meaning, _truth_dims(name, c.width)) for name, c in COLUMNS.items() if name != "t"}
+for _name, _what in (("dtheta", "omega_b"), ("dv", "specific force at the centre of gravity, body axes")):
+    TRUTH[_name] = replace(TRUTH[_name], meaning=f"sum over the ticks since the last row of the increments of {_what}")
+
+IMU = {
+    "dt": Variable("s", "length of the interval that ends at time"),
+    "dtheta": Variable("rad", "measured integral of angular rate of b relative to i", ("body",)),
+    "dv": Variable("m/s", "measured integral of specific force", ("body",)),
+}
+
+SAMPLE = {
+    "t_arrival": Variable("s", "when the sample could first be used"),
+    "lat": Variable("rad", "geodetic latitude of the antenna, WGS84"),
+    "lon": Variable("rad", "longitude of the antenna, WGS84"),
+    "h": Variable("m", "height of the antenna above the ellipsoid"),
+    "v_n": Variable("m/s", "velocity of the antenna over ground", ("ned",)),
+    "sigma_position_n": Variable("m", "reported 1-sigma of position", ("ned",)),
+    "sigma_velocity_n": Variable("m/s", "reported 1-sigma of velocity", ("ned",)),
+    "fix_type": Variable(
+        "1",
+        "GNSS fix type, -1 where nothing was written",
+        dtype="<i4",
+        attributes={
+            "flag_values": " ".join(str(int(f)) for f in FixType),
+            "flag_meanings": " ".join(f.name.lower() for f in FixType),
+        },
+    ),
+    "satellites": Variable("1", "satellites used, -1 where nothing was written", dtype="<i4"),
+    "hdop": Variable("1", "horizontal dilution of precision"),
+    "vdop": Variable("1", "vertical dilution of precision"),
+    "pressure": Variable("Pa", "measured static pressure"),
+    "field_b": Variable("T", "measured magnetic flux density", ("body",)),
+    "eas": Variable("m/s", "measured equivalent airspeed along body x"),
+}
+
+ESTIMATE = {
+    "lat": Variable("rad", "estimated geodetic latitude, WGS84"),
+    "lon": Variable("rad", "estimated longitude, WGS84"),
+    "h": Variable("m", "estimated height above the ellipsoid"),
+    "v_n": Variable("m/s", "estimated velocity over ground", ("ned",)),
+    "q_nb": Variable("1", "estimated attitude quaternion, scalar first", ("quaternion",)),
+    "gyro_bias": Variable("rad/s", "estimated gyro bias", ("body",)),
+    "accel_bias": Variable("m/s^2", "estimated accelerometer bias", ("body",)),
+    "sigma_position_n": Variable("m", "1-sigma of position error", ("ned",)),
+    "sigma_velocity_n": Variable("m/s", "1-sigma of velocity error", ("ned",)),
+    "sigma_attitude_n": Variable("rad", "1-sigma of attitude error phi", ("ned",)),
+    "sigma_gyro_bias": Variable("rad/s", "1-sigma of gyro bias", ("body",)),
+    "sigma_accel_bias": Variable("m/s^2", "1-sigma of accelerometer bias", ("body",)),
+    "covariance": Variable(
+        "products of m, m/s, rad", "covariance of position, velocity and attitude error", ("error", "error_column")
+    ),
+    "status": Variable(
+        "1",
+        "what the estimator says of itself, -1 where nothing was written",
+        dtype="<i4",
+        attributes={
+            "flag_masks": " ".join(str(int(f)) for f in Status),
+            "flag_meanings": " ".join((f.name or "").lower() for f in Status),
+        },
+    ),
+}
+
+# Unit and meaning of the further states that estimators may carry, by name.
+EXTRA = {
+    "wind_n": ("m/s", "estimated wind over ground, north and east"),
+    "baro_bias": ("m", "estimated bias of barometric height"),
+    "barometer_bias": ("m", "estimated bias of barometric height"),
+    "heading_bias": ("rad", "estimated bias of magnetic heading"),
+    "airspeed_scale": ("1", "estimated scale factor error of the airspeed sensor"),
+}
+
+REPORT = {
+    "innovation": Variable("units of the aid", "measurement - prediction", ("component",)),
+    "S": Variable(
+        "units of the aid, squared", "innovation covariance before the update", ("component", "component_column")
+    ),
+    "nis": Variable("1", "normalised innovation squared"),
+    "threshold": Variable("1", "gate for nis"),
+    "weight": Variable("1", "factor on the information of the sample: 1 taken as it is, 0 rejected"),
+    "reason": Variable("", "why it was refused or weakened, empty when simply fused", dtype="S64"),
+}
+
+EVENT = {
+    "severity": Variable("", "info, warning or error", dtype="S8"),
+    "text": Variable("", "what happened", dtype="S160"),
+}
+
+
+def _missing(dtype: np.dtype[Any]) -> Any:
+    return {"f": np.nan, "i": -1, "S": b""}[dtype.kind]
+
+
+def _blank(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Data:
+    return np.full(shape, _missing(dtype), dtype)
+
+
+@dataclass(slots=True)
+class _Column:
+    variable: Variable
+    shape: tuple[int, ...]
+    offset: int = 0  # of row 0 in the file [bytes]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(self.variable.dtype)
+
+    @property
+    def row_bytes(self) -> int:
+        return self.dtype.itemsize * int(np.prod(self.shape, dtype=int))
+
+
+Block: TypeAlias = dict[str, Data]
+Pack: TypeAlias = Callable[[Sequence[Any]], tuple[Block, dict[str, Variable]]]
+
+
+class _Table:
+    """One group: its columns, the rows waiting to be written, and how many the file holds.
+
+    Rows come as blocks of columns or as objects, which ``pack`` turns into a block when the table is flushed: one
+    array per column is far cheaper than one store per number.
+    """
+
+    def __init__(self, pack: Pack | None = None, time_name: str = "time") -> None:
+        self.time_name = time_name
+        self.columns = {time_name: _Column(Variable("s", "time from the start of the run"), ())}
+        self.objects: list[Any] = []
+        self.blocks: list[Block] = []
+        self.pending = 0
+        self.written = 0
+        self.capacity = 0
+        self.grown = True  # has columns that the file does not have yet
+        self._pack = pack
+
+    def add(self, block: Block, variables: Mapping[str, Variable]) -> None:
+        """Append one block; columns that are new start blank in the rows before it."""
+        for name, values in block.items():
+            if name not in self.columns:
+                self.columns[name] = _Column(variables[name], values.shape[1:])
+                self.grown = True
+        self.blocks.append(block)
+        self.pending += len(block[self.time_name])
+
+    def pack(self) -> None:
+        """Turn the waiting objects into a block."""
+        if self.objects and self._pack is not None:
+            self.add(*self._pack(self.objects))
+            self.objects.clear()
+
+    def rows(self, name: str) -> Data:
+        """All waiting rows of one column."""
+        column = self.columns[name]
+        parts = [
+            np.asarray(block[name], column.dtype)
+            if name in block
+            else _blank((len(block[self.time_name]), *column.shape), column.dtype)
+            for block in self.blocks
+        ]
+        return np.ascontiguousarray(parts[0] if len(parts) == 1 else np.concatenate(parts))
+
+    def order(self) -> Iterator[str]:
+        """Column names, time last: a finite time says that the rest of its row is there."""
+        yield from (name for name in self.columns if name != self.time_name)
+        yield self.time_name
+
+
+def _scalars(objects: Sequence[Any], name: str, dtype: str = "<f8") -> Data:
+    return np.array(list(map(attrgetter(name), objects)), dtype)
+
+
+def _vectors(objects: Sequence[Any], name: str) -> Data:
+    parts = list(map(attrgetter(name), objects))
+    return np.concatenate(parts).reshape(len(parts), *parts[0].shape)
+
+
+def _text(values: Iterable[str], dtype: str) -> Data:
+    width = np.dtype(dtype).itemsize
+    # Cut by characters, not bytes, so that no half of a character is left.
+    return np.array([v.encode()[:width].decode(errors="ignore").encode() for v in values], dtype)
+
+
+def _pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {"time": _scalars(samples, "t")}
+    for f in fields(samples[0]):
+        if f.name in ("t", "sensor"):
+            continue
+        variable = SAMPLE[f.name]
+        block[f.name] = _vectors(samples, f.name) if variable.dims else _scalars(samples, f.name, variable.dtype)
+    return block, SAMPLE
+
+
+def _pack_reports(reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {
+        "sample_time": _scalars(reports, "t"),
+        "innovation": _vectors(reports, "innovation"),
+        "S": _vectors(reports, "S"),
+        "nis": _scalars(reports, "nis"),
+        "threshold": _scalars(reports, "threshold"),
+        "weight": _scalars(reports, "weight"),
+        "reason": _text((r.reason for r in reports), REPORT["reason"].dtype),
+    }
+    return block, REPORT
+
+
+def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {"time": _scalars(estimates, "t")}
+    variables = dict(ESTIMATE)
+    for name in ("lat", "lon", "h", "status"):
+        block[name] = _scalars(estimates, name, ESTIMATE[name].dtype)
+    for name in ("v_n", "q_nb", "gyro_bias", "accel_bias", "sigma_gyro_bias", "sigma_accel_bias", "covariance"):
+        block[name] = _vectors(estimates, name)
+    sigma = np.sqrt(np.maximum(np.diagonal(block["covariance"], axis1=1, axis2=2), 0.0))  # nan stays nan
+    for k, name in enumerate(("sigma_position_n", "sigma_velocity_n", "sigma_attitude_n")):
+        block[name] = sigma[:, 3 * k : 3 * k + 3]
+    for name in sorted({key for e in estimates for key in e.extra}):
+        unit, meaning = EXTRA.get(name, ("unknown", "further state"))
+        width = next(len(e.extra[name][0]) for e in estimates if name in e.extra)
+        blank = (np.full(width, np.nan), np.full(width, np.nan))
+        pairs = [e.extra.get(name, blank) for e in estimates]
+        for k, (column, what) in enumerate(((name, meaning), (f"sigma_{name}", f"1-sigma of {name}"))):
+            values = np.concatenate([pair[k] for pair in pairs]).reshape(len(pairs), width)
+            block[column] = values[:, 0] if width == 1 else values
+            variables[column] = Variable(unit, what, () if width == 1 else (f"{name}_component",))
+    return block, variables
+
+
+def _pack_events(events: Sequence[tuple[float, str, str]]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {
+        "time": np.array([e[0] for e in events]),
+        "severity": _text((e[1] for e in events), EVENT["severity"].dtype),
+        "text": _text((e[2] for e in events), EVENT["text"].dtype),
+    }
+    return block, EVENT
+
+
+class Recorder:
+    """Collects the rows of one run and writes them as they come.
+
+    ``path`` None keeps everything in memory. The file appears with the first flush, so a run that fails before its
+    first row leaves no file, and an earlier record in its place intact. Raises UserError when the folder can't be
+    written. Objects handed over are read at the next flush: their arrays must not be written to afterwards.
+    """
+
+    def __init__(self, path: Path | None, scenario: Scenario, seed: int) -> None:
+        self.path = path
+        self.attributes: dict[str, str | int | float] = {
+            "format": FORMAT,
+            "Conventions": "CF-1.8",
+            "title": scenario.title,
+            "scenario": scenario.text,
+            "scenario_path": str(scenario.path),
+            "overrides": json.dumps(list(getattr(scenario, "overrides", ()))),
+            "seed": seed,
+            "duration_s": float(scenario.duration_s),
+            "record_rate_hz": float(scenario.record.rate_hz),
+            "versions": json.dumps(_versions()),
+            "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
+            "complete": 0,
+        }
+        self._record_imu = scenario.record.imu
+        self._every = round(scenario.truth.rate_hz / scenario.record.rate_hz)
+        self._tables: dict[str, _Table] = {}
+        self._tail: list[TruthBlock] = []  # ticks since the last recorded row
+        self._last_flush = time.monotonic()
+        self._file: BinaryIO | None = None
+        if path is not None:
+            _check_writable(path)
+
+    def truth(self, block: TruthBlock) -> None:
+        """Take full-rate rows; every n-th is recorded, with the increments summed since the one before."""
+        if len(block):
+            self._tail.append(block)
+            self._decimate()
+        if time.monotonic() - self._last_flush >= FLUSH_WALL_S:
+            self.flush()
+
+    def imu(self, name: str, samples: ImuSamples) -> None:
+        """Take inertial increments at their full rate, if the scenario records them."""
+        if self._record_imu and len(samples):
+            block = {"time": samples.t, "dt": samples.dt, "dtheta": samples.dtheta, "dv": samples.dv}
+            self._table(f"sensors/{name}").add(block, IMU)
+
+    def samples(self, name: str, samples: Sequence[Sample]) -> None:
+        """Take aiding samples as delivered."""
+        if samples:
+            self._table(f"sensors/{name}", _pack_samples).objects.extend(samples)
+
+    def estimate(self, name: str, estimate: Estimate) -> None:
+        """Take one estimate."""
+        self._table(f"estimators/{name}", _pack_estimates).objects.append(estimate)
+
+    def reports(self, name: str, reports: Sequence[UpdateReport]) -> None:
+        """Take what became of aiding samples, one group per aid."""
+        for report in reports:
+            path = f"estimators/{name}/innovations/{report.aid}"
+            table = self._tables.get(path) or self._table(path, _pack_reports, "sample_time")
+            table.objects.append(report)
+
+    def event(self, t: float, severity: str, text: str) -> None:
+        """Note that something happened; severity is info, warning or error."""
+        self._table("events", _pack_events).objects.append((t, severity, text))
+
+    def flush(self) -> None:
+        """Make every row taken so far part of the file; in memory, only pack it."""
+        self._last_flush = time.monotonic()
+        for table in self._tables.values():
+            table.pack()
+        if self.path is None or not any(table.pending for table in self._tables.values()):
+            return
+        if any(t.grown or t.written + t.pending > t.capacity for t in self._tables.values()):
+            self._lay_out(GROWTH)
+        else:
+            self._write_rows()
+
+    def close(self) -> None:
+        """Write what is left and give the file its final size. A run without rows leaves no file."""
+        self.flush()
+        if self.path is not None and self._file is not None:
+            self.attributes["complete"] = 1
+            self._lay_out(1)
+            self._file.close()
+            self._file = None
+
+    def dataset(self) -> xarray.DataTree:
+        """Everything recorded so far, equal to `load` of the file."""
+        self.flush()
+        if self.path is not None and self.path.exists():
+            return load(self.path)
+        columns = {
+            path: {name: (c.variable, table.rows(name)) for name, c in table.columns.items()}
+            for path, table in self._tables.items()
+        }
+        return _tree(columns, self.attributes)
+
+    def _table(self, path: str, pack: Pack | None = None, time_name: str = "time") -> _Table:
+        table = self._tables.get(path)
+        if table is None:
+            table = self._tables[path] = _Table(pack, time_name)
+        return table
+
+    def _decimate(self) -> None:
+        """Record the rows on multiples of the record interval; keep the ticks after the last of them."""
+        every = self._every
+        first, n = self._tail[0].tick, sum(map(len, self._tail))
+        if first == 0:  # the initial state stands alone: nothing led to it
+            self._record_truth(self._tail[0].rows(0, 1), 1)
+            self._tail[0] = self._tail[0].rows(1, len(self._tail[0]))
+            n -= 1
+        whole = n // every * every
+        if not whole:
+            return
+        blocks = self._tail
+        names = [f.name for f in fields(TruthBlock) if f.name != "tick"]
+        joined = (
+            blocks[0]
+            if len(blocks) == 1
+            else TruthBlock(
+                blocks[0].tick, **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
+            )
+        )
+        self._record_truth(joined.rows(0, whole), every)
+        self._tail = [joined.rows(whole, n)] if whole < n else []
+
+    def _record_truth(self, block: TruthBlock, every: int) -> None:
+        columns = {"time": block.t[every - 1 :: every].copy()}
+        for name in TRUTH:
+            values = getattr(block, name)
+            if name in ("dtheta", "dv"):
+                # Each interval is summed by itself, in order: the result can't depend on how the run was chunked.
+                columns[name] = values.reshape(-1, every, 3).cumsum(axis=1)[:, -1]
+            else:
+                columns[name] = values[every - 1 :: every].copy()
+        self._table("truth").add(columns, TRUTH)
+
+    def _write_rows(self) -> None:
+        assert self._file is not None
+        for table in self._tables.values():
+            if not table.pending:
+                continue
+            for name in table.order():
+                column = table.columns[name]
+                self._file.seek(column.offset + table.written * column.row_bytes)
+                self._file.write(table.rows(name).data.cast("B"))
+            table.written += table.pending
+            table.pending = 0
+            table.blocks.clear()
+
+    def _lay_out(self, growth: int) -> None:
+        """Write a new file with room for ``growth`` times the rows present, and put it in place of the old one."""
+        assert self.path is not None
+        part = self.path.with_name(f".{self.path.name}.part")
+        try:
+            old = {path: (t.written, {n: c.offset for n, c in t.columns.items()}) for path, t in self._tables.items()}
+            for table in self._tables.values():
+                table.capacity = growth * (table.written + table.pending)
+            _create(part, self._tables, self.attributes, blank=growth > 1)
+            new = part.open("r+b", buffering=0)
+            if self._file is not None:
+                for path, table in self._tables.items():
+                    written, offsets = old[path]
+                    for name in table.order():
+                        column = table.columns[name]
+                        if offsets[name] and written:
+                            _copy(self._file, offsets[name], new, column.offset, written * column.row_bytes)
+                        elif written:
+                            new.seek(column.offset)
+                            new.write(_blank((written, *column.shape), column.dtype).data.cast("B"))
+                self._file.close()
+            self._file = new
+            self._write_rows()
+            os.replace(part, self.path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise UserError(f"{self.path}: can't write the record: {error.strerror or error}") from error
+
+
+def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -> None:
+    source.seek(start)
+    target.seek(at)
+    while count:
+        chunk = source.read(min(count, 1 << 22))
+        target.write(chunk)
+        count -= len(chunk)
+
+
+def _check_writable(path: Path) -> None:
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; give the name of a file")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_name(f".{path.name}.part")
+        part.write_bytes(b"")
+        part.unlink()
+    except OSError as error:
+        raise UserError(
+            f"{path.parent}: can't write here ({error.strerror or error}); choose another folder with --out"
+        ) from error
+
+
+def _versions() -> dict[str, str]:
+    found = {}
+    for package in ("navigation-testbed", "numpy", "scipy", "numba", "jsbsim", "h5py"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+# -- HDF5 ---------------------------------------------------------------------------------------------------------
+
+
+class _Attributes:
+    """Writes string and number attributes through the low-level interface: ten times faster than the high-level one."""
+
+    def __init__(self) -> None:
+        from h5py import h5s
+
+        self._scalar = h5s.create(h5s.SCALAR)
+
+    def text(self, where: Any, name: str, value: str) -> None:
+        from h5py import h5a, h5t
+
+        raw = value.encode()
+        kind = h5t.C_S1.copy()
+        kind.set_size(max(len(raw), 1))
+        kind.set_cset(h5t.CSET_UTF8)
+        h5a.create(where, name.encode(), kind, self._scalar).write(np.array(raw, f"S{max(len(raw), 1)}"), mtype=kind)
+
+
+def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, str | int | float], blank: bool) -> None:
+    """Write the structure of a record with all its space allocated, and note where each column's rows go.
+
+    ``blank`` fills the space; without, every row is about to be written.
+    """
+    import h5py
+    from h5py import h5d, h5ds, h5p, h5s, h5t
+
+    note = _Attributes()
+    with h5py.File(path, "w", libver=("earliest", "v110"), track_order=True) as file:
+        for name, value in attributes.items():
+            file.attrs[name] = value
+        scales: dict[str, Any] = {}
+        for axis, labels in AXES.items():
+            dataset = file.create_dataset(axis, data=list(labels), dtype=h5py.string_dtype())
+            dataset.make_scale(axis)
+            scales[axis] = dataset.id
+        for group_path, table in tables.items():
+            group = file.require_group(group_path).id if group_path not in file else file[group_path].id
+            local: dict[str, Any] = {}
+            for name, column in table.columns.items():
+                dtype = column.dtype
+                text = dtype.kind == "S"
+                layout = h5p.create(h5p.DATASET_CREATE)
+                layout.set_alloc_time(h5d.ALLOC_TIME_EARLY)
+                if blank:
+                    layout.set_fill_value(np.array(_missing(dtype), dtype="S1" if text else dtype))
+                else:
+                    layout.set_fill_time(h5d.FILL_TIME_NEVER)
+                shape = (table.capacity, *column.shape, *((dtype.itemsize,) if text else ()))
+                stored = h5t.py_create(np.dtype("S1") if text else dtype)
+                dataset = h5d.create(group, name.encode(), stored, h5s.create_simple(shape), layout)
+                dims = (*column.variable.dims, *((f"characters_{dtype.itemsize}",) if text else ()))
+                if name == table.time_name:
+                    h5ds.set_scale(dataset, name.encode())
+                    local[name] = dataset
+                    note.text(dataset, "standard_name", "time")
+                    note.text(dataset, "axis", "T")
+                else:
+                    h5ds.attach_scale(dataset, local[table.time_name], 0)
+                for k, dim in enumerate(dims, start=1):
+                    if dim not in scales and dim not in local:
+                        local[dim] = _bare_dimension(group, dim, shape[k])
+                    h5ds.attach_scale(dataset, scales[dim] if dim in scales else local[dim], k)
+                for key, value in _attributes(column.variable).items():
+                    note.text(dataset, key, value)
+                if text:
+                    note.text(dataset, "_Encoding", "utf-8")
+                column.offset = dataset.get_offset()
+            table.grown = False
+
+
+def _bare_dimension(group: Any, name: str, size: int) -> Any:
+    """A netCDF-4 dimension without coordinate values."""
+    from h5py import h5d, h5ds, h5s, h5t
+
+    scale = h5d.create(group, name.encode(), h5t.IEEE_F32BE, h5s.create_simple((size,)))
+    h5ds.set_scale(scale, f"This is a netCDF dimension but not a netCDF variable.{size:10d}".encode())
+    return scale
+
+
+def _attributes(variable: Variable) -> dict[str, str]:
+    pairs = {"units": variable.unit, "long_name": variable.meaning, "frame": variable.frame, **variable.attributes}
+    return {key: value for key, value in pairs.items() if value}
+
+
+def load(path: Path) -> xarray.DataTree:
+    """Read a record. A run that was killed gives the rows of its last flush, and the attribute ``complete`` is 0.
+
+    Raises UserError when the file is missing, damaged or no record.
+    """
+    import h5py
+
+    if not path.exists():
+        raise UserError(f"{path}: no such file; `testbed run` writes run.nc into its --out folder")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; give the record in it, such as {path / 'run.nc'}")
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path}: not a record of a run (not netCDF-4/HDF5)")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise UserError(f"{path}: netCDF-4/HDF5, but not a record of a run of this version ({FORMAT!r})")
+            columns: dict[str, dict[str, tuple[Variable, Data]]] = {}
+            _read_group(file, "", columns)
+            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: damaged record ({error}); run the scenario again") from error
+    return _tree(columns, attributes)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _read_group(group: h5py.Group, path: str, found: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
+    import h5py
+
+    time_name = next((name for name in ("time", "sample_time") if name in group), None)
+    if time_name is not None:
+        t = group[time_name][()]
+        rows = int(np.argmin(np.isfinite(t))) if not np.isfinite(t).all() else len(t)
+        found[path] = {
+            name: _read_column(item, rows)
+            for name, item in group.items()
+            if isinstance(item, h5py.Dataset) and "long_name" in item.attrs
+        }
+    for name, item in group.items():
+        if isinstance(item, h5py.Group):
+            _read_group(item, f"{path}/{name}".lstrip("/"), found)
+
+
+def _read_column(dataset: h5py.Dataset, rows: int) -> tuple[Variable, Data]:
+    attributes = {
+        name: _plain(dataset.attrs[name])
+        for name in ("units", "long_name", "flag_values", "flag_masks", "flag_meanings")
+        if name in dataset.attrs
+    }
+    dims = tuple(Path(dataset.dims[k][0].name).name for k in range(1, dataset.ndim))
+    values = dataset[:rows]
+    if values.dtype.kind == "S":
+        values = values.view(f"S{values.shape[1]}")[:, 0]
+        dims = dims[:-1]
+    variable = Variable(attributes.pop("units", ""), attributes.pop("long_name"), dims, values.dtype.str, attributes)
+    return variable, values
+
+
+def _tree(
+    columns: Mapping[str, Mapping[str, tuple[Variable, Data]]], attributes: Mapping[str, str | int | float]
+) -> xarray.DataTree:
+    import xarray
+
+    nodes = {"/": xarray.Dataset(coords={axis: list(labels) for axis, labels in AXES.items()}, attrs=dict(attributes))}
+    for path, group in columns.items():
+        time_name = "sample_time" if "sample_time" in group else "time"
+        nodes[path] = xarray.Dataset(
+            {
+                name: (
+                    (time_name, *variable.dims),
+                    np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
+                    _attributes(variable),
+                )
+                for name, (variable, values) in group.items()
+            }
+        ).set_coords(time_name)
+    return xarray.DataTree.from_dict(nodes)
