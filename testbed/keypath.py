@@ -15,7 +15,9 @@ from testbed.errors import UserError
 KeyPath: TypeAlias = tuple[str | int, ...]
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-_OVERRIDE_STEP = re.compile(r"""\[(?P<index>\d{1,9})\]|"(?P<basic>[^"]*)"|'(?P<literal>[^']*)'|(?P<bare>[^.\[\]"'=]+)""")
+_OVERRIDE_STEP = re.compile(
+    r"""\[(?P<index>\d{1,9})\]|"(?P<basic>[^"]*)"|'(?P<literal>[^']*)'|(?P<bare>[^.\[\]"'=]+)"""
+)
 _TOKEN = re.compile(
     r"""(?P<skip>[ \t\r]+|\#[^\n]*)
       | (?P<newline>\n)

@@ -145,7 +145,11 @@ class Bounds(Section):
     @model_validator(mode="before")
     @classmethod
     def _maximum(cls, value: Any) -> Any:
-        return value if isinstance(value, dict) else {"max": value}
+        if not isinstance(value, dict):
+            return {"max": value}
+        if value.keys() - {"min", "max"}:
+            raise ValueError("takes a maximum, or min and max; a metric's name is quoted, as it has dots in it")
+        return value
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -327,7 +331,7 @@ def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     if not scenario.plan:
         yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
         return
-    aircraft = sorted(file.name for file in data_dir("aircraft").iterdir() if file.is_dir())
+    aircraft = sorted(file.stem for file in data_dir("aircraft").glob("*/*.xml") if file.stem == file.parent.name)
     if scenario.truth.aircraft not in aircraft:
         yield ("truth", "aircraft"), _unknown("aircraft", scenario.truth.aircraft, aircraft)
     try:
@@ -412,7 +416,7 @@ def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[Ke
     elif not _whole(tick_hz / rate_hz):
         ticks = int(tick_hz / rate_hz)
         slower, faster = tick_hz / (ticks + 1), tick_hz / ticks
-        near = " or ".join(f"{rate!r}" for rate in (slower, faster))
+        near = f"{slower:.10g} or {faster:.10g}"
         yield path, f"{rate_hz:g} Hz does not divide the tick rate of {tick_hz:g} Hz (truth.rate_hz): try {near}"
 
 
@@ -421,9 +425,7 @@ def _whole(value: float) -> bool:
 
 
 def _unknown(what: str, given: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(given, known, n=1)
-    hint = f"did you mean {near[0]}? " if near else ""
-    return f"there is no {what} {given!r}: {hint}There is {', '.join(known) if known else 'none'}"
+    return f"there is no {what} {_shown(given)}: {_choice(given, known)}"
 
 
 # --- saying what is wrong
@@ -441,9 +443,10 @@ def _report(
     messages = []
     for path, texts in said.items():
         above = [path[:length] for length in range(len(path), -1, -1)]
-        override = next((set_paths[p] for p in above if p in set_paths), None)
+        below = [p for p in set_paths if path and p[: len(path)] == path]
+        override = next((set_paths[p] for p in above + below if p in set_paths), None)
         line = next((lines[p] for p in above if p in lines), None)
-        at = f" (--set {override})" if override else f":{line}" if line else ""
+        at = f" (--set {_short(override)})" if override else f":{line}" if line else ""
         key = f" {keypath.written(path)}:" if path else ""
         messages.append((line or 0, f"{place}{at}:{key} {', or '.join(dict.fromkeys(texts))}"))
     messages.sort(key=lambda message: message[0])
@@ -458,29 +461,32 @@ def _locate(details: ErrorDetails, data: dict[str, Any]) -> tuple[KeyPath, list[
 
     Pydantic's location also names the branch that it took in a union, which is no part of the file's path.
     """
+    loc = details["loc"]
+    if "discriminator" in details.get("ctx", {}):
+        loc = (*loc, details["ctx"]["discriminator"].strip("'"))
     here: Any = data
     path: KeyPath = ()
     models: list[type[Section]] = [Scenario]
-    *steps, last = details["loc"] or ("",)
-    for step in steps:
-        if isinstance(here, dict) and step in (here.get("leg"), here.get("source")) and len(models) > 1:
+    for step in loc[:-1]:
+        if isinstance(here, dict) and len(models) > 1 and step in (here.get("leg"), here.get("source")):
             models = [m for m in models if step in (*_tags(m, "leg"), *_tags(m, "source"))]
-        elif (isinstance(here, dict) and step in here) or (isinstance(here, list) and isinstance(step, int)):
+        elif _holds(here, step):
             here = here[step]
-            if path == ("sensors",):
-                models = [CONFIGS[here["kind"]]] if isinstance(here, dict) and here.get("kind") in CONFIGS else []
+            path = (*path, step)
+            if len(path) == 2 and path[0] == "sensors":
+                models = [CONFIGS[here["kind"]]]
             elif isinstance(step, str):
                 fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
                 models = [model for annotation in fields for model in _sections(annotation)]
-            path = (*path, step)
-    in_file = (isinstance(here, dict) and last in here) or (isinstance(here, list) and isinstance(last, int))
-    if details["loc"] and (in_file or details["type"] == "missing"):
-        path = (*path, last)
-    if "discriminator" in details.get("ctx", {}):
-        path = (*path, details["ctx"]["discriminator"].strip("'"))
-    if details["type"] == "sensor_kind":
+    if loc and (_holds(here, loc[-1]) or details["type"] in ("missing", "union_tag_not_found")):
+        path = (*path, loc[-1])
+    if details["type"] == "sensor_kind" and details["input"]["kind"] != path[-1]:
         path = (*path, "kind")
     return path, models
+
+
+def _holds(here: Any, step: str | int) -> bool:
+    return step in here if isinstance(here, dict) else isinstance(here, list) and isinstance(step, int)
 
 
 def _sections(annotation: Any) -> list[type[Section]]:
@@ -500,21 +506,19 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
     match kind:
         case "extra_forbidden":
             known = list(dict.fromkeys(key for model in models for key in model.model_fields))
-            near = difflib.get_close_matches(str(path[-1]), known, n=1)
-            hint = f"did you mean {near[0]}? " if near else ""
-            return f"unknown key: {hint}Known here are {', '.join(known)}"
+            return f"unknown key: {_choice(str(path[-1]), known)}"
         case "missing":
             return "is missing: this item needs one more value" if isinstance(path[-1], int) else "is missing: add it"
         case "sensor_kind":
             return _unknown("sensor of kind", str(given.get("kind")), list(CONFIGS))
         case "union_tag_not_found":
             known = [tag for model in models for tag in _tags(model, str(path[-1]))]
-            return f"is missing: add it, one of {', '.join(known)}" if known else "is missing: add it"
+            return f"is missing: add it, one of {', '.join(known)}"
         case "union_tag_invalid":
             return _unknown(str(path[-1]), str(context["tag"]), re.findall(r"'([^']*)'", context["expected_tags"]))
         case "literal_error":
             known = re.findall(r"'([^']*)'", context["expected"])
-            return f"must be {context['expected']}, not {_shown(given)}{_near(given, known)}"
+            return f"can't be {_shown(given)}: {_choice(str(given), known)}"
         case "value_error":
             return str(context["error"])
         case "scenario":
@@ -523,10 +527,14 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
             return "tables or lists are nested too deeply"
         case "model_type" | "dict_type" | "model_attributes_type":
             return f"must be a table, not {_shown(given)}"
+        case "date_type" | "date_parsing" | "date_from_datetime_parsing" | "date_from_datetime_inexact":
+            return f"must be a date such as 2026-06-01, not {_shown(given)}"
         case "list_type" | "tuple_type":
             return f"must be a list, not {_shown(given)}"
         case "finite_number":
             return f"must be a finite number, not {_shown(given)}"
+        case "too_long":
+            return f"has {context['actual_length']} items, but at most {context['max_length']} are allowed"
         case "float_type":
             return f"must be a number, not {_shown(given)}"
         case "int_type" | "int_from_float":
@@ -538,13 +546,15 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
     return f"{details['msg'].replace('Input should be', 'must be')}, not {_shown(given)}"
 
 
-def _near(given: object, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(str(given), known, n=1)
-    return f": did you mean {near[0]}?" if near else ""
+def _choice(given: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(given, known, n=1)
+    hint = f"did you mean {near[0]}? Choose from " if near else "choose from "
+    return hint + ", ".join(known) if known else "there is none to choose from"
 
 
 def _shown(value: object) -> str:
-    if isinstance(value, float):
-        return repr(value)
-    text = json.dumps(value, default=str, ensure_ascii=False)
+    return _short(repr(value) if isinstance(value, float) else json.dumps(value, default=str, ensure_ascii=False))
+
+
+def _short(text: str) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
