@@ -8,7 +8,7 @@ from testbed.errors import UserError
 
 
 def data_dir(name: str) -> Path:
-    """Folder of shipped data, ``"aircraft"`` or ``"scenarios"``: inside `testbed` once installed, beside it in a checkout.
+    """Folder of shipped data, ``"aircraft"`` or ``"scenarios"``: in `testbed` once installed, beside it in a checkout.
 
     Raises UserError when the installation lacks it.
     """

@@ -1,14 +1,15 @@
 """The scenario file: what to fly, sense, estimate and expect. Whatever can be found wrong with it is found here.
 
 A scenario is one TOML file. Sensors and plan legs declare their own keys beside their code (`testbed.sensors`,
-`testbed.guidance`); the sections that belong to nobody else are here. `Scenario.load` reports every mistake of a file at
-once, each with its line and key path.
+`testbed.guidance`); the sections that belong to nobody else are here. `Scenario.load` reports every mistake of a file
+at once, each with its line and key path.
 """
 
 from __future__ import annotations
 
 import datetime as dt
 import difflib
+import itertools
 import json
 import re
 import tomllib
@@ -62,14 +63,14 @@ class Wind(Section):
     from_deg: Heading = 0.0
     speed_mps: WindSpeed = 0.0
     turbulence: Literal["none", "light", "moderate", "severe"] = "none"
-    profile: list[tuple[Altitude, Heading, WindSpeed]] = []
+    profile: list[tuple[Altitude, Heading, WindSpeed]] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _one_wind(self) -> Self:
         if self.profile and self.model_fields_set & {"from_deg", "speed_mps"}:
             raise ValueError("a profile replaces from_deg and speed_mps: give one or the other")
         heights = [row[0] for row in self.profile]
-        if any(upper <= lower for lower, upper in zip(heights, heights[1:], strict=False)):
+        if any(upper <= lower for lower, upper in itertools.pairwise(heights)):
             raise ValueError("the rows of profile must climb: sort them by alt_m, each altitude once")
         return self
 
@@ -91,8 +92,8 @@ class Rest(Section):
     lon_deg: Longitude
     alt_m: Altitude
     heading_deg: Heading = 0.0
-    pitch_deg: float = Field(0.0, ge=-90, le=90)
-    roll_deg: float = Field(0.0, ge=-180, le=180)
+    pitch_deg: float = Field(default=0.0, ge=-90, le=90)
+    roll_deg: float = Field(default=0.0, ge=-180, le=180)
 
 
 class KinematicTruth(Section):
@@ -132,7 +133,7 @@ class AutopilotConfig(Section):
 class RecordConfig(Section):
     """What goes into the run file: rate of truth and estimates, and whether every IMU sample is kept."""
 
-    rate_hz: float = Field(10.0, gt=0)
+    rate_hz: float = Field(default=10.0, gt=0)
     imu: bool = True
 
 
@@ -174,16 +175,16 @@ class Scenario(Section):
 
     title: str = Field(min_length=1)
     description: str = ""
-    seed: int = Field(0, ge=0, lt=2**63)
+    seed: int = Field(default=0, ge=0, lt=2**63)
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S)
     date: dt.date = dt.date(2026, 1, 1)
     truth: FlightTruth | KinematicTruth = Field(discriminator="source")
-    plan: list[guidance.Leg] = []
-    sensors: dict[str, Annotated[Section, PlainValidator(_sensor)]] = {}
-    estimator: list[EstimatorConfig] = []
+    plan: list[guidance.Leg] = Field(default_factory=list)
+    sensors: dict[str, Annotated[Section, PlainValidator(_sensor)]] = Field(default_factory=dict)
+    estimator: list[EstimatorConfig] = Field(default_factory=list)
     autopilot: AutopilotConfig = AutopilotConfig()
     record: RecordConfig = RecordConfig()
-    expect: dict[str, Bounds] = {}
+    expect: dict[str, Bounds] = Field(default_factory=dict)
 
     _text: str = PrivateAttr("")
     _path: Path | None = PrivateAttr(None)

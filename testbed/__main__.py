@@ -1,0 +1,319 @@
+"""The command line: ``testbed scenarios | run | check | report | export | campaign | bench``.
+
+Nothing heavy is imported before a command needs it, so that help and completion answer at once.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from testbed.data import data_dir
+from testbed.errors import UserError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from testbed.loop import Publisher, RunResult
+    from testbed.scenario import Bounds, Scenario
+
+EXIT_FAILED, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
+RUNS = Path("runs")
+PIPE_COLUMNS = 120  # width of tables where the output is not a terminal
+
+app = typer.Typer(
+    help="Fly, sense, navigate: a navigation testbed coupled to a flight simulation.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+ScenarioName = Annotated[str, typer.Argument(metavar="SCENARIO", help="A scenario file, or a shipped one by name.")]
+RunFile = Annotated[Path, typer.Argument(metavar="RUN.nc", help="The record of a run.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a key: sensors.gnss.denied=[[300,500]]; repeatable."),
+]
+
+
+class ExportFormat(StrEnum):
+    """What a run file can be turned into."""
+
+    csv = "csv"
+    mat = "mat"
+
+
+def main() -> None:
+    """Entry point: a user's mistake ends with its message and exit code 2, never with a traceback."""
+    try:
+        app(_explicit_realtime(sys.argv[1:]))
+    except UserError as error:
+        for line in str(error).splitlines():
+            print(f"testbed: {line}", file=sys.stderr)
+        sys.exit(EXIT_USER_ERROR)
+    except OSError as error:  # a full disk, a folder that went away
+        print(f"testbed: {error}", file=sys.stderr)
+        sys.exit(EXIT_USER_ERROR)
+    except KeyboardInterrupt:
+        sys.exit(EXIT_INTERRUPTED)
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: Annotated[bool, typer.Option("--version", help="Print the version and leave.")] = False) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        print(f"testbed {installed('navigation-testbed')}")
+        raise typer.Exit
+
+
+@app.command()
+def scenarios() -> None:
+    """List the shipped scenarios."""
+    from rich.table import Table
+
+    table = Table("name", "title", "duration")
+    for path in sorted(data_dir("scenarios").glob("*.toml")):
+        try:
+            head = tomllib.loads(path.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise UserError(f"{path}: {error}") from None
+        table.add_row(path.stem, str(head.get("title")), f"{head.get('duration_s')} s")
+    _console().print(table)
+
+
+@app.command()
+def run(
+    scenario: ScenarioName,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results; runs/<scenario>.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", min=0, help="In place of the scenario's seed.")] = None,
+    overrides: Overrides = None,
+    mavlink: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URL", help="Stream to udpout:HOST:PORT, tcp:HOST:PORT or tlog:FILE; repeatable."),
+    ] = None,
+    realtime: Annotated[
+        float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
+    ] = None,
+    report: Annotated[bool, typer.Option("--report/--no-report", help="Write figures and report.html.")] = True,
+) -> None:
+    """Fly one scenario: record, metrics, report."""
+    if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
+        raise UserError(f"--realtime {realtime:g}: the factor must be above 0, such as 1 for wall-clock time")
+    loaded = _load(scenario, overrides)
+    folder = out or RUNS / Path(scenario).stem
+    with _output_folder(folder):
+        result = _fly(loaded, folder, seed=seed, links=_connect(mavlink or []), realtime=realtime)
+        _conclude(result, folder, report)
+
+
+@app.command()
+def check(
+    names: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help="Scenario files or shipped names.")],
+) -> None:
+    """Run scenarios and compare their metrics with their [expect]; exit code 1 if anything failed."""
+    loaded = {name: _load(name) for name in names}
+    for name, one in loaded.items():
+        if not one.expect:
+            raise UserError(f"{name}: has no [expect], so there is nothing to check: add bounds to it")
+    failed = False
+    for name, one in loaded.items():
+        folder = RUNS / "check" / Path(name).stem
+        with _output_folder(folder):
+            result = _fly(one, folder)
+        verdicts = judge(one.expect, result.metrics)
+        _show_verdicts(name, one.expect, result.metrics, verdicts)
+        if not all(verdicts.values()):
+            failed = True
+            print(f"{name}: failed; the record is kept in {folder}")
+    if failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def report(run_file: RunFile) -> None:
+    """Write metrics, figures and report.html again from a run file, beside it."""
+    from testbed import loop, metrics, record
+
+    dataset = record.load(run_file)
+    _conclude(loop.RunResult(dataset, metrics.compute(dataset), run_file.parent), run_file.parent, report=True)
+
+
+@app.command()
+def export(
+    run_file: RunFile,
+    format: Annotated[ExportFormat, typer.Option(help="One CSV file per table, or one MATLAB file.")],
+    out: Annotated[Path | None, typer.Option(metavar="PATH", help="Where to; beside the run file.")] = None,
+) -> None:
+    """Turn a run file into CSV or MATLAB."""
+    from testbed import record
+
+    print(record.export(run_file, format.value, out))
+
+
+@app.command()
+def campaign(
+    scenario: ScenarioName,
+    runs: Annotated[int, typer.Option(metavar="N", min=1, help="How many seeds.")],
+    vary: Annotated[
+        list[str] | None, typer.Option(metavar="KEY=A,B,C", help="Repeat for each of these values; repeatable.")
+    ] = None,
+    scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="An existing Dask cluster.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
+) -> None:
+    """Fly a scenario with many seeds."""
+    from testbed.campaign import campaign as conduct
+
+    _load(scenario)
+    folder = out or RUNS / f"{Path(scenario).stem}_campaign"
+    with _output_folder(folder):
+        conduct(scenario, runs=runs, vary=dict(map(parse_vary, vary or [])), scheduler=scheduler, out=folder)
+
+
+@app.command()
+def bench() -> None:
+    """Measure speed, each figure as a ratio within the same run."""
+    from testbed import bench as benchmarks
+
+    benchmarks.main()
+
+
+def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> dict[str, bool]:
+    """Whether each expected metric is there and within its bounds. One that is missing, or NaN, is not."""
+    return {key: key in metrics and bounds.hold(metrics[key]) for key, bounds in expect.items()}
+
+
+def parse_vary(text: str) -> tuple[str, list[str]]:
+    """``key=a,b,c`` as the key and its values; commas inside brackets, braces and quotes do not separate."""
+    key, equals, listed = text.partition("=")
+    values, depth, quote = [""], 0, ""
+    for character in listed:
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "\"'":
+            quote = character
+        else:
+            depth += (character in "[{") - (character in "]}")
+        if character == "," and not quote and depth == 0:
+            values.append("")
+        else:
+            values[-1] += character
+    values = [value.strip() for value in values]
+    if not equals or not key.strip() or not all(values):
+        raise UserError(f"--vary {text}: give it as key=a,b,c, such as truth.wind.speed_mps=0,5,10")
+    return key.strip(), values
+
+
+def _explicit_realtime(arguments: Sequence[str]) -> list[str]:
+    """Give a bare ``--realtime`` its factor 1: the option parser knows no optional values."""
+    explicit = []
+    for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+        explicit.append(argument)
+        if argument == "--realtime":
+            try:
+                float(following)
+            except ValueError:
+                explicit.append("1")
+    return explicit
+
+
+def _console(stderr: bool = False) -> Console:
+    from rich.console import Console
+
+    console = Console(stderr=stderr)
+    return console if console.is_terminal else Console(stderr=stderr, width=PIPE_COLUMNS)
+
+
+def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
+    from testbed.scenario import Scenario
+
+    return Scenario.load(name, overrides or ())
+
+
+@contextmanager
+def _output_folder(folder: Path) -> Iterator[None]:
+    """Make a folder and see that it can be written; if the work is then refused, no empty folder stays behind."""
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UserError(f"{folder}: can't be written: {error.strerror}: choose another folder with --out") from None
+    try:
+        yield
+    except UserError:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
+        raise
+
+
+def _connect(urls: Sequence[str]) -> list[Publisher]:
+    if not urls:
+        return []
+    from testbed import mavlink
+
+    links: list[Publisher] = []
+    try:
+        for url in urls:
+            links.append(mavlink.connect(url))
+    except UserError:
+        for link in links:
+            link.close()
+        raise
+    return links
+
+
+def _fly(
+    scenario: Scenario,
+    folder: Path,
+    *,
+    seed: int | None = None,
+    links: Sequence[Publisher] = (),
+    realtime: float | None = None,
+) -> RunResult:
+    from testbed import loop, progress
+
+    try:
+        with progress.shown(_console(stderr=True), scenario.title) as tell:
+            return loop.run(scenario, seed=seed, out=folder, links=links, realtime=realtime, progress=tell)
+    except KeyboardInterrupt:
+        print(f"testbed: interrupted: the record so far is {folder / 'run.nc'}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _conclude(result: RunResult, folder: Path, report: bool) -> None:
+    from testbed import report as reports
+
+    _console().print(reports.summary_table(result.metrics))
+    if report:
+        print(f"report: {reports.write_report(result.dataset, result.metrics, folder)}")
+    print(f"record: {folder / 'run.nc'}")
+
+
+def _show_verdicts(
+    name: str, expect: Mapping[str, Bounds], metrics: Mapping[str, float], verdicts: Mapping[str, bool]
+) -> None:
+    from rich.table import Table
+
+    table = Table("metric", "measured", "expected", "verdict", title=name, title_justify="left")
+    table.columns[0].no_wrap = True
+    for key, bounds in expect.items():
+        measured = f"{metrics[key]:.4g}" if key in metrics else "missing"
+        table.add_row(key, measured, str(bounds), "passed" if verdicts[key] else "[bold red]FAILED")
+    _console().print(table)
+
+
+if __name__ == "__main__":
+    main()
