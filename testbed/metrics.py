@@ -75,9 +75,9 @@ class Errors:
         return np.hypot(self.attitude[:, 0], self.attitude[:, 1])
 
 
-def column(node: xarray.DataTree, name: str) -> npt.NDArray[Any]:
-    """The bare array of one variable of a group."""
-    return np.asarray(cast("xarray.DataArray", node[name]).values)
+def column(dataset: xarray.DataTree, path: str) -> npt.NDArray[Any]:
+    """The bare array of one variable, such as ``truth/v_n``."""
+    return np.asarray(cast("xarray.DataArray", dataset[path]).values)
 
 
 def names(dataset: xarray.DataTree) -> list[str]:
@@ -85,17 +85,22 @@ def names(dataset: xarray.DataTree) -> list[str]:
     return list(dataset["estimators"].children) if "estimators" in dataset.children else []
 
 
+def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:
+    """The aids whose innovations one estimator reported."""
+    children = dataset.children["estimators"].children[estimator].children
+    return list(children["innovations"].children) if "innovations" in children else []
+
+
 def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLING_S) -> Errors:
     """Errors of one estimator of a recorded run."""
-    truth = dataset["truth"]
-    node = dataset[f"estimators/{estimator}"]
-    rows, at = _common(column(node, "time"), column(truth, "time"))
+    own = f"estimators/{estimator}"
+    rows, at = _common(column(dataset, f"{own}/time"), column(dataset, "truth/time"))
 
     def estimated(name: str) -> Array:
-        return np.asarray(column(node, name)[rows], float)
+        return np.asarray(column(dataset, f"{own}/{name}")[rows], np.float64)
 
     def true(name: str) -> Array:
-        return np.asarray(column(truth, name)[at], float)
+        return np.asarray(column(dataset, f"truth/{name}")[at], np.float64)
 
     t = estimated("time")
     position = earth.position_difference_n(
@@ -104,7 +109,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     velocity = estimated("v_n") - true("v_n")
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
-    aligned = (column(node, "status")[rows] & Status.ALIGNED) != 0
+    aligned = (column(dataset, f"{own}/status")[rows] & Status.ALIGNED) != 0
     aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
     finite = np.isfinite(np.column_stack([position, velocity, attitude, covariance.reshape(len(t), -1)])).all(axis=1)
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
@@ -149,7 +154,7 @@ def attitude_error(q: Array, q_true: Array) -> Array:
 
 
 def nees(error: Array, covariance: Array) -> Array:
-    """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) under covariances (N, n, n), NaN where P is singular."""
+    """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) of covariances (N, n, n), NaN where singular."""
     n = error.shape[1]
     sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -172,19 +177,18 @@ def outages(dataset: xarray.DataTree) -> list[Window]:
     changes: list[tuple[float, str, bool]] = []
     receivers = _receivers(dataset)
     for name in receivers:
-        node = dataset[f"sensors/{name}"]
-        fix = column(node, "fix_type") > FixType.NO_FIX
+        fix = column(dataset, f"sensors/{name}/fix_type") > FixType.NO_FIX
         first = np.flatnonzero(np.diff(fix, prepend=~fix[:1]))
-        when = np.where(fix, column(node, "t_arrival"), column(node, "time"))
+        when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), column(dataset, f"sensors/{name}/time"))
         changes += [(float(when[k]), name, bool(fix[k])) for k in first]
     has_fix = dict.fromkeys(receivers, True)
     windows: list[Window] = []
     start: float | None = None
-    for t, name, fix in sorted(changes):
-        has_fix[name] = fix
+    for t, name, fixed in sorted(changes):
+        has_fix[name] = fixed
         if start is None and not any(has_fix.values()):
             start = t
-        elif start is not None and fix:
+        elif start is not None and fixed:
             windows.append((start, t))
             start = None
     return windows if start is None else [*windows, (start, np.inf)]
@@ -227,10 +231,8 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
     result |= _statistics(e, e.valid & ~denied & ~recovering, "")
     result |= _statistics(e, e.valid & denied, "outage_")
     result |= _outage_marks(e, windows) | _recovery(e, windows)
-    node = dataset[f"estimators/{name}"]
-    if "innovations" in node.children:
-        for aid, reports in node["innovations"].children.items():
-            result |= _innovations(reports, aid, e.aligned_s + settling_s)
+    for aid in aids(dataset, name):
+        result |= _innovations(dataset, name, aid, e.aligned_s + settling_s)
     return result
 
 
@@ -296,10 +298,11 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
     return {"recovery_s": max(found)} if found else {}
 
 
-def _innovations(reports: xarray.DataTree, aid: str, start: float) -> dict[str, float]:
-    after = column(reports, "sample_time") >= start
-    value, weight = column(reports, "nis"), column(reports, "weight")
-    m = column(reports, "innovation").shape[1]
+def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
+    own = f"estimators/{estimator}/innovations/{aid}"
+    after = column(dataset, f"{own}/sample_time") >= start
+    value, weight = column(dataset, f"{own}/nis"), column(dataset, f"{own}/weight")
+    m = column(dataset, f"{own}/innovation").shape[1]
     fused = after & (weight > 0) & np.isfinite(value)
     result = {}
     if fused.any():
