@@ -1,0 +1,150 @@
+"""The loop: the same bits however it is watched or paced, events, and a record that survives a crash."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample
+from testbed import Scenario, loop, record, run
+from testbed.truth import MotionSource, TruthBlock
+
+SHORT = ["duration_s=40", "sensors.gnss.denied=[[20, 26]]"]
+
+
+class Watcher:
+    """A link that keeps what it is handed."""
+
+    period_s = 0.04
+
+    def __init__(self) -> None:
+        self.rows: list[float] = []
+        self.gnss_age: list[float] = []
+        self.events: list[tuple[float, str, str]] = []
+        self.closed = False
+
+    def publish(
+        self,
+        truth: TruthBlock,
+        estimate: Estimate,
+        samples: Mapping[str, Sample],
+        imu: ImuSamples | None,
+        others: Sequence[tuple[str, Estimate]],
+    ) -> None:
+        t = float(truth.t[0])
+        assert len(truth) == 1
+        assert estimate.t == pytest.approx(t, abs=1e-9)
+        assert imu is not None
+        assert imu.t[-1] == pytest.approx(t, abs=1e-9)
+        assert all(sample.t_arrival <= t + 1e-9 for sample in samples.values())
+        if "gnss" in samples:
+            self.gnss_age.append(t - samples["gnss"].t)
+        self.rows.append(t)
+
+    def event(self, t: float, severity: str, text: str) -> None:
+        self.events.append((t, severity, text))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def same(a: object, b: object) -> bool:
+    """Whether two recorded datasets hold the same bits."""
+    groups = {node.path: node for node in a.subtree}  # type: ignore[attr-defined]
+    others = {node.path: node for node in b.subtree}  # type: ignore[attr-defined]
+    if groups.keys() != others.keys():
+        return False
+    return all(
+        np.array_equal(variable.values, others[path][name].values, equal_nan=variable.dtype.kind == "f")
+        for path, node in groups.items()
+        for name, variable in node.variables.items()
+    )
+
+
+def test_live_and_batch_give_the_same_bits() -> None:
+    scenario = Scenario.load("u_turn", SHORT)
+    batch = run(scenario, seed=3)
+    watcher = Watcher()
+    live = run(scenario, seed=3, links=[watcher], realtime=1000.0)
+    assert same(batch.dataset, live.dataset)
+    assert watcher.closed
+    np.testing.assert_allclose(watcher.rows, np.arange(1001) * 0.04, atol=1e-9)
+    assert not same(batch.dataset, run(scenario, seed=4).dataset)
+
+
+@pytest.mark.parametrize("batch_s", [0.065, 0.25, 7.0])
+def test_result_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch, batch_s: float) -> None:
+    scenario = Scenario.load("u_turn", [*SHORT, "sensors.gnss.latency_s=0.13"])
+    reference = run(scenario)
+    monkeypatch.setattr(loop, "BATCH_S", batch_s)
+    assert same(reference.dataset, run(scenario).dataset)
+
+
+def test_events_tell_of_denial_reacquisition_and_legs() -> None:
+    watcher = Watcher()
+    run(Scenario.load("u_turn", SHORT), links=[watcher])
+    texts = [text for _, _, text in watcher.events]
+    assert any("aligned" in text for text in texts)
+    denied = next(t for t, _, text in watcher.events if text == "gnss denied")
+    back = next(t for t, _, text in watcher.events if text == "gnss reacquired")
+    assert denied == pytest.approx(20.0, abs=0.41)
+    assert back >= 26.0
+    assert any(text.startswith("leg 1/") for text in texts)
+
+
+def test_crash_leaves_a_readable_record(tmp_path: Path) -> None:
+    scenario = Scenario.load("u_turn", SHORT)
+
+    class Failing:
+        """A motion that breaks after 25 s."""
+
+        def __init__(self, inner: MotionSource) -> None:
+            self.inner = inner
+            self.rate_hz = inner.rate_hz
+            self.ticks = 0
+
+        def advance(self, ticks: int) -> TruthBlock:
+            self.ticks += ticks
+            if self.ticks > 25 * self.rate_hz:
+                raise RuntimeError("the simulator broke")
+            return self.inner.advance(ticks)
+
+        def activity(self) -> str:
+            return ""
+
+    with pytest.raises(RuntimeError, match="simulator broke"):
+        run(scenario, out=tmp_path, source=Failing(loop.motion(scenario, scenario.seed)))
+    dataset = record.load(tmp_path / "run.nc")
+    t = dataset["estimators/ins"]["time"].values
+    assert t[0] == 0.0
+    assert 24.0 <= t[-1] <= 25.0
+    assert np.isfinite(dataset["estimators/ins"]["lat"].values[-1])
+
+
+def test_metrics_and_record_are_written(tmp_path: Path) -> None:
+    result = run(Scenario.load("u_turn", SHORT), out=tmp_path)
+    assert (tmp_path / "metrics.json").exists()
+    assert same(result.dataset, record.load(tmp_path / "run.nc"))
+    assert result.metrics["run.realtime_factor"] > 0
+    assert result.metrics["ins.position_horizontal_rms_m"] > 0
+
+
+def test_gnss_denied_sample_says_so() -> None:
+    watcher = Watcher()
+    seen: list[GnssSample] = []
+    original = watcher.publish
+
+    def publish(truth, estimate, samples, imu, others):  # type: ignore[no-untyped-def]
+        if "gnss" in samples:
+            seen.append(samples["gnss"])
+        original(truth, estimate, samples, imu, others)
+
+    watcher.publish = publish  # type: ignore[method-assign]
+    run(Scenario.load("u_turn", SHORT), links=[watcher])
+    inside = [s for s in seen if 20.5 < s.t < 25.5]
+    assert inside
+    assert all(s.fix_type == FixType.NO_FIX for s in inside)
+    assert all(np.isnan(s.lat) for s in inside)

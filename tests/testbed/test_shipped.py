@@ -1,0 +1,60 @@
+"""Every shipped scenario loads, flies and keeps its promises."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from testbed import Scenario, run
+from testbed.__main__ import judge
+from testbed.data import data_dir
+
+SCENARIOS = sorted(path.stem for path in data_dir("scenarios").glob("*.toml"))
+SHORT_S = 400.0
+
+
+def test_the_promised_scenarios_are_shipped() -> None:
+    promised = {"loiter_gnss_outage", "u_turn", "survey_racetrack_wind", "jammer_zone", "static_bench"}
+    assert promised <= set(SCENARIOS)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_loads_and_says_what_it_shows(name: str) -> None:
+    scenario = Scenario.load(name)
+    assert scenario.title
+    assert scenario.text.startswith("# What this shows")
+    assert scenario.expect, "a scenario without [expect] can't fail"
+
+
+def keeps_its_promises(name: str) -> None:
+    scenario = Scenario.load(name)
+    verdicts = judge(scenario.expect, run(scenario).metrics)
+    assert all(verdicts.values()), verdicts
+
+
+@pytest.mark.parametrize("name", [n for n in SCENARIOS if Scenario.load(n).duration_s <= SHORT_S])
+def test_short_scenario_meets_its_expectations(name: str) -> None:
+    keeps_its_promises(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n in SCENARIOS if Scenario.load(n).duration_s > SHORT_S])
+def test_long_scenario_meets_its_expectations(name: str) -> None:
+    keeps_its_promises(name)
+
+
+@pytest.mark.slow
+def test_sweep_script(tmp_path: Path) -> None:
+    script = data_dir("scenarios") / "sweep_outage.py"
+    out = subprocess.run(
+        [sys.executable, str(script), "--seeds", "1", "--out", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
+    )
+    assert (tmp_path / "sweep_outage.png").stat().st_size > 10_000
+    assert out.stdout.count(" m\n") == 6
