@@ -1,0 +1,97 @@
+"""Airspeed: a pitot tube along body x and a differential pressure transducer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from nav.samples import AirspeedSample
+from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.timing import AidingTiming, Schedule
+from testbed.sensors.units import PERCENT
+from testbed.truth import Column, TruthBlock
+
+COLUMNS: dict[str, Column] = {
+    "t": Column("s", 1, "time of validity"),
+    "t_arrival": Column("s", 1, "time of arrival"),
+    "eas": Column("m/s", 1, "equivalent airspeed along body x"),
+}
+
+SEA_LEVEL_DENSITY = 1.225  # [kg/m^3], U.S. Standard Atmosphere 1976
+REFERENCE_EAS = 25.0  # [m/s], where `AirspeedErrors` turns pressure into speed
+
+GRADES: dict[str, dict[str, Any]] = {
+    "perfect": {},
+    # TE MS4525DO, +-1 psi, 14 bit: 1.05 Pa per count, accuracy 0.25 % of span (17 Pa) before the zero taken on the
+    # ground. What is left after that zero, and the calibration of the tube on the airframe, assumed.
+    "mems": {"scale_percent": 1.0, "bias_pa": 3.0, "noise_pa": 2.0},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class AirspeedErrors:
+    """The sensor's datasheet in SI, 1 sigma, as errors of speed: ``scale`` [1]; ``bias``, ``noise`` [m/s] at
+    `REFERENCE_EAS`, from where they grow as 1/EAS; ``latency`` [s].
+    """
+
+    scale: float
+    bias: float
+    noise: float
+    latency: float
+
+
+class AirspeedConfig(AidingTiming):
+    """Keys of an airspeed sensor. ``grade`` sets the errors; each may be given to override it."""
+
+    kind: Literal["airspeed"] = "airspeed"
+    grade: Literal["perfect", "mems"] = "mems"
+
+    scale_percent: float = Field(0.0, ge=0, le=50, description="of dynamic pressure: half of it in speed")
+    bias_pa: float = Field(0.0, ge=0, le=1e4)
+    noise_pa: float = Field(0.0, ge=0, le=1e4)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_grade(cls, data: Any) -> Any:
+        return with_grade(data, GRADES, "mems")
+
+    def errors(self) -> AirspeedErrors:
+        """The same in SI, linearised: d(EAS) = dq / (rho0 EAS)."""
+        per_pascal = 1 / (SEA_LEVEL_DENSITY * REFERENCE_EAS)
+        return AirspeedErrors(
+            self.scale_percent * PERCENT / 2, self.bias_pa * per_pascal, self.noise_pa * per_pascal, self.latency_s
+        )
+
+
+class Airspeed:
+    """One pitot on one run: q = rho/2 (V cos(alpha) cos(beta))^2, measured q' = (1 + scale) q + bias + noise,
+    EAS = sqrt(2 q'/rho0), zero when q' is negative.
+    """
+
+    def __init__(self, name: str, config: AirspeedConfig, tick_rate_hz: float, seed: int) -> None:
+        self.name = name
+        self.rate_hz = config.rate_hz
+        self.errors = config.errors()
+        self._schedule = Schedule.of(name, config, tick_rate_hz)
+        self._scale = stream(seed, name, "scale").standard_normal() * config.scale_percent * PERCENT
+        self._bias = stream(seed, name, "bias").standard_normal() * config.bias_pa
+        self._white = Process.white(stream(seed, name, "white"), [config.noise_pa])
+
+    def sense(self, truth: TruthBlock) -> list[AirspeedSample]:
+        """The samples that fall inside this block."""
+        rows = self._schedule.rows(truth)
+        n = len(rows)
+        if not n:
+            return []
+        due = slice(rows.start, None, rows.step)
+        along = np.maximum(truth.airspeed[due] * np.cos(truth.alpha[due]) * np.cos(truth.beta[due]), 0.0)
+        q = 0.5 * truth.density[due] * along**2
+        q = (1 + self._scale) * q + self._bias + self._white.take(n)[:, 0]
+        speeds = np.sqrt(2 * np.maximum(q, 0.0) / SEA_LEVEL_DENSITY).tolist()
+        return [
+            AirspeedSample(t, t + self._schedule.latency, eas, self.name)
+            for t, eas in zip(truth.t[due].tolist(), speeds, strict=True)
+        ]

@@ -1,0 +1,87 @@
+"""Barometer: static pressure with bias, drift and noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from pydantic import Field, model_validator
+
+from nav.samples import BarometerSample
+from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.timing import AidingTiming, Schedule
+from testbed.truth import Column, TruthBlock
+
+COLUMNS: dict[str, Column] = {
+    "t": Column("s", 1, "time of validity"),
+    "t_arrival": Column("s", 1, "time of arrival"),
+    "pressure": Column("Pa", 1, "static pressure"),
+}
+
+GRADES: dict[str, dict[str, Any]] = {
+    "perfect": {},
+    # TE MS5611-01BA03 data sheet: accuracy +-1.5 mbar (taken as three sigma), resolution 0.012 mbar rms at the highest
+    # oversampling. Drift, from temperature inside its +-2.5 mbar error band and from the weather, assumed.
+    "mems": {"bias_pa": 50.0, "drift_pa": 15.0, "drift_time_s": 1800.0, "noise_pa": 1.2},
+}
+
+
+@dataclass(frozen=True, slots=True)
+class BarometerErrors:
+    """The sensor's datasheet, 1 sigma: ``noise``, constant ``bias``, Gauss-Markov ``drift`` [Pa] with ``drift_tau``,
+    ``latency`` [s]. Near the ground 12 Pa are a metre.
+    """
+
+    noise: float
+    bias: float
+    drift: float
+    drift_tau: float
+    latency: float
+
+
+class BarometerConfig(AidingTiming):
+    """Keys of a barometer. ``grade`` sets the errors; each may be given to override it."""
+
+    kind: Literal["barometer"] = "barometer"
+    grade: Literal["perfect", "mems"] = "mems"
+
+    bias_pa: float = Field(0.0, ge=0, le=1e5)
+    drift_pa: float = Field(0.0, ge=0, le=1e5)
+    drift_time_s: float = Field(1800.0, gt=0, le=1e6)
+    noise_pa: float = Field(0.0, ge=0, le=1e5)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_grade(cls, data: Any) -> Any:
+        return with_grade(data, GRADES, "mems")
+
+    def errors(self) -> BarometerErrors:
+        """The same as a plain record."""
+        return BarometerErrors(self.noise_pa, self.bias_pa, self.drift_pa, self.drift_time_s, self.latency_s)
+
+
+class Barometer:
+    """One barometer on one run: measured = pressure + bias + drift + noise."""
+
+    def __init__(self, name: str, config: BarometerConfig, tick_rate_hz: float, seed: int) -> None:
+        self.name = name
+        self.rate_hz = config.rate_hz
+        self.errors = e = config.errors()
+        self._schedule = Schedule.of(name, config, tick_rate_hz)
+        self._bias = stream(seed, name, "bias").standard_normal() * e.bias
+        self._drift = Process.gauss_markov(stream(seed, name, "drift"), [e.drift], e.drift_tau, 1 / config.rate_hz)
+        self._white = Process.white(stream(seed, name, "white"), [e.noise])
+
+    def sense(self, truth: TruthBlock) -> list[BarometerSample]:
+        """The samples that fall inside this block."""
+        rows = self._schedule.rows(truth)
+        n = len(rows)
+        if not n:
+            return []
+        error = self._bias + self._drift.take(n)[:, 0] + self._white.take(n)[:, 0]
+        due = slice(rows.start, None, rows.step)
+        pressures = (truth.pressure[due] + error).tolist()
+        return [
+            BarometerSample(t, t + self._schedule.latency, pressure, self.name)
+            for t, pressure in zip(truth.t[due].tolist(), pressures, strict=True)
+        ]

@@ -1,0 +1,348 @@
+"""GNSS receiver: position and velocity of the antenna, with denial and reacquisition.
+
+Errors are white plus first-order Gauss-Markov, independent along north, east and down. They go on while the receiver
+hears nothing, as the atmosphere does. The reported accuracy is the standard deviation of what is added.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from nav._jit import njit
+from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
+from nav.rotation import quat_rotate
+from nav.samples import Array, FixType, GnssSample
+from testbed.schema import Section
+from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.timing import AidingTiming, Schedule
+from testbed.sensors.units import DEG
+from testbed.truth import Column, TruthBlock
+
+COLUMNS: dict[str, Column] = {
+    "t": Column("s", 1, "time of validity"),
+    "t_arrival": Column("s", 1, "time of arrival"),
+    "lat": Column("rad", 1, "geodetic latitude of the antenna, WGS84; NaN without a fix"),
+    "lon": Column("rad", 1, "longitude of the antenna, WGS84"),
+    "h": Column("m", 1, "height of the antenna above the ellipsoid"),
+    "v_n": Column("m/s", 3, "velocity of the antenna over ground, NED"),
+    "sigma_position_n": Column("m", 3, "reported 1-sigma position accuracy, NED"),
+    "sigma_velocity_n": Column("m/s", 3, "reported 1-sigma velocity accuracy, NED"),
+    "fix_type": Column("1", 1, "1 no fix, 3 three-dimensional fix"),
+    "satellites": Column("1", 1, "satellites used"),
+    "hdop": Column("1", 1, "horizontal dilution of precision"),
+    "vdop": Column("1", 1, "vertical dilution of precision"),
+}
+
+NO_FIX_DOP = 99.99  # what receivers report when they have none
+SATELLITES_SIGMA = 1.0  # how the number in view comes and goes
+SATELLITES_TAU = 300.0  # [s]
+MIN_SATELLITES = 5  # below which this receiver would not call it a 3D fix
+
+# Horizontal figures are per axis. For a circular Gaussian with sigma per axis, CEP = 1.177 sigma, 95 % = 2.448 sigma;
+# vertical 95 % = 1.96 sigma. Correlation: multipath 10-900 s, troposphere 900-2700 s (Joerger & Pervan 2020); 300 s
+# stands for the mixture. Where not stated, the split into white and correlated is assumed.
+GRADES: dict[str, dict[str, Any]] = {
+    "perfect": {},
+    # Single-frequency SPS, 1.5 m rms horizontally: between the 2 m CEP of the u-blox M9 data sheet and the FAA SPS
+    # Performance Analysis Report 108 (survey-grade sites). Velocity 0.05 m/s: u-blox M9.
+    "standalone": {
+        "horizontal_white_m": 0.4,
+        "horizontal_correlated_m": 1.0,
+        "vertical_white_m": 0.8,
+        "vertical_correlated_m": 2.0,
+        "correlation_time_s": 300.0,
+        "horizontal_velocity_white_mps": 0.05,
+        "horizontal_velocity_correlated_mps": 0.02,
+        "vertical_velocity_white_mps": 0.08,
+        "vertical_velocity_correlated_mps": 0.03,
+        "velocity_correlation_time_s": 10.0,
+        "latency_s": 0.1,
+        "reacquire_s": 2.0,
+        "satellites": 12,
+        "hdop": 0.9,
+        "vdop": 1.4,
+    },
+    # FAA WAAS Performance Analysis Report 10: 95 % of 0.61-1.06 m horizontally, 1.03-1.79 m vertically.
+    "sbas": {
+        "horizontal_white_m": 0.2,
+        "horizontal_correlated_m": 0.3,
+        "vertical_white_m": 0.35,
+        "vertical_correlated_m": 0.6,
+        "correlation_time_s": 300.0,
+        "horizontal_velocity_white_mps": 0.05,
+        "horizontal_velocity_correlated_mps": 0.02,
+        "vertical_velocity_white_mps": 0.08,
+        "vertical_velocity_correlated_mps": 0.03,
+        "velocity_correlation_time_s": 10.0,
+        "latency_s": 0.1,
+        "reacquire_s": 2.0,
+        "satellites": 14,
+        "hdop": 0.8,
+        "vdop": 1.2,
+    },
+    # u-blox ZED-F9P data sheet: RTK 0.01 m + 1 ppm CEP horizontally and vertically, velocity 0.05 m/s.
+    "rtk": {
+        "horizontal_white_m": 0.005,
+        "horizontal_correlated_m": 0.007,
+        "vertical_white_m": 0.01,
+        "vertical_correlated_m": 0.012,
+        "correlation_time_s": 100.0,
+        "horizontal_velocity_white_mps": 0.03,
+        "horizontal_velocity_correlated_mps": 0.01,
+        "vertical_velocity_white_mps": 0.05,
+        "vertical_velocity_correlated_mps": 0.02,
+        "velocity_correlation_time_s": 10.0,
+        "latency_s": 0.1,
+        "reacquire_s": 10.0,
+        "satellites": 20,
+        "hdop": 0.6,
+        "vdop": 0.9,
+    },
+}
+
+
+class Jammer(Section):
+    """A transmitter on the ground inside whose radius the receiver hears nothing."""
+
+    lat_deg: float = Field(ge=-90, le=90)
+    lon_deg: float = Field(ge=-180, le=180)
+    radius_m: float = Field(gt=0, le=1e6)
+
+
+@dataclass(frozen=True, slots=True)
+class GnssErrors:
+    """The receiver's datasheet in SI, 1 sigma along north, east, down: what an estimator may be told.
+
+    ``position_white_n``, ``position_correlated_n`` (3,) [m] with ``position_tau`` [s]; ``velocity_white_n``,
+    ``velocity_correlated_n`` (3,) [m/s] with ``velocity_tau`` [s]; ``lever_arm_b`` (3,) [m] from the centre of gravity
+    to the antenna; ``latency`` [s].
+    """
+
+    position_white_n: Array
+    position_correlated_n: Array
+    position_tau: float
+    velocity_white_n: Array
+    velocity_correlated_n: Array
+    velocity_tau: float
+    lever_arm_b: Array
+    latency: float
+
+
+class GnssConfig(AidingTiming):
+    """Keys of a GNSS receiver. ``grade`` sets the errors; each may be given to override it. Horizontal: per axis."""
+
+    kind: Literal["gnss"] = "gnss"
+    grade: Literal["perfect", "standalone", "sbas", "rtk"] = "standalone"
+    rate_hz: float = Field(5.0, gt=0, le=100)
+
+    horizontal_white_m: float = Field(0.0, ge=0, le=1e4)
+    horizontal_correlated_m: float = Field(0.0, ge=0, le=1e4)
+    vertical_white_m: float = Field(0.0, ge=0, le=1e4)
+    vertical_correlated_m: float = Field(0.0, ge=0, le=1e4)
+    correlation_time_s: float = Field(300.0, gt=0, le=1e6)
+    horizontal_velocity_white_mps: float = Field(0.0, ge=0, le=100)
+    horizontal_velocity_correlated_mps: float = Field(0.0, ge=0, le=100)
+    vertical_velocity_white_mps: float = Field(0.0, ge=0, le=100)
+    vertical_velocity_correlated_mps: float = Field(0.0, ge=0, le=100)
+    velocity_correlation_time_s: float = Field(10.0, gt=0, le=1e6)
+    satellites: int = Field(12, ge=MIN_SATELLITES, le=60)
+    hdop: float = Field(0.9, gt=0, le=50)
+    vdop: float = Field(1.4, gt=0, le=50)
+    lever_arm_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
+
+    reacquire_s: float = Field(0.0, ge=0, le=3600, description="from the end of denial to the first fix")
+    settle_factor: float = Field(2.0, ge=1, le=100, description="errors and reported accuracy at the first fix")
+    settle_s: float = Field(5.0, gt=0, le=3600, description="time constant of their return to normal")
+    denied: tuple[tuple[float, float], ...] = Field((), description="windows of simulated time without signals")
+    jammers: tuple[Jammer, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_grade(cls, data: Any) -> Any:
+        return with_grade(data, GRADES, "standalone")
+
+    @field_validator("denied")
+    @classmethod
+    def _windows_in_order(cls, windows: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        for start, end in windows:
+            if start < 0:
+                raise ValueError(f"window [{start:g}, {end:g}] starts before the run; times are seconds from its start")
+            if end <= start:
+                raise ValueError(f"window [{start:g}, {end:g}] ends before it starts; write [start, end] in seconds")
+        ordered = tuple(sorted(windows))
+        for (a, b), (c, d) in pairwise(ordered):
+            if c < b:
+                raise ValueError(f"windows [{a:g}, {b:g}] and [{c:g}, {d:g}] overlap; join them into one")
+        return ordered
+
+    def errors(self) -> GnssErrors:
+        """The same in SI."""
+
+        def ned(horizontal: float, vertical: float) -> Array:
+            return np.array([horizontal, horizontal, vertical])
+
+        return GnssErrors(
+            position_white_n=ned(self.horizontal_white_m, self.vertical_white_m),
+            position_correlated_n=ned(self.horizontal_correlated_m, self.vertical_correlated_m),
+            position_tau=self.correlation_time_s,
+            velocity_white_n=ned(self.horizontal_velocity_white_mps, self.vertical_velocity_white_mps),
+            velocity_correlated_n=ned(self.horizontal_velocity_correlated_mps, self.vertical_velocity_correlated_mps),
+            velocity_tau=self.velocity_correlation_time_s,
+            lever_arm_b=np.array(self.lever_arm_m, dtype=float),
+            latency=self.latency_s,
+        )
+
+
+class Gnss:
+    """One receiver on one run. ``sense`` is called with consecutive truth blocks of any length."""
+
+    def __init__(self, name: str, config: GnssConfig, tick_rate_hz: float, seed: int) -> None:
+        self.name = name
+        self.rate_hz = config.rate_hz
+        self.errors = e = config.errors()
+        self._config = config
+        self._schedule = Schedule.of(name, config, tick_rate_hz)
+        dt = 1 / config.rate_hz
+        self._white = Process.white(
+            stream(seed, name, "white"), np.concatenate([e.position_white_n, e.velocity_white_n])
+        )
+        self._correlated = Process.gauss_markov(
+            stream(seed, name, "correlated"),
+            np.concatenate([e.position_correlated_n, e.velocity_correlated_n]),
+            np.repeat([e.position_tau, e.velocity_tau], 3),
+            dt,
+        )
+        self._sky = Process.gauss_markov(stream(seed, name, "sky"), [SATELLITES_SIGMA], SATELLITES_TAU, dt)
+        self._sigma_position_n = np.hypot(e.position_white_n, e.position_correlated_n)
+        self._sigma_velocity_n = np.hypot(e.velocity_white_n, e.velocity_correlated_n)
+        self._jammers = [
+            (ecef_from_geodetic(j.lat_deg * DEG, j.lon_deg * DEG, 0.0), j.radius_m) for j in config.jammers
+        ]
+        self._denied_until = -math.inf
+
+    def sense(self, truth: TruthBlock) -> list[GnssSample]:
+        """The epochs that fall inside this block; those without a fix are delivered too."""
+        rows = self._schedule.rows(truth)
+        n = len(rows)
+        if not n:
+            return []
+        noise = self._white.take(n)
+        noise += self._correlated.take(n)
+        sky = self._sky.take(n)
+        antenna = np.empty((n, 6))
+        _antenna(
+            rows.start,
+            rows.step,
+            truth.lat,
+            truth.lon,
+            truth.h,
+            truth.v_n,
+            truth.q_nb,
+            truth.omega_b,
+            self.errors.lever_arm_b,
+            antenna,
+        )
+        return [self._sample(float(truth.t[k]), antenna[i], noise[i], sky[i, 0]) for i, k in enumerate(rows)]
+
+    def _sample(self, t: float, antenna: Array, noise: Array, sky: float) -> GnssSample:
+        if not self._has_fix(t, antenna):
+            return self._no_fix(t)
+        config = self._config
+        unsettled = 1 + (config.settle_factor - 1) * math.exp(
+            -(t - self._denied_until - config.reacquire_s) / config.settle_s
+        )
+        noise = noise * unsettled
+        lat, lon, h = antenna[0], antenna[1], antenna[2]
+        R_M, R_N = radii(lat)
+        satellites = max(MIN_SATELLITES, round((config.satellites + sky) / unsettled))
+        dilution = math.sqrt(config.satellites / satellites)
+        return GnssSample(
+            t,
+            t + config.latency_s,
+            float(lat + noise[0] / (R_M + h)),
+            float(wrap_longitude(lon + noise[1] / ((R_N + h) * math.cos(lat)))),
+            float(h - noise[2]),
+            antenna[3:] + noise[3:],
+            self._sigma_position_n * unsettled,
+            self._sigma_velocity_n * unsettled,
+            FixType.FIX_3D,
+            satellites,
+            config.hdop * dilution,
+            config.vdop * dilution,
+            self.name,
+        )
+
+    def _no_fix(self, t: float) -> GnssSample:
+        nothing = np.full(3, np.nan)
+        return GnssSample(
+            t,
+            t + self._config.latency_s,
+            math.nan,
+            math.nan,
+            math.nan,
+            nothing,
+            nothing,
+            nothing,
+            FixType.NO_FIX,
+            0,
+            NO_FIX_DOP,
+            NO_FIX_DOP,
+            self.name,
+        )
+
+    def _has_fix(self, t: float, antenna: Array) -> bool:
+        """Signals are heard, and have been for the time it takes to reacquire."""
+        for start, end in self._config.denied:
+            if start <= t:
+                self._denied_until = max(self._denied_until, end)
+        if self._is_jammed(antenna):
+            self._denied_until = max(self._denied_until, t)
+            return False
+        return t >= self._denied_until + self._config.reacquire_s
+
+    def _is_jammed(self, antenna: Array) -> bool:
+        """Whether the point below the antenna is within a jammer's radius, as the crow flies."""
+        if not self._jammers:
+            return False
+        ground = ecef_from_geodetic(antenna[0], antenna[1], 0.0)
+        return any(math.dist(ground, centre) <= radius for centre, radius in self._jammers)
+
+
+@njit
+def _antenna(
+    start: int,
+    step: int,
+    lat: Array,
+    lon: Array,
+    h: Array,
+    v_n: Array,
+    q_nb: Array,
+    omega_b: Array,
+    lever: Array,
+    out: Array,
+) -> None:
+    """[lat, lon, h, v_n] of the antenna on every ``step``-th row into ``out`` (n, 6).
+
+    r_antenna = r + C_nb l; v_antenna = v + (C_nb omega_ib_b - omega_ie_n) x C_nb l.
+    """
+    has_lever = lever[0] != 0.0 or lever[1] != 0.0 or lever[2] != 0.0
+    for i in range(out.shape[0]):
+        k = start + i * step
+        out[i, 0], out[i, 1], out[i, 2] = lat[k], lon[k], h[k]
+        out[i, 3], out[i, 4], out[i, 5] = v_n[k, 0], v_n[k, 1], v_n[k, 2]
+        if has_lever:
+            arm = quat_rotate(q_nb[k], lever)
+            rate = quat_rotate(q_nb[k], omega_b[k]) - earth_rate_n(lat[k])
+            R_M, R_N = radii(lat[k])
+            out[i, 0] += arm[0] / (R_M + h[k])
+            out[i, 1] = wrap_longitude(lon[k] + arm[1] / ((R_N + h[k]) * math.cos(lat[k])))
+            out[i, 2] -= arm[2]
+            out[i, 3] += rate[1] * arm[2] - rate[2] * arm[1]
+            out[i, 4] += rate[2] * arm[0] - rate[0] * arm[2]
+            out[i, 5] += rate[0] * arm[1] - rate[1] * arm[0]

@@ -1,0 +1,566 @@
+"""Inertial measurement unit: true increments in, increments of a real unit out.
+
+Chain, tick by tick: lever arm -> engine vibration -> bandwidth -> mounting, misalignment, scale factor and its
+asymmetry, g-sensitivity -> summed over the output interval -> biases and noise -> range -> resolution.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.linalg import expm
+
+from nav._jit import njit
+from nav.rotation import dcm_from_quat, quat_from_euler
+from nav.samples import Array, ImuSamples
+from testbed.schema import Section
+from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.timing import ticks_per_sample
+from testbed.sensors.units import (
+    DEG,
+    DEG_PER_H,
+    DEG_PER_H_PER_ROOT_H,
+    DEG_PER_ROOT_H,
+    MG,
+    MG_PER_ROOT_H,
+    MPS_PER_ROOT_H,
+    MRAD,
+    PPM,
+    G,
+)
+from testbed.truth import Column, TruthBlock
+
+COLUMNS: dict[str, Column] = {
+    "t": Column("s", 1, "end of the interval"),
+    "dt": Column("s", 1, "length of the interval"),
+    "dtheta": Column("rad", 3, "integrated angular rate relative to i, axes of the unit"),
+    "dv": Column("m/s", 3, "integrated specific force, axes of the unit"),
+}
+
+# A Gauss-Markov process of standard deviation sigma and correlation time tau has the Allan deviation
+# sigma sqrt(2 tau/T (1 - tau/(2 T) (3 - 4 exp(-T/tau) + exp(-2 T/tau)))) (IEEE Std 952, annex C), flat around its
+# maximum of 0.6174 sigma at T = 1.89 tau. A datasheet's in-run instability is the height of that flat region.
+ALLAN_PEAK = 0.6174
+VIBRATION_RPM = 6000.0  # the engine speed at which the vibration keys hold; imbalance forces grow with its square
+SECOND_HARMONIC = 0.5  # amplitude of the tone at two per rev over that at one per rev
+
+# Sources. Where a datasheet is silent or gives worst-case limits, the figure is typical of the class: "assumed".
+GRADES: dict[str, dict[str, Any]] = {
+    "perfect": {},
+    # Honeywell HG9900 brochure N61-1638: gyro bias 0.0035 deg/h, ARW 0.002 deg/sqrt(h), scale 5 ppm; accelerometer bias
+    # 25 ug, scale 100 ppm. Turn-on 0.01 deg/h defines the class (Groves 2013, table 4.1). Rest assumed.
+    "navigation": {
+        "gyro_turn_on_degph": 0.01,
+        "gyro_instability_degph": 0.0035,
+        "gyro_instability_tau_s": 500.0,
+        "angle_random_walk_degprth": 0.002,
+        "gyro_rate_random_walk_degphprth": 0.0005,
+        "gyro_scale_ppm": 5.0,
+        "gyro_scale_asymmetry_ppm": 1.0,
+        "gyro_misalignment_mrad": 0.02,
+        "gyro_nonorthogonality_mrad": 0.01,
+        "gyro_temperature_degphpk": 0.0002,
+        "gyro_range_degps": 400.0,
+        "gyro_resolution_degps": 1e-6,
+        "gyro_bandwidth_hz": 300.0,
+        "accel_turn_on_mg": 0.025,
+        "accel_instability_mg": 0.005,
+        "accel_instability_tau_s": 500.0,
+        "velocity_random_walk_mpsprth": 0.005,
+        "accel_random_walk_mgprth": 0.0005,
+        "accel_scale_ppm": 100.0,
+        "accel_scale_asymmetry_ppm": 10.0,
+        "accel_misalignment_mrad": 0.02,
+        "accel_nonorthogonality_mrad": 0.01,
+        "accel_temperature_mgpk": 0.0005,
+        "accel_range_g": 30.0,
+        "accel_resolution_mg": 0.0005,
+        "accel_bandwidth_hz": 300.0,
+    },
+    # Sensonor STIM300 datasheet TS1524: gyro in-run 0.5 deg/h, ARW 0.15 deg/sqrt(h), scale 500 ppm, 5 deg/h rms over
+    # static temperature, g-sensitivity 1 deg/h/g (compensated), 400 deg/s; 10 g accelerometer in-run 0.05 mg,
+    # VRW 0.06 m/s/sqrt(h), scale 300 ppm, on/off 0.75 mg, misalignment 1 mrad, filter up to 262 Hz, 24 bit. Rest
+    # assumed.
+    "tactical": {
+        "gyro_turn_on_degph": 5.0,
+        "gyro_instability_degph": 0.5,
+        "gyro_instability_tau_s": 200.0,
+        "angle_random_walk_degprth": 0.15,
+        "gyro_rate_random_walk_degphprth": 0.1,
+        "gyro_scale_ppm": 500.0,
+        "gyro_scale_asymmetry_ppm": 50.0,
+        "gyro_misalignment_mrad": 1.0,
+        "gyro_nonorthogonality_mrad": 0.2,
+        "gyro_g_sensitivity_degphpg": 1.0,
+        "gyro_temperature_degphpk": 0.1,
+        "gyro_range_degps": 400.0,
+        "gyro_resolution_degps": 6.1e-5,
+        "gyro_bandwidth_hz": 262.0,
+        "accel_turn_on_mg": 0.75,
+        "accel_instability_mg": 0.05,
+        "accel_instability_tau_s": 200.0,
+        "velocity_random_walk_mpsprth": 0.06,
+        "accel_random_walk_mgprth": 0.005,
+        "accel_scale_ppm": 300.0,
+        "accel_scale_asymmetry_ppm": 30.0,
+        "accel_misalignment_mrad": 1.0,
+        "accel_nonorthogonality_mrad": 0.2,
+        "accel_temperature_mgpk": 0.01,
+        "accel_range_g": 10.0,
+        "accel_resolution_mg": 0.0019,
+        "accel_bandwidth_hz": 262.0,
+    },
+    # Analog Devices ADIS16495-1 datasheet Rev. C: gyro in-run 0.8 deg/h, ARW 0.09 deg/sqrt(h), +-125 deg/s;
+    # accelerometer in-run 3.2 ug, +-8 g; axis to axis 0.05 deg, axis to package 0.25 deg maximum (taken as three
+    # sigma). Rest assumed, the turn-on after the bias correction at start-up that the part offers.
+    "mems-industrial": {
+        "gyro_turn_on_degph": 15.0,
+        "gyro_instability_degph": 0.8,
+        "gyro_instability_tau_s": 200.0,
+        "angle_random_walk_degprth": 0.09,
+        "gyro_rate_random_walk_degphprth": 0.3,
+        "gyro_scale_ppm": 800.0,
+        "gyro_scale_asymmetry_ppm": 80.0,
+        "gyro_misalignment_mrad": 1.5,
+        "gyro_nonorthogonality_mrad": 0.87,
+        "gyro_g_sensitivity_degphpg": 5.0,
+        "gyro_temperature_degphpk": 0.3,
+        "gyro_range_degps": 125.0,
+        "gyro_resolution_degps": 1e-5,
+        "gyro_bandwidth_hz": 300.0,
+        "accel_turn_on_mg": 1.0,
+        "accel_instability_mg": 0.0032,
+        "accel_instability_tau_s": 200.0,
+        "velocity_random_walk_mpsprth": 0.01,
+        "accel_random_walk_mgprth": 0.001,
+        "accel_scale_ppm": 500.0,
+        "accel_scale_asymmetry_ppm": 50.0,
+        "accel_misalignment_mrad": 1.5,
+        "accel_nonorthogonality_mrad": 0.87,
+        "accel_temperature_mgpk": 0.01,
+        "accel_range_g": 8.0,
+        "accel_resolution_mg": 0.0005,
+        "accel_bandwidth_hz": 300.0,
+    },
+    # Turn-on 40 deg/h and 2 mg: the unit of Jiang et al. 2021 (attitude of a loitering vehicle without GNSS), after
+    # calibration. Noise: Bosch BMI088 datasheet BST-BMI088-DS001, 0.014 deg/s/sqrt(Hz) and 175 ug/sqrt(Hz); 16 bit on
+    # +-500 deg/s and +-12 g. Rest assumed, for a calibrated part.
+    "mems-consumer": {
+        "gyro_turn_on_degph": 40.0,
+        "gyro_instability_degph": 5.0,
+        "gyro_instability_tau_s": 200.0,
+        "angle_random_walk_degprth": 0.84,
+        "gyro_rate_random_walk_degphprth": 2.0,
+        "gyro_scale_ppm": 1000.0,
+        "gyro_scale_asymmetry_ppm": 200.0,
+        "gyro_misalignment_mrad": 2.0,
+        "gyro_nonorthogonality_mrad": 1.0,
+        "gyro_g_sensitivity_degphpg": 10.0,
+        "gyro_temperature_degphpk": 1.0,
+        "gyro_range_degps": 500.0,
+        "gyro_resolution_degps": 500 / 2**15,
+        "gyro_bandwidth_hz": 116.0,
+        "accel_turn_on_mg": 2.0,
+        "accel_instability_mg": 0.03,
+        "accel_instability_tau_s": 200.0,
+        "velocity_random_walk_mpsprth": 0.103,
+        "accel_random_walk_mgprth": 0.02,
+        "accel_scale_ppm": 1000.0,
+        "accel_scale_asymmetry_ppm": 200.0,
+        "accel_misalignment_mrad": 2.0,
+        "accel_nonorthogonality_mrad": 1.0,
+        "accel_temperature_mgpk": 0.02,
+        "accel_range_g": 12.0,
+        "accel_resolution_mg": 12_000 / 2**15,
+        "accel_bandwidth_hz": 145.0,
+    },
+}
+# How the unit is mounted and warms up is the aircraft's doing, the same for every grade that is not perfect: a small
+# engine behind soft rubber (assumed).
+INSTALLATION = {"vibration_mg": 30.0, "vibration_degps": 0.2, "self_heating_k": 5.0}
+for _name, _grade in GRADES.items():
+    if _name != "perfect":
+        _grade.update(INSTALLATION)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuErrors:
+    """The unit's datasheet in SI: what an estimator may be told. All sizes are 1 sigma per axis.
+
+    Random walks: ``gyro_noise`` [rad/sqrt(s)], ``accel_noise`` [m/s/sqrt(s)]. Biases: ``*_turn_on`` constant of a run,
+    ``*_in_run`` Gauss-Markov with correlation time ``*_in_run_tau`` [s], ``*_random_walk`` per sqrt(s), all
+    in rad/s and m/s^2. ``*_scale`` and ``*_scale_asymmetry`` [1], ``*_misalignment`` and ``*_nonorthogonality`` [rad],
+    ``gyro_g_sensitivity`` [rad/s per m/s^2], ``*_temperature`` per kelvin. ``lever_arm_b`` (3,) [m] from the centre of
+    gravity, ``C_sb`` (3, 3) from body axes to the axes of the unit.
+    """
+
+    gyro_noise: float
+    gyro_turn_on: float
+    gyro_in_run: float
+    gyro_in_run_tau: float
+    gyro_random_walk: float
+    gyro_scale: float
+    gyro_scale_asymmetry: float
+    gyro_misalignment: float
+    gyro_nonorthogonality: float
+    gyro_g_sensitivity: float
+    gyro_temperature: float
+    accel_noise: float
+    accel_turn_on: float
+    accel_in_run: float
+    accel_in_run_tau: float
+    accel_random_walk: float
+    accel_scale: float
+    accel_scale_asymmetry: float
+    accel_misalignment: float
+    accel_nonorthogonality: float
+    accel_temperature: float
+    lever_arm_b: Array
+    C_sb: Array
+
+
+class ImuConfig(Section):
+    """Keys of an inertial unit. ``grade`` sets all the others; each may be given to override the datasheet.
+
+    Errors are 1 sigma per axis. Units end the names: degph deg/h, degprth deg/sqrt(h), degphprth deg/h/sqrt(h),
+    mpsprth m/s/sqrt(h), mgprth mg/sqrt(h), degphpk deg/h/K, degphpg deg/h/g.
+    """
+
+    kind: Literal["imu"] = "imu"
+    grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = "mems-consumer"
+    rate_hz: float = Field(200.0, gt=0, le=10_000)
+
+    gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5)
+    gyro_instability_degph: float = Field(0.0, ge=0, le=1e4)
+    gyro_instability_tau_s: float = Field(200.0, gt=0, le=1e6)
+    angle_random_walk_degprth: float = Field(0.0, ge=0, le=1e3)
+    gyro_rate_random_walk_degphprth: float = Field(0.0, ge=0, le=1e4)
+    gyro_scale_ppm: float = Field(0.0, ge=0, le=1e5)
+    gyro_scale_asymmetry_ppm: float = Field(0.0, ge=0, le=1e5)
+    gyro_misalignment_mrad: float = Field(0.0, ge=0, le=100)
+    gyro_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100)
+    gyro_g_sensitivity_degphpg: float = Field(0.0, ge=0, le=1e4)
+    gyro_temperature_degphpk: float = Field(0.0, ge=0, le=1e3)
+    gyro_range_degps: float | None = Field(None, gt=0, le=1e5)
+    gyro_resolution_degps: float = Field(0.0, ge=0, le=100)
+    gyro_bandwidth_hz: float | None = Field(None, gt=0, le=1e5)
+
+    accel_turn_on_mg: float = Field(0.0, ge=0, le=1e3)
+    accel_instability_mg: float = Field(0.0, ge=0, le=1e3)
+    accel_instability_tau_s: float = Field(200.0, gt=0, le=1e6)
+    velocity_random_walk_mpsprth: float = Field(0.0, ge=0, le=1e3)
+    accel_random_walk_mgprth: float = Field(0.0, ge=0, le=1e3)
+    accel_scale_ppm: float = Field(0.0, ge=0, le=1e5)
+    accel_scale_asymmetry_ppm: float = Field(0.0, ge=0, le=1e5)
+    accel_misalignment_mrad: float = Field(0.0, ge=0, le=100)
+    accel_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100)
+    accel_temperature_mgpk: float = Field(0.0, ge=0, le=100)
+    accel_range_g: float | None = Field(None, gt=0, le=1e4)
+    accel_resolution_mg: float = Field(0.0, ge=0, le=1e3)
+    accel_bandwidth_hz: float | None = Field(None, gt=0, le=1e5)
+
+    vibration_mg: float = Field(0.0, ge=0, le=1e5, description="amplitude at one per rev and 6000 rpm")
+    vibration_degps: float = Field(0.0, ge=0, le=1e4, description="amplitude at one per rev and 6000 rpm")
+    self_heating_k: float = Field(0.0, ge=0, le=100, description="how much the unit warms up after power-on")
+    self_heating_tau_s: float = Field(300.0, gt=0, le=1e5)
+
+    lever_arm_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
+    mounting_deg: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="roll, pitch, heading of the unit")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_grade(cls, data: Any) -> Any:
+        return with_grade(data, GRADES, "mems-consumer")
+
+    def errors(self) -> ImuErrors:
+        """The same in SI."""
+        roll, pitch, heading = (float(a) * DEG for a in self.mounting_deg)
+        return ImuErrors(
+            gyro_noise=self.angle_random_walk_degprth * DEG_PER_ROOT_H,
+            gyro_turn_on=self.gyro_turn_on_degph * DEG_PER_H,
+            gyro_in_run=self.gyro_instability_degph * DEG_PER_H / ALLAN_PEAK,
+            gyro_in_run_tau=self.gyro_instability_tau_s,
+            gyro_random_walk=self.gyro_rate_random_walk_degphprth * DEG_PER_H_PER_ROOT_H,
+            gyro_scale=self.gyro_scale_ppm * PPM,
+            gyro_scale_asymmetry=self.gyro_scale_asymmetry_ppm * PPM,
+            gyro_misalignment=self.gyro_misalignment_mrad * MRAD,
+            gyro_nonorthogonality=self.gyro_nonorthogonality_mrad * MRAD,
+            gyro_g_sensitivity=self.gyro_g_sensitivity_degphpg * DEG_PER_H / G,
+            gyro_temperature=self.gyro_temperature_degphpk * DEG_PER_H,
+            accel_noise=self.velocity_random_walk_mpsprth * MPS_PER_ROOT_H,
+            accel_turn_on=self.accel_turn_on_mg * MG,
+            accel_in_run=self.accel_instability_mg * MG / ALLAN_PEAK,
+            accel_in_run_tau=self.accel_instability_tau_s,
+            accel_random_walk=self.accel_random_walk_mgprth * MG_PER_ROOT_H,
+            accel_scale=self.accel_scale_ppm * PPM,
+            accel_scale_asymmetry=self.accel_scale_asymmetry_ppm * PPM,
+            accel_misalignment=self.accel_misalignment_mrad * MRAD,
+            accel_nonorthogonality=self.accel_nonorthogonality_mrad * MRAD,
+            accel_temperature=self.accel_temperature_mgpk * MG,
+            lever_arm_b=np.array(self.lever_arm_m, dtype=float),
+            C_sb=dcm_from_quat(quat_from_euler(roll, pitch, heading)).T.copy(),
+        )
+
+
+class Imu:
+    """One unit on one run: its turn-on errors are drawn here, its in-run errors as it senses.
+
+    ``sense`` is called with consecutive truth blocks of any length. Raises UserError when the rate does not divide the
+    tick rate.
+    """
+
+    def __init__(self, name: str, config: ImuConfig, tick_rate_hz: float, seed: int) -> None:
+        self.name = name
+        self.rate_hz = config.rate_hz
+        self.errors = config.errors()
+        self._every = ticks_per_sample(name, config.rate_hz, tick_rate_hz)
+        self._dt = self._every / tick_rate_hz
+        self._tick_s = 1 / tick_rate_hz
+        self._draw_constants(config, seed)
+        self._start_processes(seed)
+        self._self_heating = (config.self_heating_k, config.self_heating_tau_s)
+        self._temperature_at_start: float | None = None
+        self._filter = np.stack(
+            [_low_pass(config.gyro_bandwidth_hz, self._tick_s), _low_pass(config.accel_bandwidth_hz, self._tick_s)]
+        )
+        self._limit = np.repeat([(config.gyro_range_degps or np.inf) * DEG, (config.accel_range_g or np.inf) * G], 3)
+        self._resolution = np.repeat([config.gyro_resolution_degps * DEG, config.accel_resolution_mg * MG], 3)
+        # Carried from tick to tick: filter states, sum of the running interval, last rate and engine phase.
+        self._filter_state = np.zeros((6, 2))
+        self._sum = np.zeros(6)
+        self._last = np.zeros(4)
+        self._bias = np.zeros(6)
+
+    def _draw_constants(self, config: ImuConfig, seed: int) -> None:
+        def draw(process: str, n: int) -> Array:
+            return stream(seed, self.name, process).standard_normal(n)
+
+        e = self.errors
+        self._turn_on = draw("turn-on", 6) * np.repeat([e.gyro_turn_on, e.accel_turn_on], 3)
+        self._temperature_slope = draw("temperature", 6) * np.repeat([e.gyro_temperature, e.accel_temperature], 3)
+        self._asymmetry = draw("scale asymmetry", 6) * np.repeat([e.gyro_scale_asymmetry, e.accel_scale_asymmetry], 3)
+        scale = draw("scale", 6) * np.repeat([e.gyro_scale, e.accel_scale], 3)
+        misalignment = draw("misalignment", 6) * np.repeat([e.gyro_misalignment, e.accel_misalignment], 3)
+        skewness = draw("non-orthogonality", 6) * np.repeat([e.gyro_nonorthogonality, e.accel_nonorthogonality], 3)
+        self._sensitivity = np.stack(
+            [
+                (np.eye(3) + _axis_errors(scale[i : i + 3], misalignment[i : i + 3], skewness[i : i + 3])) @ e.C_sb
+                for i in (0, 3)
+            ]
+        )
+        self._g_sensitivity = draw("g-sensitivity", 9).reshape(3, 3) * e.gyro_g_sensitivity @ e.C_sb
+        amplitude = np.repeat([config.vibration_degps * DEG, config.vibration_mg * MG], 3) / VIBRATION_RPM**2
+        phase = stream(seed, self.name, "vibration").uniform(0, 2 * math.pi, (2, 6))
+        harmonics = amplitude * np.array([[1.0], [SECOND_HARMONIC]])
+        self._vibration = np.stack([harmonics * np.cos(phase), harmonics * np.sin(phase)], axis=-1)
+
+    def _start_processes(self, seed: int) -> None:
+        def per_axis(gyro: float, accel: float) -> Array:
+            return np.repeat([gyro, accel], 3)
+
+        e, dt = self.errors, self._dt
+        self._white = Process.white(
+            stream(seed, self.name, "white"), per_axis(e.gyro_noise, e.accel_noise) / math.sqrt(dt)
+        )
+        self._in_run = Process.gauss_markov(
+            stream(seed, self.name, "in-run"),
+            per_axis(e.gyro_in_run, e.accel_in_run),
+            per_axis(e.gyro_in_run_tau, e.accel_in_run_tau),
+            dt,
+        )
+        self._walk = Process.random_walk(
+            stream(seed, self.name, "random walk"), per_axis(e.gyro_random_walk, e.accel_random_walk), dt
+        )
+
+    @property
+    def bias(self) -> tuple[Array, Array]:
+        """(gyro (3,) [rad/s], accel (3,) [m/s^2]): additive bias of the newest sample, all terms but white noise."""
+        return self._bias[:3].copy(), self._bias[3:].copy()
+
+    def sense(self, truth: TruthBlock) -> ImuSamples:
+        """The increments whose intervals end inside this block, in the axes of the unit."""
+        first = max(truth.tick, 1)  # row 0 of a run carries no increments
+        start = -first % self._every + first - truth.tick
+        t = truth.t[start :: self._every].copy()
+        n = len(t)
+        bias = self._in_run.take(n)
+        bias += self._walk.take(n)
+        bias += self._turn_on
+        bias += np.outer(self._warming(truth, start, t), self._temperature_slope)
+        if n:
+            self._bias[:] = bias[-1]
+        rate = np.empty((n, 6))
+        _sense(
+            truth.tick,
+            self._every,
+            self._tick_s,
+            truth.dtheta,
+            truth.dv,
+            truth.omega_b,
+            truth.engine_rpm,
+            self.errors.lever_arm_b,
+            self._vibration,
+            self._filter,
+            self._sensitivity,
+            self._g_sensitivity,
+            self._asymmetry,
+            self._filter_state,
+            self._sum,
+            self._last,
+            rate,
+        )
+        increments = rate
+        increments += (bias + self._white.take(n)) * self._dt
+        limit, step = self._limit * self._dt, self._resolution * self._dt
+        np.clip(increments, -limit, limit, out=increments)
+        if step.any():
+            _round(increments, step)
+        return ImuSamples(t, np.full(n, self._dt), increments[:, :3].copy(), increments[:, 3:].copy())
+
+    def _warming(self, truth: TruthBlock, start: int, t: Array) -> Array:
+        """Temperature of the unit less that at power-on (n,) [K]: it follows the air and heats itself up."""
+        if self._temperature_at_start is None and len(truth):
+            self._temperature_at_start = float(truth.temperature[0])
+        rise, tau = self._self_heating
+        return (
+            truth.temperature[start :: self._every] - (self._temperature_at_start or 0.0) + rise * -np.expm1(-t / tau)
+        )
+
+
+def _axis_errors(scale: Array, misalignment: Array, skewness: Array) -> Array:
+    """Scale on the diagonal, a small rotation of the triad, and y and z axes that lean towards the earlier ones."""
+    mx, my, mz = misalignment
+    errors: Array = np.diag(scale) + np.array([[0.0, mz, -my], [-mz, 0.0, mx], [my, -mx, 0.0]])
+    errors[1, 0] += skewness[0]
+    errors[2, 0] += skewness[1]
+    errors[2, 1] += skewness[2]
+    return errors
+
+
+def _low_pass(bandwidth_hz: float | None, dt: float) -> Array:
+    """Second-order Butterworth low-pass over one tick: (3, 3) map of [state (2), input] to [new state, average output].
+
+    Exact for an input that is constant over the tick; unit gain at rest, -3 dB at the bandwidth. The third row gives
+    the output averaged over the tick, which is what an integrating sensor sees.
+    """
+    if bandwidth_hz is None:
+        return np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    w = 2 * math.pi * bandwidth_hz
+    # states: output y, its derivative over w, the input, and the integral of y
+    A = np.zeros((4, 4))
+    A[0, 1] = w
+    A[1] = [-w, -math.sqrt(2) * w, w, 0.0]
+    A[3, 0] = 1.0
+    step = expm(A * dt)
+    over_tick: Array = np.array([step[0, :3], step[1, :3], step[3, :3] / dt])
+    return over_tick
+
+
+@njit
+def _sense(
+    tick: int,
+    every: int,
+    tick_s: float,
+    dtheta: Array,
+    dv: Array,
+    omega_b: Array,
+    engine_rpm: Array,
+    lever: Array,
+    vibration: Array,
+    low_pass: Array,
+    sensitivity: Array,
+    g_sensitivity: Array,
+    asymmetry: Array,
+    state: Array,
+    total: Array,
+    last: Array,
+    out: Array,
+) -> None:
+    """Deterministic part of the chain: sums of sensed increments per output interval into ``out`` (n, 6).
+
+    ``state``, ``total`` and ``last`` are carried from call to call. A lever arm r moves at omega x r; between two ticks
+    its velocity changes, in body axes and per left Jacobian of phi = dtheta, by
+    J^-1 (exp(phi) a1 - a0) = (a1 - a0) + phi x (a0 + a1)/2 + c phi x (phi x (a1 - a0)), a = omega x r,
+    c = (1 - |phi|/2 cot(|phi|/2))/|phi|^2.
+    """
+    has_lever = lever[0] != 0.0 or lever[1] != 0.0 or lever[2] != 0.0
+    has_vibration = False
+    for i in range(6):
+        if vibration[0, i, 0] != 0.0 or vibration[0, i, 1] != 0.0:
+            has_vibration = True
+    x = np.empty(6)
+    y = np.empty(6)
+    j = 0
+    for k in range(dtheta.shape[0]):
+        if tick + k == 0:
+            last[0], last[1], last[2], last[3] = omega_b[0, 0], omega_b[0, 1], omega_b[0, 2], 0.0
+            continue
+        for i in range(3):
+            x[i] = dtheta[k, i]
+            x[3 + i] = dv[k, i]
+        if has_lever:
+            w0x, w0y, w0z = last[0], last[1], last[2]
+            w1x, w1y, w1z = omega_b[k, 0], omega_b[k, 1], omega_b[k, 2]
+            px, py, pz = x[0], x[1], x[2]
+            # difference and sum of omega x r at the two ends
+            sx, sy, sz = w1x + w0x, w1y + w0y, w1z + w0z
+            ex, ey, ez = w1x - w0x, w1y - w0y, w1z - w0z
+            mx = 0.5 * (sy * lever[2] - sz * lever[1])
+            my = 0.5 * (sz * lever[0] - sx * lever[2])
+            mz = 0.5 * (sx * lever[1] - sy * lever[0])
+            dx = ey * lever[2] - ez * lever[1]
+            dy = ez * lever[0] - ex * lever[2]
+            dz = ex * lever[1] - ey * lever[0]
+            square = px * px + py * py + pz * pz
+            c = 1.0 / 12.0 + square / 720.0 + square * square / 30240.0
+            cx, cy, cz = py * dz - pz * dy, pz * dx - px * dz, px * dy - py * dx
+            x[3] += dx + (py * mz - pz * my) + c * (py * cz - pz * cy)
+            x[4] += dy + (pz * mx - px * mz) + c * (pz * cx - px * cz)
+            x[5] += dz + (px * my - py * mx) + c * (px * cy - py * cx)
+            last[0], last[1], last[2] = w1x, w1y, w1z
+        if has_vibration and engine_rpm[k] > 0.0:
+            # integral of a cos(phase + offset) over the tick, for one and two per rev
+            turn = 2.0 * math.pi * engine_rpm[k] / 60.0 * tick_s
+            middle = last[3] + 0.5 * turn
+            size = engine_rpm[k] * engine_rpm[k] * tick_s
+            c1, s1 = math.cos(middle), math.sin(middle)
+            half = math.sin(0.5 * turn)
+            one = size * half / (0.5 * turn)
+            two = size * (2.0 * half * math.cos(0.5 * turn)) / turn
+            c2, s2 = c1 * c1 - s1 * s1, 2.0 * c1 * s1
+            for i in range(6):
+                x[i] += one * (vibration[0, i, 0] * c1 - vibration[0, i, 1] * s1)
+                x[i] += two * (vibration[1, i, 0] * c2 - vibration[1, i, 1] * s2)
+            last[3] = (last[3] + turn) % (2.0 * math.pi)
+        for i in range(6):
+            m = low_pass[i // 3]
+            if tick + k == 1:
+                state[i, 0] = x[i]
+            y[i] = m[2, 0] * state[i, 0] + m[2, 1] * state[i, 1] + m[2, 2] * x[i]
+            a = m[0, 0] * state[i, 0] + m[0, 1] * state[i, 1] + m[0, 2] * x[i]
+            state[i, 1] = m[1, 0] * state[i, 0] + m[1, 1] * state[i, 1] + m[1, 2] * x[i]
+            state[i, 0] = a
+        for i in range(3):
+            w = sensitivity[0, i, 0] * y[0] + sensitivity[0, i, 1] * y[1] + sensitivity[0, i, 2] * y[2]
+            f = sensitivity[1, i, 0] * y[3] + sensitivity[1, i, 1] * y[4] + sensitivity[1, i, 2] * y[5]
+            g = g_sensitivity[i, 0] * y[3] + g_sensitivity[i, 1] * y[4] + g_sensitivity[i, 2] * y[5]
+            total[i] += w + asymmetry[i] * abs(w) + g
+            total[3 + i] += f + asymmetry[3 + i] * abs(f)
+        if (tick + k) % every == 0:
+            for i in range(6):
+                out[j, i] = total[i]
+                total[i] = 0.0
+            j += 1
+
+
+@njit
+def _round(increments: Array, step: Array) -> None:
+    """To the nearest multiple of ``step`` (6,), column by column, in place; zero leaves a column alone."""
+    for i in range(increments.shape[1]):
+        if step[i] > 0.0:
+            for k in range(increments.shape[0]):
+                increments[k, i] = step[i] * np.rint(increments[k, i] / step[i])

@@ -1,0 +1,227 @@
+"""Three-axis magnetometer: the geomagnetic field in body axes, bent by iron and currents on board."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from nav._jit import njit
+from nav.rotation import quat_conjugate, quat_rotate
+from nav.samples import Array, MagnetometerSample
+from testbed.errors import UserError
+from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.timing import AidingTiming, Schedule
+from testbed.sensors.units import DEG, MICROTESLA, PERCENT
+from testbed.truth import Column, TruthBlock
+
+COLUMNS: dict[str, Column] = {
+    "t": Column("s", 1, "time of validity"),
+    "t_arrival": Column("s", 1, "time of arrival"),
+    "field_b": Column("T", 3, "magnetic flux density, body axes"),
+}
+
+NANOTESLA = 1e-9
+WMM_YEARS = (2010, 2030)  # covered by the models that pygeomag carries, five years each
+
+GRADES: dict[str, dict[str, Any]] = {
+    "perfect": {},
+    # Bosch BMM350 data sheet BST-BMM350-DS001: noise 190 nT rms, range +-2000 uT. What calibration on the aircraft
+    # leaves of hard and soft iron, and the stray field of the wiring, are assumed.
+    "mems": {
+        "noise_ut": 0.19,
+        "hard_iron_ut": 0.5,
+        "soft_iron_percent": 0.5,
+        "current_ut_per_a": 0.05,
+        "range_ut": 2000.0,
+    },
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where and when a run starts: date, geodetic ``lat``, ``lon`` [rad], ``h`` [m]."""
+
+    date: datetime.date
+    lat: float
+    lon: float
+    h: float
+
+
+def decimal_year(date: datetime.date) -> float:
+    """The date as a year with a fraction, as geomagnetic models take it."""
+    start, end = datetime.date(date.year, 1, 1), datetime.date(date.year + 1, 1, 1)
+    return date.year + (date - start).days / (end - start).days
+
+
+@lru_cache(maxsize=4)
+def _model(year: int) -> Any:
+    from pygeomag import GeoMag  # type: ignore[import-untyped]
+
+    return GeoMag(base_year=year)
+
+
+def geomagnetic_field_n(lat: float, lon: float, h: float, date: datetime.date) -> Array:
+    """Main field of the Earth (3,) [T], north-east-down, from the World Magnetic Model of the date.
+
+    ``lat``, ``lon`` geodetic [rad], ``h`` above the ellipsoid [m]. Source: WMM2010 to WMM2025 (NOAA NCEI and BGS),
+    which give the main field to about 0.14 uT and know no local anomaly. Raises UserError for a date that no model
+    covers.
+    """
+    if not WMM_YEARS[0] <= date.year < WMM_YEARS[1]:
+        raise UserError(
+            f"date: no geomagnetic model for {date.isoformat()}; choose one from {WMM_YEARS[0]} to {WMM_YEARS[1] - 1}"
+        )
+    at = _model(date.year).calculate(glat=lat / DEG, glon=lon / DEG, alt=h / 1000, time=decimal_year(date))
+    return np.array([at.x, at.y, at.z]) * NANOTESLA
+
+
+class FieldMap:
+    """The field near a moving point, interpolated linearly on a fixed lattice of latitude, longitude and height.
+
+    The model itself takes 0.1 ms. Nodes depend on nothing but the date, so results do not depend on the way there; the
+    interpolation errs by less than 1 nT below 80 deg of latitude.
+    """
+
+    STEP = np.array([0.1 * DEG, 0.1 * DEG, 5000.0])  # lat, lon [rad], h [m]
+
+    def __init__(self, date: datetime.date) -> None:
+        self._date = date
+        self._nodes: dict[tuple[int, int, int], Array] = {}
+        self._cell: tuple[int, int, int] | None = None
+        self._corners = np.zeros((2, 2, 2, 3))
+
+    def field_n(self, lat: float, lon: float, h: float) -> Array:
+        """The field (3,) [T], north-east-down."""
+        x, y, z = lat / self.STEP[0], lon / self.STEP[1], h / self.STEP[2]
+        cell = (math.floor(x), math.floor(y), math.floor(z))
+        if cell != self._cell:
+            self._enter(cell)
+        return _interpolate(self._corners, x - cell[0], y - cell[1], z - cell[2])
+
+    def _enter(self, cell: tuple[int, int, int]) -> None:
+        self._cell = cell
+        for corner in np.ndindex(2, 2, 2):
+            i, j, k = cell[0] + corner[0], cell[1] + corner[1], cell[2] + corner[2]
+            if (i, j, k) not in self._nodes:
+                at = np.array([i, j, k]) * self.STEP
+                lat = min(max(at[0], -math.pi / 2), math.pi / 2)
+                self._nodes[i, j, k] = geomagnetic_field_n(lat, math.remainder(at[1], 2 * math.pi), at[2], self._date)
+            self._corners[corner] = self._nodes[i, j, k]
+
+
+@njit
+def _interpolate(corners: Array, x: float, y: float, z: float) -> Array:
+    """Trilinear interpolation between ``corners`` (2, 2, 2, 3), x, y, z in [0, 1]."""
+    value = np.zeros(3)
+    for i in range(2):
+        for j in range(2):
+            for k in range(2):
+                weight = (x if i else 1 - x) * (y if j else 1 - y) * (z if k else 1 - z)
+                for c in range(3):
+                    value[c] += weight * corners[i, j, k, c]
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class MagnetometerErrors:
+    """The sensor's datasheet in SI, 1 sigma per axis: ``noise``, ``hard_iron`` [T], ``soft_iron`` [1],
+    ``current`` [T/A], ``latency`` [s].
+    """
+
+    noise: float
+    hard_iron: float
+    soft_iron: float
+    current: float
+    latency: float
+
+
+class MagnetometerConfig(AidingTiming):
+    """Keys of a magnetometer. ``grade`` sets the errors; each may be given to override it."""
+
+    kind: Literal["magnetometer"] = "magnetometer"
+    grade: Literal["perfect", "mems"] = "mems"
+
+    noise_ut: float = Field(0.0, ge=0, le=1000)
+    hard_iron_ut: float = Field(0.0, ge=0, le=1000, description="constant offset per axis that calibration left")
+    soft_iron_percent: float = Field(0.0, ge=0, le=50, description="each element of the matrix that calibration left")
+    current_ut_per_a: float = Field(0.0, ge=0, le=100, description="stray field of the wiring per axis")
+    range_ut: float | None = Field(None, gt=0, le=1e6)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on_top_of_grade(cls, data: Any) -> Any:
+        return with_grade(data, GRADES, "mems")
+
+    def errors(self) -> MagnetometerErrors:
+        """The same in SI."""
+        return MagnetometerErrors(
+            noise=self.noise_ut * MICROTESLA,
+            hard_iron=self.hard_iron_ut * MICROTESLA,
+            soft_iron=self.soft_iron_percent * PERCENT,
+            current=self.current_ut_per_a * MICROTESLA,
+            latency=self.latency_s,
+        )
+
+
+class Magnetometer:
+    """One magnetometer on one run: measured = (I + soft iron) C_bn field_n + hard iron + wiring * current + noise."""
+
+    def __init__(self, name: str, config: MagnetometerConfig, tick_rate_hz: float, seed: int, site: Site) -> None:
+        self.name = name
+        self.rate_hz = config.rate_hz
+        self.errors = e = config.errors()
+        self._schedule = Schedule.of(name, config, tick_rate_hz)
+        self._map = FieldMap(site.date)
+        self._map.field_n(site.lat, site.lon, site.h)  # a date without a model is refused here, not in flight
+        self._hard_iron = stream(seed, name, "hard iron").standard_normal(3) * e.hard_iron
+        self._iron = np.eye(3) + stream(seed, name, "soft iron").standard_normal((3, 3)) * e.soft_iron
+        self._wiring = stream(seed, name, "wiring").standard_normal(3) * e.current
+        self._white = Process.white(stream(seed, name, "white"), np.full(3, e.noise))
+        self._limit = (config.range_ut or math.inf) * MICROTESLA
+
+    def sense(self, truth: TruthBlock) -> list[MagnetometerSample]:
+        """The samples that fall inside this block."""
+        rows = self._schedule.rows(truth)
+        noise = self._white.take(len(rows))
+        samples = []
+        for i, k in enumerate(rows):
+            t = float(truth.t[k])
+            field_n = self._map.field_n(truth.lat[k], truth.lon[k], truth.h[k])
+            field_b = _measured(
+                field_n,
+                truth.q_nb[k],
+                self._iron,
+                self._hard_iron,
+                self._wiring,
+                truth.current[k],
+                noise[i],
+                self._limit,
+            )
+            samples.append(MagnetometerSample(t, t + self._schedule.latency, field_b, self.name))
+        return samples
+
+
+@njit
+def _measured(
+    field_n: Array,
+    q_nb: Array,
+    iron: Array,
+    hard_iron: Array,
+    wiring: Array,
+    current: float,
+    noise: Array,
+    limit: float,
+) -> Array:
+    """What the sensor makes of the field (3,) [T]."""
+    field_b = quat_rotate(quat_conjugate(q_nb), field_n)
+    measured = np.empty(3)
+    for i in range(3):
+        bent = iron[i, 0] * field_b[0] + iron[i, 1] * field_b[1] + iron[i, 2] * field_b[2]
+        measured[i] = min(limit, max(-limit, bent + hard_iron[i] + wiring[i] * current + noise[i]))
+    return measured
