@@ -179,7 +179,7 @@ def quat_rotate(q: Array, v: Array) -> Array:
 
 @njit
 def left_jacobian_solve(phi: Array, v: Array) -> Array:
-    """J(phi)^-1 @ v (3,), with J the mean of the rotation over the turn: ``integral of exp(s [phi x]) ds``, s from 0 to 1.
+    """J(phi)^-1 @ v (3,), with J the mean of the rotation over the turn, ``integral of exp(s [phi x]) ds`` over [0, 1].
 
     A vector f that is constant in axes turning by ``phi`` (|phi| < 2 pi) has the mean J @ f in the axes where the turn
     began; this finds f from that mean.

@@ -105,7 +105,7 @@ class MotionSource(Protocol):
     rate_hz: float
 
     def advance(self, ticks: int) -> TruthBlock:
-        """The next ``ticks`` rows, fewer when the motion ends, none when it has ended; the first call starts at tick 0."""
+        """The next ``ticks`` rows, fewer when the motion ends, none when it has ended. Starts at tick 0."""
         ...
 
     def activity(self) -> str:
