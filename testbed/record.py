@@ -14,16 +14,17 @@ parent's dimension with other values.
 
 A record survives the death of its writer. Its HDF5 structure never changes in place: a new column, a new group or more
 room means a new file beside it, renamed over the old one when complete. In between, rows are written straight into the
-space that the contiguous datasets already own, the time column last, so that a finite time marks a complete row.
-Room not yet written reads NaN (-1 for codes, empty for text).
+space that the contiguous datasets already own, the time column last, so that a finite time marks a complete row:
+where nothing was written yet, time is NaN. `load` leaves those rows out.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
@@ -47,7 +48,7 @@ Data: TypeAlias = npt.NDArray[Any]
 
 FORMAT = "navigation-testbed run 1"
 FLUSH_WALL_S = 0.5  # a killed run loses at most this much work
-GROWTH = 4  # room made for each row present when the file has to be laid out anew
+SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 
 # What the components of a vector mean; coordinates of the file's root, shared by all groups.
 AXES: dict[str, tuple[str, ...]] = {
@@ -144,7 +145,10 @@ ESTIMATE = {
     "sigma_gyro_bias": Variable("rad/s", "1-sigma of gyro bias", ("body",)),
     "sigma_accel_bias": Variable("m/s^2", "1-sigma of accelerometer bias", ("body",)),
     "covariance": Variable(
-        "products of m, m/s, rad", "covariance of position, velocity and attitude error", ("error", "error_column")
+        "products of m, m/s, rad",
+        "covariance of position, velocity and attitude error",
+        ("error", "error_column"),
+        "<f4",  # a dozen standard deviations would do; half the size of everything else an estimator says
     ),
     "status": Variable(
         "1",
@@ -226,6 +230,7 @@ class _Table:
         self.written = 0
         self.capacity = 0
         self.grown = True  # has columns that the file does not have yet
+        self.started = math.nan  # time of the first row
         self._pack = pack
 
     def add(self, block: Block, variables: Mapping[str, Variable]) -> None:
@@ -234,8 +239,21 @@ class _Table:
             if name not in self.columns:
                 self.columns[name] = _Column(variables[name], values.shape[1:])
                 self.grown = True
+        if math.isnan(self.started):
+            self.started = float(block[self.time_name][0])
         self.blocks.append(block)
         self.pending += len(block[self.time_name])
+
+    @property
+    def rows_now(self) -> int:
+        """Rows in the file and waiting."""
+        return self.written + self.pending
+
+    def rows_expected(self, t: float, duration: float) -> int:
+        """Rows at the end of the run at the rate so far, with some room to spare."""
+        rate = self.rows_now / max(t - self.started, 1.0)
+        expected = self.rows_now + 1.05 * rate * max(duration - t, 0.0)
+        return int(max(expected, 1.25 * self.rows_now)) + SPARE_ROWS
 
     def pack(self) -> None:
         """Turn the waiting objects into a block."""
@@ -269,10 +287,14 @@ def _vectors(objects: Sequence[Any], name: str) -> Data:
     return np.concatenate(parts).reshape(len(parts), *parts[0].shape)
 
 
-def _text(values: Iterable[str], dtype: str) -> Data:
+def _text(values: Sequence[str], dtype: str) -> Data:
     width = np.dtype(dtype).itemsize
-    # Cut by characters, not bytes, so that no half of a character is left.
-    return np.array([v.encode()[:width].decode(errors="ignore").encode() for v in values], dtype)
+    result = np.zeros(len(values), dtype)
+    for k, value in enumerate(values):
+        if value:  # most reports have no reason
+            # Cut by whole characters, so that no half of one is left.
+            result[k] = value.encode()[:width].decode(errors="ignore").encode()
+    return result
 
 
 def _pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]]:
@@ -293,7 +315,7 @@ def _pack_reports(reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Var
         "nis": _scalars(reports, "nis"),
         "threshold": _scalars(reports, "threshold"),
         "weight": _scalars(reports, "weight"),
-        "reason": _text((r.reason for r in reports), REPORT["reason"].dtype),
+        "reason": _text([r.reason for r in reports], REPORT["reason"].dtype),
     }
     return block, REPORT
 
@@ -323,8 +345,8 @@ def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Var
 def _pack_events(events: Sequence[tuple[float, str, str]]) -> tuple[Block, dict[str, Variable]]:
     block: Block = {
         "time": np.array([e[0] for e in events]),
-        "severity": _text((e[1] for e in events), EVENT["severity"].dtype),
-        "text": _text((e[2] for e in events), EVENT["text"].dtype),
+        "severity": _text([e[1] for e in events], EVENT["severity"].dtype),
+        "text": _text([e[2] for e in events], EVENT["text"].dtype),
     }
     return block, EVENT
 
@@ -344,8 +366,8 @@ class Recorder:
             "Conventions": "CF-1.8",
             "title": scenario.title,
             "scenario": scenario.text,
-            "scenario_path": str(scenario.path),
-            "overrides": json.dumps(list(getattr(scenario, "overrides", ()))),
+            "scenario_path": str(scenario.path or ""),
+            "overrides": json.dumps(scenario.overrides),
             "seed": seed,
             "duration_s": float(scenario.duration_s),
             "record_rate_hz": float(scenario.record.rate_hz),
@@ -353,10 +375,12 @@ class Recorder:
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }
+        self._duration = float(scenario.duration_s)
         self._record_imu = scenario.record.imu
         self._every = round(scenario.truth.rate_hz / scenario.record.rate_hz)
         self._tables: dict[str, _Table] = {}
-        self._tail: list[TruthBlock] = []  # ticks since the last recorded row
+        self._increments = np.zeros((0, 6))  # dtheta and dv of the ticks since the last recorded row
+        self._t = 0.0
         self._last_flush = time.monotonic()
         self._file: BinaryIO | None = None
         if path is not None:
@@ -365,8 +389,8 @@ class Recorder:
     def truth(self, block: TruthBlock) -> None:
         """Take full-rate rows; every n-th is recorded, with the increments summed since the one before."""
         if len(block):
-            self._tail.append(block)
-            self._decimate()
+            self._record_truth(block)
+            self._t = float(block.t[-1])
         if time.monotonic() - self._last_flush >= FLUSH_WALL_S:
             self.flush()
 
@@ -403,17 +427,17 @@ class Recorder:
             table.pack()
         if self.path is None or not any(table.pending for table in self._tables.values()):
             return
-        if any(t.grown or t.written + t.pending > t.capacity for t in self._tables.values()):
-            self._lay_out(GROWTH)
+        if any(t.grown or t.rows_now > t.capacity for t in self._tables.values()):
+            self._guard(self._lay_out)
         else:
-            self._write_rows()
+            self._guard(self._write_rows)
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
         self.flush()
         if self.path is not None and self._file is not None:
             self.attributes["complete"] = 1
-            self._lay_out(1)
+            self._guard(lambda: self._lay_out(final=True))
             self._file.close()
             self._file = None
 
@@ -434,39 +458,28 @@ class Recorder:
             table = self._tables[path] = _Table(pack, time_name)
         return table
 
-    def _decimate(self) -> None:
-        """Record the rows on multiples of the record interval; keep the ticks after the last of them."""
+    def _record_truth(self, block: TruthBlock) -> None:
+        """Record the rows whose ticks are multiples of the record interval, with the increments summed up to them."""
         every = self._every
-        first, n = self._tail[0].tick, sum(map(len, self._tail))
-        if first == 0:  # the initial state stands alone: nothing led to it
-            self._record_truth(self._tail[0].rows(0, 1), 1)
-            self._tail[0] = self._tail[0].rows(1, len(self._tail[0]))
-            n -= 1
-        whole = n // every * every
-        if not whole:
+        kept = slice(-block.tick % every, None, every)
+        count = len(block.t[kept])
+        before = self._increments
+        if block.tick == 0:  # nothing led to the initial state: its interval is itself alone
+            before = np.zeros((every - 1, 6))
+        increments = np.empty((len(before) + len(block), 6))
+        increments[: len(before)] = before
+        increments[len(before) :, :3] = block.dtheta
+        increments[len(before) :, 3:] = block.dv
+        whole = count * every
+        self._increments = increments[whole:]
+        if not count:
             return
-        blocks = self._tail
-        names = [f.name for f in fields(TruthBlock) if f.name != "tick"]
-        joined = (
-            blocks[0]
-            if len(blocks) == 1
-            else TruthBlock(
-                blocks[0].tick, **{name: np.concatenate([getattr(b, name) for b in blocks]) for name in names}
-            )
+        columns = {name: getattr(block, name)[kept].copy() for name in TRUTH if name not in ("dtheta", "dv")}
+        # Each interval is summed by itself, in order: the result can't depend on how the run was chunked.
+        sums = np.add.reduceat(increments[:whole], np.arange(0, whole, every), axis=0)
+        self._table("truth").add(
+            {"time": block.t[kept].copy(), **columns, "dtheta": sums[:, :3], "dv": sums[:, 3:]}, TRUTH
         )
-        self._record_truth(joined.rows(0, whole), every)
-        self._tail = [joined.rows(whole, n)] if whole < n else []
-
-    def _record_truth(self, block: TruthBlock, every: int) -> None:
-        columns = {"time": block.t[every - 1 :: every].copy()}
-        for name in TRUTH:
-            values = getattr(block, name)
-            if name in ("dtheta", "dv"):
-                # Each interval is summed by itself, in order: the result can't depend on how the run was chunked.
-                columns[name] = values.reshape(-1, every, 3).cumsum(axis=1)[:, -1]
-            else:
-                columns[name] = values[every - 1 :: every].copy()
-        self._table("truth").add(columns, TRUTH)
 
     def _write_rows(self) -> None:
         assert self._file is not None
@@ -481,33 +494,42 @@ class Recorder:
             table.pending = 0
             table.blocks.clear()
 
-    def _lay_out(self, growth: int) -> None:
-        """Write a new file with room for ``growth`` times the rows present, and put it in place of the old one."""
+    def _lay_out(self, final: bool = False) -> None:
+        """Write a new file with the room that is needed, and put it in place of the old one."""
         assert self.path is not None
-        part = self.path.with_name(f".{self.path.name}.part")
+        old = {path: (t.written, {n: c.offset for n, c in t.columns.items()}) for path, t in self._tables.items()}
+        for table in self._tables.values():
+            table.capacity = table.rows_now if final else table.rows_expected(self._t, self._duration)
+        _create(_part(self.path), self._tables, self.attributes, blank=not final)
+        new = _part(self.path).open("r+b", buffering=0)
+        if self._file is not None:
+            for path, table in self._tables.items():
+                written, offsets = old[path]
+                for name in table.order() if written else ():
+                    column = table.columns[name]
+                    if offsets[name]:
+                        _copy(self._file, offsets[name], new, column.offset, written * column.row_bytes)
+                    else:
+                        new.seek(column.offset)
+                        new.write(_blank((written, *column.shape), column.dtype).data.cast("B"))
+            self._file.close()
+        self._file = new
+        self._write_rows()
+        os.replace(_part(self.path), self.path)
+
+    def _guard(self, write: Callable[[], None]) -> None:
+        """Turn a full disk and the like into a message; what the file held before stays."""
+        assert self.path is not None
         try:
-            old = {path: (t.written, {n: c.offset for n, c in t.columns.items()}) for path, t in self._tables.items()}
-            for table in self._tables.values():
-                table.capacity = growth * (table.written + table.pending)
-            _create(part, self._tables, self.attributes, blank=growth > 1)
-            new = part.open("r+b", buffering=0)
-            if self._file is not None:
-                for path, table in self._tables.items():
-                    written, offsets = old[path]
-                    for name in table.order():
-                        column = table.columns[name]
-                        if offsets[name] and written:
-                            _copy(self._file, offsets[name], new, column.offset, written * column.row_bytes)
-                        elif written:
-                            new.seek(column.offset)
-                            new.write(_blank((written, *column.shape), column.dtype).data.cast("B"))
-                self._file.close()
-            self._file = new
-            self._write_rows()
-            os.replace(part, self.path)
+            write()
         except OSError as error:
-            part.unlink(missing_ok=True)
-            raise UserError(f"{self.path}: can't write the record: {error.strerror or error}") from error
+            _part(self.path).unlink(missing_ok=True)
+            raise UserError(f"{self.path}: can't write the record ({error.strerror or error})") from error
+
+
+def _part(path: Path) -> Path:
+    """Where the next version of a file is made."""
+    return path.with_name(f".{path.name}.part")
 
 
 def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -> None:
@@ -524,9 +546,8 @@ def _check_writable(path: Path) -> None:
         raise UserError(f"{path}: is a folder; give the name of a file")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.part")
-        part.write_bytes(b"")
-        part.unlink()
+        _part(path).write_bytes(b"")
+        _part(path).unlink()
     except OSError as error:
         raise UserError(
             f"{path.parent}: can't write here ({error.strerror or error}); choose another folder with --out"
@@ -567,7 +588,7 @@ class _Attributes:
 def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, str | int | float], blank: bool) -> None:
     """Write the structure of a record with all its space allocated, and note where each column's rows go.
 
-    ``blank`` fills the space; without, every row is about to be written.
+    ``blank`` marks all rows as not written; without, every row is about to be.
     """
     import h5py
     from h5py import h5d, h5ds, h5p, h5s, h5t
@@ -582,17 +603,18 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
             dataset.make_scale(axis)
             scales[axis] = dataset.id
         for group_path, table in tables.items():
-            group = file.require_group(group_path).id if group_path not in file else file[group_path].id
+            group = file.require_group(group_path).id
             local: dict[str, Any] = {}
             for name, column in table.columns.items():
                 dtype = column.dtype
                 text = dtype.kind == "S"
                 layout = h5p.create(h5p.DATASET_CREATE)
                 layout.set_alloc_time(h5d.ALLOC_TIME_EARLY)
-                if blank:
-                    layout.set_fill_value(np.array(_missing(dtype), dtype="S1" if text else dtype))
+                layout.set_obj_track_times(False)  # the same run gives the same bytes
+                if blank and name == table.time_name:
+                    layout.set_fill_value(np.array(np.nan))
                 else:
-                    layout.set_fill_time(h5d.FILL_TIME_NEVER)
+                    layout.set_fill_time(h5d.FILL_TIME_NEVER)  # room costs nothing until it is written
                 shape = (table.capacity, *column.shape, *((dtype.itemsize,) if text else ()))
                 stored = h5t.py_create(np.dtype("S1") if text else dtype)
                 dataset = h5d.create(group, name.encode(), stored, h5s.create_simple(shape), layout)
