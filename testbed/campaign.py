@@ -1,0 +1,623 @@
+"""Many seeds: one scenario flown many times, for every combination of varied values, on Dask.
+
+Run k of a combination has the scenario's own seed + k, so `testbed run --seed` flies any one of them again, bit for
+bit. Every run is a task by itself: its numbers can't depend on how many workers there are, or on which of them it ran.
+Results come back to this process, which writes them into the campaign's folder as they finish; a campaign that was
+interrupted carries on with the runs that are missing.
+"""
+
+# mypy: untyped-calls-exclude="distributed"
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import hashlib
+import io
+import itertools
+import json
+import logging
+import math
+import os
+import shutil
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.lib.format import open_memmap
+
+import nav
+from nav.samples import Array
+from testbed import metrics
+from testbed.data import data_dir
+from testbed.errors import UserError
+from testbed.scenario import FlightTruth, Scenario
+from testbed.truth import COLUMNS, MotionSource, TruthBlock
+
+if TYPE_CHECKING:
+    import xarray
+    from distributed import Client
+    from rich.console import Console
+
+    from testbed.campaign_report import Statistics
+
+HISTORY_HZ = 1.0  # rate at which a run's errors are kept
+CONNECT_S = 3.0  # how long a scheduler may take to answer
+WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
+SAVE_TICKS = 20_000  # rows of a shared flight in memory at a time
+POLL_S = 2.0  # how often progress is told when no run finishes
+PLAIN_EVERY_S = 5.0  # how often a line says so where the output is no terminal
+SETUP = "setup.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Combination:
+    """One choice of the varied values, as given, and the scenario that it makes."""
+
+    values: Mapping[str, str]
+    scenario: Scenario
+
+    def __str__(self) -> str:
+        return ", ".join(f"{key}={value}" for key, value in self.values.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What is kept of one run: its metrics, and its errors over time at `HISTORY_HZ`.
+
+    ``history`` has ``time`` (N,) [s], ``outage`` (N,) 1 while some GNSS receiver has no fix, and for each estimator
+    ``<name>.error`` horizontal position error [m], ``<name>.sigma`` its own 1-sigma sqrt(P_N + P_E) [m] and
+    ``<name>.nees`` the position NEES per degree of freedom; each (N,), NaN while aligning.
+    """
+
+    combination: int
+    seed: int
+    metrics: Mapping[str, float]
+    history: Mapping[str, Array]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A run that ended with an error: its combination, seed, the message and the traceback, if there was one."""
+
+    combination: int
+    seed: int
+    message: str
+    traceback: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a campaign stands: runs finished and failed, of how many, how many of them were there before it began.
+
+    ``elapsed_s`` is wall time; ``activity`` says what is going on when it is not simply flying.
+    """
+
+    done: int
+    failed: int
+    total: int
+    before: int
+    elapsed_s: float
+    activity: str
+
+    @property
+    def remaining_s(self) -> float:
+        """Wall time still to go at the pace so far, NaN before the first run."""
+        flown = self.done + self.failed - self.before
+        return self.elapsed_s / flown * (self.total - self.done - self.failed) if flown else math.nan
+
+    def __str__(self) -> str:
+        parts = [f"{self.done}/{self.total}", f"{self.elapsed_s:.0f} s"]
+        if math.isfinite(self.remaining_s):
+            parts.append(f"about {self.remaining_s:.0f} s to go")
+        if self.failed:
+            parts.append(f"{self.failed} failed")
+        return "  ".join(filter(None, [*parts, self.activity]))
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignResult:
+    """A finished campaign: folder, combinations, outcomes in order of combination and seed, failures, statistics."""
+
+    path: Path
+    combinations: Sequence[Combination]
+    outcomes: Sequence[Outcome]
+    failures: Sequence[Failure]
+    statistics: Statistics
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """All that a worker needs to fly one run."""
+
+    combination: int
+    seed: int
+    scenario: Scenario
+    truth: Path | None  # the flight that all runs share; a worker that can't see it flies it again
+    code: str
+
+
+def campaign(
+    scenario: str | Path,
+    runs: int,
+    *,
+    vary: Mapping[str, Sequence[str]] | None = None,
+    overrides: Sequence[str] = (),
+    scheduler: str | None = None,
+    out: Path,
+    workers: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> CampaignResult:
+    """Fly ``runs`` seeds of a scenario for every combination of the values in ``vary``, and say what they show.
+
+    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs.
+    ``scheduler`` is the address of a Dask scheduler; without, a cluster of one process per core (or ``workers``) lives
+    as long as the campaign. A script that calls this needs the guard ``if __name__ == "__main__":``, because those
+    processes import it. In ``out`` there are, at the end, runs/, campaign.csv, campaign.json and figures; what is there
+    already of the same campaign is not flown again.
+
+    A run that fails is in ``failures`` and stops no other. Raises UserError when the scenario or a varied value is
+    wrong, when ``out`` can't be written or holds another campaign, or when the scheduler can't be reached.
+    """
+    from dask.system import CPU_COUNT
+
+    from testbed import campaign_report
+
+    combinations = _combinations(scenario, vary or {}, overrides)
+    if runs < 1:
+        raise UserError(f"--runs {runs}: give at least 1")
+    folder = out.absolute()
+    _claim(folder, _setup(combinations[0].scenario, vary or {}, overrides))
+    wanted = [(i, c.scenario.seed + k) for i, c in enumerate(combinations) for k in range(runs)]
+    stored = {run: _load(folder, *run) for run in wanted}
+    missing = [run for run, outcome in stored.items() if outcome is None]
+    failures: list[Failure] = []
+    if missing:
+        truth = _share_truth(folder, combinations)
+        code = _code()
+        tasks = [_Task(i, seed, combinations[i].scenario, truth, code) for i, seed in missing]
+        tell = _Teller(progress, len(wanted), len(wanted) - len(missing))
+        with _connect(scheduler, min(workers or CPU_COUNT, len(tasks))) as client:
+            for flown in _fly_all(client, tasks, tell):
+                if isinstance(flown, Failure):
+                    failures.append(flown)
+                else:
+                    _store(folder, flown)
+                    stored[flown.combination, flown.seed] = flown
+    outcomes = [outcome for outcome in stored.values() if outcome is not None]
+    failures.sort(key=lambda f: (f.combination, f.seed))
+    statistics = campaign_report.statistics(combinations, outcomes)
+    result = CampaignResult(folder, combinations, outcomes, failures, statistics)
+    campaign_report.save(result)
+    return result
+
+
+def _combinations(
+    scenario: str | Path, vary: Mapping[str, Sequence[str]], overrides: Sequence[str]
+) -> list[Combination]:
+    """Every combination of varied values, each loaded and so checked. They differ in nothing else."""
+    for key, listed in vary.items():
+        if key == "seed":
+            raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
+        if not listed or len(set(listed)) < len(listed):
+            raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
+    made = []
+    for values in itertools.product(*vary.values()):
+        chosen = dict(zip(vary, values, strict=True))
+        loaded = Scenario.load(scenario, [*overrides, *(f"{key}={value}" for key, value in chosen.items())])
+        made.append(Combination(chosen, loaded))
+    if not made[0].scenario.estimator:
+        raise UserError(f"{scenario}: has no estimator, so a campaign would have nothing to compare: add [[estimator]]")
+    return made
+
+
+# --- the folder
+
+
+def _setup(scenario: Scenario, vary: Mapping[str, Sequence[str]], overrides: Sequence[str]) -> dict[str, Any]:
+    """Everything that decides the numbers, apart from the seeds."""
+    packages = ("numpy", "scipy", "numba", "jsbsim", "pygeomag")
+    return {
+        "scenario text": scenario.text,
+        "overrides": list(overrides),
+        "varied values": {key: list(values) for key, values in vary.items()},
+        "code": _code(),
+        "versions": {package: version(package) for package in packages},
+    }
+
+
+@functools.cache
+def _code() -> str:
+    """Digest of the code and the aircraft that this process would fly with."""
+    digest = hashlib.sha256()
+    package = Path(__file__).parent
+    for folder, pattern in (
+        (Path(nav.__file__).parent, "*.py"),
+        (package, "*.py"),
+        (package / "sensors", "*.py"),
+        (data_dir("aircraft"), "**/*.xml"),
+    ):
+        for file in sorted(folder.glob(pattern)):
+            digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def _claim(folder: Path, setup: Mapping[str, Any]) -> None:
+    """Make the campaign's folder, or make sure that it holds this campaign and no other."""
+    file = folder / SETUP
+    advice = "choose another folder with --out, or delete this one"
+    try:
+        (folder / "runs").mkdir(parents=True, exist_ok=True)
+        if file.exists():
+            before = json.loads(file.read_bytes())
+            differ = [key for key in setup if before.get(key) != setup[key]]
+            if differ:
+                raise UserError(f"{folder}: holds a campaign with different {', '.join(differ)}: {advice}")
+        elif any((folder / "runs").iterdir()):
+            raise UserError(f"{folder}: has runs but no {SETUP} to say of what: {advice}")
+        else:
+            write_file(file, json.dumps(setup, indent=1).encode())
+    except OSError as error:
+        raise UserError(f"{folder}: can't write here ({error.strerror}): choose another folder with --out") from None
+    except (ValueError, AttributeError):
+        raise UserError(f"{file}: is damaged: {advice}") from None
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """Write a file so that it is there whole or not at all. Raises UserError when it can't be written."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_bytes(content)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UserError(f"{path}: can't be written: {error.strerror}") from None
+
+
+def _stem(folder: Path, combination: int, seed: int) -> Path:
+    return folder / "runs" / f"c{combination:03d}_s{seed:06d}"
+
+
+def _store(folder: Path, outcome: Outcome) -> None:
+    """Write one outcome: metrics last, so that a run with metrics is a whole run."""
+    stem = _stem(folder, outcome.combination, outcome.seed)
+    record = {"combination": outcome.combination, "seed": outcome.seed, "metrics": outcome.metrics}
+    arrays = io.BytesIO()
+    np.savez_compressed(arrays, **outcome.history)  # type: ignore[arg-type]
+    write_file(stem.with_suffix(".npz"), arrays.getvalue())
+    write_file(stem.with_suffix(".json"), json.dumps(record, indent=1).encode())
+
+
+def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
+    """A stored outcome; None when there is none, or none that can be read."""
+    stem = _stem(folder, combination, seed)
+    try:
+        values = json.loads(stem.with_suffix(".json").read_bytes())["metrics"]
+        with np.load(stem.with_suffix(".npz")) as file:
+            history = {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+    return Outcome(combination, seed, values, history)
+
+
+# --- the shared flight
+
+
+def _share_truth(folder: Path, combinations: Sequence[Combination]) -> Path | None:
+    """Fly once the motion that all runs have in common, if they have, and give the folder where it lies."""
+    from testbed.loop import motion
+
+    first = combinations[0].scenario
+    if not all(_same_motion(first, c.scenario) for c in combinations) or not _seed_leaves_motion(first):
+        return None
+    truth = folder / "truth"
+    if not truth.is_dir():
+        source = motion(first, first.seed)
+        save_motion(source, round(first.duration_s * source.rate_hz) + 1, truth)
+    return truth
+
+
+def _same_motion(one: Scenario, other: Scenario) -> bool:
+    return (one.truth, one.plan, one.duration_s) == (other.truth, other.plan, other.duration_s)
+
+
+def _seed_leaves_motion(scenario: Scenario) -> bool:
+    """Whether the motion is the same for every seed: nothing estimated is fed back, and no gust follows the seed."""
+    if scenario.autopilot.feedback != "truth":
+        return False
+    if not isinstance(scenario.truth, FlightTruth):
+        return True
+    wind = scenario.truth.wind
+    return wind.turbulence == "none" or getattr(wind, "turbulence_seed", None) is not None
+
+
+# --- the workers
+
+
+@contextmanager
+def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
+    """A client of the scheduler at an address, or of a cluster of our own on the loopback interface."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    if scheduler is not None:
+        _require_scheduler(scheduler)
+        with Client(scheduler, set_as_default=False) as client:
+            try:
+                client.wait_for_workers(1, timeout=WORKER_WAIT_S)
+            except TimeoutError:
+                raise UserError(
+                    f"{scheduler}: the scheduler has no workers: start some with `dask worker {scheduler}`"
+                ) from None
+            yield client
+        return
+    # Dask starts workers with one BLAS thread each, which is what matrices of this size want. Its statistical profiler
+    # would look at the Python stack a hundred times a second.
+    with (
+        dask.config.set({"distributed.worker.profile.enabled": False}),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=None,
+            memory_limit=None,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+def _require_scheduler(address: str) -> None:
+    """Ask whoever answers at the address what it is: a client that can't connect leaves threads and noise behind."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from distributed.core import rpc
+    from distributed.security import Security
+
+    async def ask() -> Mapping[str, Any]:
+        arguments = Security().get_connection_args("client")
+        async with rpc(address, connection_args=arguments, timeout=CONNECT_S) as peer:
+            return await asyncio.wait_for(peer.identity(), CONNECT_S)
+
+    try:
+        # In a thread of its own, since a notebook has an event loop running in this one.
+        with ThreadPoolExecutor(1) as pool:
+            identity = pool.submit(asyncio.run, ask()).result()
+    except ValueError as error:
+        raise UserError(f"--scheduler {address}: {error}: give an address like tcp://host:8786") from None
+    except OSError:
+        raise UserError(
+            f"--scheduler {address}: nothing answers there: start one with `dask scheduler`, or leave the option out"
+        ) from None
+    except MemoryError:  # the first bytes of another protocol, read as the size of a message
+        identity = {}
+    if identity.get("type") != "Scheduler":
+        raise UserError(f"--scheduler {address}: what answers there is no Dask scheduler")
+
+
+def _fly_all(client: Client, tasks: Sequence[_Task], tell: _Teller) -> Iterator[Outcome | Failure]:
+    """Outcomes and failures as they come. A task whose worker dies is given to another one."""
+    from concurrent.futures import CancelledError
+
+    from distributed import wait
+
+    campaign_id = uuid.uuid4().hex  # an old scheduler may remember another campaign
+    waiting = {
+        client.submit(_fly, task, key=f"run-{campaign_id}-{task.combination}-{task.seed}", pure=False): task
+        for task in tasks
+    }
+    tell.now("starting")
+    try:
+        while waiting:
+            try:
+                done = wait(list(waiting), timeout=POLL_S, return_when="FIRST_COMPLETED").done
+            except TimeoutError:
+                tell.now("" if client.scheduler_info()["workers"] else "waiting for a worker")
+                continue
+            for future in done:
+                result = _result(future, waiting.pop(future))
+                tell.finished(isinstance(result, Failure))
+                yield result
+    except CancelledError:
+        raise UserError("the scheduler has gone: give the same command again to fly the runs that are left") from None
+
+
+def _result(future: Any, task: _Task) -> Outcome | Failure:
+    from concurrent.futures import CancelledError
+
+    from distributed.scheduler import KilledWorker
+
+    try:
+        result: Outcome | Failure = future.result()
+    except CancelledError:
+        raise
+    except KilledWorker as error:
+        deaths = error.allowed_failures + 1
+        message = f"its worker process died, {deaths} times over: out of memory, or a crash outside Python?"
+        return Failure(task.combination, task.seed, message)
+    except Exception as error:
+        return Failure(task.combination, task.seed, f"{type(error).__name__}: {error}", traceback.format_exc())
+    return result
+
+
+def _fly(task: _Task) -> Outcome | Failure:
+    """Fly one run. Called on a worker."""
+    from testbed.loop import run
+
+    try:
+        if _code() != task.code:
+            raise UserError("this worker has another version of the testbed than the campaign: install the same there")
+        source = Replay(task.truth) if task.truth is not None and task.truth.is_dir() else None
+        result = run(task.scenario, seed=task.seed, source=source)
+        # How long a run took says nothing about the filter and is never the same twice.
+        kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
+        for name in metrics.names(result.dataset):
+            kept[f"{name}.false_alarms_per_h"] = _false_alarms_per_h(result.dataset, name)
+        finite = {key: value for key, value in kept.items() if math.isfinite(value)}
+        return Outcome(task.combination, task.seed, finite, _history(result.dataset))
+    except Exception as error:
+        message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        return Failure(task.combination, task.seed, message, traceback.format_exc())
+
+
+def _history(dataset: xarray.DataTree) -> dict[str, Array]:
+    """The errors of a run over time, as `Outcome` keeps them."""
+    t = metrics.column(dataset, "truth/time")
+    every = max(1, round(float(dataset.attrs["record_rate_hz"]) / HISTORY_HZ))
+    kept = {"time": t, "outage": metrics.inside(t, metrics.outages(dataset)).astype(float)}
+    for name in metrics.names(dataset):
+        errors = metrics.errors(dataset, name)
+        kept[f"{name}.error"] = errors.horizontal
+        kept[f"{name}.sigma"] = np.hypot(errors.sigma_position[:, 0], errors.sigma_position[:, 1])
+        kept[f"{name}.nees"] = np.where(errors.valid, errors.position_nees, np.nan)
+    return {name: values[::every].copy() for name, values in kept.items()}
+
+
+def _false_alarms_per_h(dataset: xarray.DataTree, estimator: str) -> float:
+    """Aiding samples that an estimator rejected while GNSS had a fix, per hour of such time once it had settled."""
+    errors = metrics.errors(dataset, estimator)
+    outages = metrics.outages(dataset)
+    counted = errors.t[errors.valid & ~metrics.inside(errors.t, outages)]
+    if not len(counted):
+        return math.nan
+    rejected = 0
+    for aid in metrics.aids(dataset, estimator):
+        own = f"estimators/{estimator}/innovations/{aid}"
+        t = metrics.column(dataset, f"{own}/sample_time")
+        refused = metrics.column(dataset, f"{own}/weight") <= 0.0
+        rejected += int(np.sum(refused & (t >= counted[0]) & ~metrics.inside(t, outages)))
+    return rejected * 3600.0 * float(dataset.attrs["record_rate_hz"]) / len(counted)
+
+
+# --- a flight that was flown before
+
+
+class Replay:
+    """A motion source that gives, row for row, what `save_motion` stored in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        stored = json.loads((folder / "motion.json").read_bytes())
+        self.rate_hz = float(stored["rate_hz"])
+        self._rows = int(stored["rows"])
+        self._columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS}
+        self._tick = 0
+
+    def advance(self, ticks: int) -> TruthBlock:
+        """The next ``ticks`` rows, as copies: numba would compile again for arrays that can't be written to."""
+        rows = slice(self._tick, min(self._tick + ticks, self._rows))
+        block = TruthBlock(self._tick, **{name: np.array(column[rows]) for name, column in self._columns.items()})
+        self._tick += len(block)
+        return block
+
+    def activity(self) -> str:
+        """What is going on."""
+        return "replay"
+
+
+def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
+    """Store the first ``ticks`` rows of a motion, one .npy per truth column, for `Replay`.
+
+    The folder appears when it is complete. Raises UserError when it can't be written.
+    """
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    try:
+        part.mkdir()
+        columns = {
+            name: open_memmap(part / f"{name}.npy", "w+", float, (ticks, c.width) if c.width > 1 else (ticks,))
+            for name, c in COLUMNS.items()
+        }
+        rows = 0
+        while rows < ticks and len(block := source.advance(min(SAVE_TICKS, ticks - rows))):
+            for name, column in columns.items():
+                column[rows : rows + len(block)] = getattr(block, name)
+            rows += len(block)
+        (part / "motion.json").write_text(json.dumps({"rate_hz": source.rate_hz, "rows": rows}))
+        part.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: can't store the flight: {error.strerror}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+# --- telling
+
+
+class _Teller:
+    """Counts what has finished and passes it on."""
+
+    def __init__(self, progress: Callable[[Progress], None] | None, total: int, done: int) -> None:
+        self._progress = progress
+        self._total, self._before, self._done, self._failed = total, done, done, 0
+        self._started = time.monotonic()
+
+    def finished(self, failed: bool) -> None:
+        """One more run is through."""
+        self._failed += failed
+        self._done += not failed
+        self.now("")
+
+    def now(self, activity: str) -> None:
+        """Tell how things stand."""
+        if self._progress is not None:
+            elapsed = time.monotonic() - self._started
+            self._progress(Progress(self._done, self._failed, self._total, self._before, elapsed, activity))
+
+
+def conduct(
+    console: Console,
+    scenario: str | Path,
+    runs: int,
+    *,
+    vary: Mapping[str, Sequence[str]] | None = None,
+    overrides: Sequence[str] = (),
+    scheduler: str | None = None,
+    out: Path,
+) -> bool:
+    """A `campaign` for people: progress, tables and failures on the console; whether every run succeeded."""
+    from testbed import campaign_report
+
+    with _shown(console) as tell:
+        result = campaign(scenario, runs, vary=vary, overrides=overrides, scheduler=scheduler, out=out, progress=tell)
+    for table in campaign_report.tables(result):
+        console.print(table)
+    for failure in result.failures:
+        which = ", ".join(filter(None, [str(result.combinations[failure.combination]), f"seed {failure.seed}"]))
+        console.print(f"failed: {which}: {failure.message}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"campaign: {out}", markup=False, highlight=False, soft_wrap=True)
+    return not result.failures
+
+
+@contextmanager
+def _shown(console: Console) -> Iterator[Callable[[Progress], None]]:
+    """Progress as a bar on a terminal, as a line now and then elsewhere."""
+    if not console.is_terminal:
+        yield _plain(console)
+        return
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    with Bar(TextColumn("runs"), BarColumn(), TextColumn("{task.description}"), console=console, transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+        yield lambda now: bar.update(task, total=now.total, completed=now.done + now.failed, description=str(now))
+
+
+def _plain(console: Console) -> Callable[[Progress], None]:
+    last = -math.inf
+
+    def tell(now: Progress) -> None:
+        nonlocal last
+        if now.done + now.failed < now.total and now.elapsed_s - last < PLAIN_EVERY_S:
+            return
+        last = now.elapsed_s
+        console.print(f"runs {now}", markup=False, highlight=False, soft_wrap=True)
+
+    return tell
