@@ -35,8 +35,18 @@ def written(path: KeyPath) -> str:
         if isinstance(step, int):
             text += f"[{step}]"
         else:
-            text += ("." if text else "") + (step if _BARE_KEY.fullmatch(step) else f'"{step}"')
+            text += ("." if text else "") + (step if _BARE_KEY.fullmatch(step) else f'"{printable(step)}"')
     return text
+
+
+def read(text: str) -> KeyPath:
+    """The key path that `written` wrote, of bare keys and indexes."""
+    return tuple(int(index) if index else key for index, key in re.findall(r"\[(\d+)\]|([^.\[\]]+)", text))
+
+
+def printable(text: str) -> str:
+    """The same on one line: what does not print is escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def line_numbers(text: str) -> dict[KeyPath, int]:
@@ -149,7 +159,7 @@ def assign(data: dict[str, Any], override: str) -> KeyPath:
     value is read as TOML and, where that fails, taken as a string. Raises UserError that names the override.
     """
     key, equals, value = override.partition("=")
-    where = f"--set {override}"
+    where = f"--set {printable(override)}"
     if not equals:
         raise UserError(f"{where}: give it as key=value, such as sensors.gnss.rate_hz=10")
     steps = _override_steps(key.strip(), where)

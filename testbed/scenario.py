@@ -11,9 +11,10 @@ import datetime as dt
 import difflib
 import itertools
 import json
+import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 
@@ -25,12 +26,16 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.keypath import KeyPath
 from testbed.schema import Section
-from testbed.sensors import CONFIGS
+from testbed.sensors import CONFIGS, SensorConfig, Site
+from testbed.sensors.magnetometer import WMM_YEARS
+from testbed.sensors.timing import TICK_TOLERANCE
 
 LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
 LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a slip of the keyboard beyond that
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
 ERRORS_SHOWN = 20
+CHOICES_SHOWN = 12
+MISSING = "is missing: add it"
 
 Latitude: TypeAlias = Annotated[float, Field(gt=-LATITUDE_LIMIT_DEG, lt=LATITUDE_LIMIT_DEG)]
 Longitude: TypeAlias = Annotated[float, Field(ge=-180, le=180)]
@@ -38,6 +43,7 @@ Altitude: TypeAlias = Annotated[float, Field(ge=-500, le=10_000)]
 Heading: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 WindSpeed: TypeAlias = Annotated[float, Field(ge=0, le=50)]
 TickRate: TypeAlias = Annotated[float, Field(ge=50, le=1000)]
+Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt.date(WMM_YEARS[1], 1, 1))]
 
 # What each kind of estimator can be aided by.
 AIDS: Mapping[str, frozenset[str]] = {"ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"})}
@@ -63,7 +69,7 @@ class Wind(Section):
     from_deg: Heading = 0.0
     speed_mps: WindSpeed = 0.0
     turbulence: Literal["none", "light", "moderate", "severe"] = "none"
-    profile: list[tuple[Altitude, Heading, WindSpeed]] = Field(default_factory=list)
+    profile: tuple[tuple[Altitude, Heading, WindSpeed], ...] = ()
 
     @model_validator(mode="after")
     def _one_wind(self) -> Self:
@@ -112,7 +118,7 @@ def _sensor(table: object) -> Section:
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in CONFIGS:
         raise PydanticCustomError("sensor_kind", "unknown sensor kind")
-    return CONFIGS[kind].model_validate_json(json.dumps(table), strict=True)
+    return CONFIGS[kind].model_validate(table, strict=True)
 
 
 class EstimatorConfig(Section):
@@ -121,7 +127,7 @@ class EstimatorConfig(Section):
     name: str
     kind: Literal["ins"] = "ins"
     imu: str = "imu"
-    aids: list[str]
+    aids: tuple[str, ...]
 
 
 class AutopilotConfig(Section):
@@ -177,11 +183,11 @@ class Scenario(Section):
     description: str = ""
     seed: int = Field(default=0, ge=0, lt=2**63)
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S)
-    date: dt.date = dt.date(2026, 1, 1)
+    date: Date = dt.date(2026, 1, 1)
     truth: FlightTruth | KinematicTruth = Field(discriminator="source")
-    plan: list[guidance.Leg] = Field(default_factory=list)
-    sensors: dict[str, Annotated[Section, PlainValidator(_sensor)]] = Field(default_factory=dict)
-    estimator: list[EstimatorConfig] = Field(default_factory=list)
+    plan: tuple[guidance.Leg, ...] = ()
+    sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(default_factory=dict)
+    estimator: tuple[EstimatorConfig, ...] = ()
     autopilot: AutopilotConfig = AutopilotConfig()
     record: RecordConfig = RecordConfig()
     expect: dict[str, Bounds] = Field(default_factory=dict)
@@ -228,14 +234,18 @@ class Scenario(Section):
             if isinstance(table, dict):
                 table.setdefault("kind", name)
         try:
-            # By way of JSON because pydantic's strict mode then still takes a list for a tuple, and refuses "5" for 5.
-            scenario = cls.model_validate_json(json.dumps(data, default=str), strict=True)
+            scenario = cls.model_validate(_frozen(data), strict=True)
         except ValidationError as error:
             raise UserError(_report(error, data, text, place, set_paths)) from None
         except RecursionError:
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
         scenario._text, scenario._path, scenario._overrides = text, path, tuple(overrides)
         return scenario
+
+    def site(self) -> Site:
+        """Where and when the run starts."""
+        start = self.truth.start
+        return Site(self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -268,8 +278,8 @@ def _find(path_or_name: str | Path) -> Path:
             raise UserError(f"{path}: is a folder: give a scenario file in it")
         if path.exists():
             return path
-    except (OSError, ValueError) as error:  # a name that no file can have
-        raise UserError(f"{named!r}: {error}") from None
+    except OSError as error:  # a name that no file can have
+        raise UserError(f"{named}: {error.strerror}") from None
     if path.suffix or path.parent != Path():
         raise UserError(f"{path}: no such file")
     near = difflib.get_close_matches(named, known, n=3)
@@ -306,6 +316,13 @@ def _toml(text: str, place: str) -> dict[str, Any]:
         raise UserError(f"{place}: is not valid TOML: {error}") from None
 
 
+def _frozen(value: Any) -> Any:
+    """The same with tuples for lists: sections are immutable, and strict validation does not convert."""
+    if isinstance(value, dict):
+        return {key: _frozen(item) for key, item in value.items()}
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value
+
+
 # --- what one key can't know
 
 
@@ -335,45 +352,35 @@ def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     aircraft = sorted(file.stem for file in data_dir("aircraft").glob("*/*.xml") if file.stem == file.parent.name)
     if scenario.truth.aircraft not in aircraft:
         yield ("truth", "aircraft"), _unknown("aircraft", scenario.truth.aircraft, aircraft)
+    wind = scenario.truth.wind
     try:
-        guidance.check_plan(scenario.plan)
+        guidance.check_plan(
+            scenario.plan, scenario.truth.start, max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
+        )
     except ValueError as error:
-        yield ("plan",), str(error)
+        key, _, what = str(error).partition(": ")
+        yield keypath.read(key), what
 
 
-def _sensor_faults(path: KeyPath, config: Section, tick_hz: float, duration_s: float) -> Iterator[tuple[KeyPath, str]]:
+def _sensor_faults(
+    path: KeyPath, config: SensorConfig, tick_hz: float, duration_s: float
+) -> Iterator[tuple[KeyPath, str]]:
     name = str(path[-1])
     if not _IDENTIFIER.fullmatch(name):
         yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
-    rate_hz = getattr(config, "rate_hz", None)
-    if rate_hz is not None:
-        yield from _divides((*path, "rate_hz"), rate_hz, tick_hz)
+    yield from _divides((*path, "rate_hz"), config.rate_hz, tick_hz)
     offset_s = getattr(config, "offset_s", 0.0)
     if not _whole(offset_s * tick_hz):
         nearest = round(offset_s * tick_hz) / tick_hz
         yield (*path, "offset_s"), f"is not a multiple of the tick {1 / tick_hz:g} s: the nearest is {nearest:g}"
-    yield from _window_faults((*path, "denied"), getattr(config, "denied", ()), duration_s)
-
-
-def _window_faults(
-    path: KeyPath, windows: Iterable[tuple[float, float]], duration_s: float
-) -> Iterator[tuple[KeyPath, str]]:
-    last_end = -1.0
-    for index, (start, end) in enumerate(windows):
-        shown = f"window [{start:g}, {end:g}]"
-        if start < 0:
-            yield (*path, index), f"{shown} starts before the run"
-        elif end <= start:
-            yield (*path, index), f"{shown} is reversed or empty: give its start, then its end"
-        elif start >= duration_s:
-            yield (*path, index), f"{shown} starts after the end of the run: duration_s is {duration_s:g}"
-        elif start <= last_end:
-            yield (*path, index), f"{shown} overlaps the one before it or comes out of order: sort and merge them"
-        last_end = max(last_end, end)
+    for start, end in getattr(config, "denied", ()):
+        if start >= duration_s:
+            shown = f"window [{start:g}, {end:g}]"
+            yield (*path, "denied"), f"{shown} starts after the end of the run: duration_s is {duration_s:g}"
 
 
 def _estimator_faults(
-    path: KeyPath, config: EstimatorConfig, sensors: Mapping[str, Section], taken: set[str]
+    path: KeyPath, config: EstimatorConfig, sensors: Mapping[str, SensorConfig], taken: set[str]
 ) -> Iterator[tuple[KeyPath, str]]:
     if not _IDENTIFIER.fullmatch(config.name):
         yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
@@ -381,7 +388,7 @@ def _estimator_faults(
         yield (*path, "name"), f"{config.name!r} is taken by an estimator above: give each its own name"
     elif config.name in _RESERVED:
         yield (*path, "name"), f"{config.name!r} is reserved: choose another name"
-    kinds = {name: _kind(sensor) for name, sensor in sensors.items()}
+    kinds = {name: sensor.kind for name, sensor in sensors.items()}
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
@@ -407,10 +414,6 @@ def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, st
         yield ("expect", key), _unknown("estimator", match["whose"], sorted(estimators | {"run"}))
 
 
-def _kind(config: Section) -> str:
-    return next(kind for kind, section in CONFIGS.items() if type(config) is section)
-
-
 def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:
     if rate_hz > tick_hz:
         yield path, f"{rate_hz:g} Hz is faster than the tick rate of {tick_hz:g} Hz (truth.rate_hz)"
@@ -422,7 +425,7 @@ def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[Ke
 
 
 def _whole(value: float) -> bool:
-    return abs(value - round(value)) <= 1e-9 * max(1.0, abs(value))
+    return abs(value - round(value)) <= TICK_TOLERANCE * max(1.0, value)
 
 
 def _unknown(what: str, given: str, known: Sequence[str]) -> str:
@@ -437,12 +440,17 @@ def _report(
 ) -> str:
     """Every error on a line of its own: file, line, key path, what is wrong and what to do."""
     said: dict[KeyPath, list[str]] = {}
+    misspelt: set[KeyPath] = set()
     for details in error.errors(include_url=False):
         path, models = _locate(details, data)
         said.setdefault(path, []).append(_say(details, path, models))
+        if details["type"] == "extra_forbidden":
+            misspelt.update((*path[:-1], key) for key in _near(str(path[-1]), _keys(models)))
     lines = keypath.line_numbers(text)
     messages = []
     for path, texts in said.items():
+        if path in misspelt and texts == [MISSING]:
+            continue  # it is there under the name that is complained about already
         above = [path[:length] for length in range(len(path), -1, -1)]
         below = [p for p in set_paths if path and p[: len(path)] == path]
         override = next((set_paths[p] for p in above + below if p in set_paths), None)
@@ -506,10 +514,9 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
     kind, given, context = details["type"], details["input"], details.get("ctx", {})
     match kind:
         case "extra_forbidden":
-            known = list(dict.fromkeys(key for model in models for key in model.model_fields))
-            return f"unknown key: {_choice(str(path[-1]), known)}"
+            return f"unknown key: {_choice(str(path[-1]), _keys(models))}"
         case "missing":
-            return "is missing: this item needs one more value" if isinstance(path[-1], int) else "is missing: add it"
+            return "is missing: this item needs one more value" if isinstance(path[-1], int) else MISSING
         case "sensor_kind":
             return _unknown("sensor of kind", str(given.get("kind")), list(CONFIGS))
         case "union_tag_not_found":
@@ -524,8 +531,6 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
             return str(context["error"])
         case "scenario":
             return str(context["text"])
-        case "json_invalid":
-            return "tables or lists are nested too deeply"
         case "model_type" | "dict_type" | "model_attributes_type":
             return f"must be a table, not {_shown(given)}"
         case "date_type" | "date_parsing" | "date_from_datetime_parsing" | "date_from_datetime_inexact":
@@ -548,9 +553,22 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
 
 
 def _choice(given: str, known: Sequence[str]) -> str:
-    near = difflib.get_close_matches(given, known, n=1)
-    hint = f"did you mean {near[0]}? Choose from " if near else "choose from "
-    return hint + ", ".join(known) if known else "there is none to choose from"
+    if not known:
+        return "there is none to choose from"
+    near = _near(given, known)
+    listed = (
+        known if len(known) <= CHOICES_SHOWN else difflib.get_close_matches(given, known, n=CHOICES_SHOWN, cutoff=0)
+    )
+    more = ", …" if len(known) > CHOICES_SHOWN else ""
+    return (f"did you mean {near[0]}? Choose from " if near else "choose from ") + ", ".join(listed) + more
+
+
+def _near(given: str, known: Sequence[str]) -> list[str]:
+    return difflib.get_close_matches(given, known, n=1)
+
+
+def _keys(models: Sequence[type[Section]]) -> list[str]:
+    return list(dict.fromkeys(key for model in models for key in model.model_fields))
 
 
 def _shown(value: object) -> str:
@@ -558,4 +576,4 @@ def _shown(value: object) -> str:
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= 60 else text[:57] + "..."
+    return keypath.printable(text if len(text) <= 60 else text[:57] + "...")

@@ -1,0 +1,362 @@
+"""Wrong scenarios: every mistake is one clear message with file, line, key and advice; nothing else ever comes out."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from testbed.data import data_dir
+from testbed.errors import UserError
+from testbed.scenario import Scenario
+
+TEXTS = {path.stem: path.read_text("utf-8") for path in sorted(data_dir("scenarios").glob("*.toml"))}
+U_TURN = TEXTS["u_turn"]
+
+
+def complaint(text: str, *overrides: str) -> str:
+    with pytest.raises(UserError) as caught:
+        Scenario.parse(text, overrides, Path("mine.toml"))
+    return str(caught.value)
+
+
+def line_of(text: str, start: str) -> int:
+    """Number of the first line that begins with ``start``."""
+    return next(n for n, line in enumerate(text.splitlines(), 1) if line.startswith(start))
+
+
+# --- one mistake in the file: what is replaced, on which line the message is to point, and what it says
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('title = "A', 'titel = "A', "titel: unknown key: did you mean title? Choose from title, description, seed"),
+        ("seed = 1", "seed = 1.5", "seed: must be a whole number, not 1.5"),
+        ("seed = 1", "seed = -1", "seed: must be greater than or equal to 0, not -1"),
+        ("duration_s = 200", "duration_s = 0", "duration_s: must be greater than 0, not 0"),
+        ("duration_s = 200", "duration_s = 1e9", "duration_s: must be less than or equal to 172800"),
+        ("duration_s = 200", "duration_s = nan", "duration_s: must be a finite number, not nan"),
+        ("duration_s = 200", "duration_s = inf", "duration_s: must be a finite number, not inf"),
+        ("duration_s = 200", 'duration_s = "200"', 'duration_s: must be a number, not "200"'),
+        ("duration_s = 200", "duration_min = 4", "duration_min: unknown key: did you mean duration_s"),
+        ("date = 2026-06-01", "date = 2026", "date: must be a date such as 2026-06-01, not 2026"),
+        ('source = "flight"', 'source = "fly"', 'truth.source: there is no source "fly": '),
+        ('source = "flight"', "", "truth.source: is missing: add it, one of flight, kinematic"),
+        ('aircraft = "loiter"', 'aircraft = "loitr"', 'truth.aircraft: there is no aircraft "loitr": did you mean'),
+        ("start = { lat_deg = 47.0", "start = { lat_deg = 85.0", "truth.start.lat_deg: must be less than 85, not 85"),
+        (
+            "start = { lat_deg = 47.0",
+            "start = { lat_rad = 0.7",
+            "truth.start.lat_rad: unknown key: did you mean lat_deg",
+        ),
+        ("start = { lat_deg = 47.0,", "start = {", "truth.start.lat_deg: is missing: add it"),
+        ("wind = {", "wind = 5 # {", "truth.wind: must be a table, not 5"),
+        ('leg = "u_turn"', 'leg = "uturn"', 'plan[1].leg: there is no leg "uturn": did you mean u_turn'),
+        ('leg = "u_turn"', "", "plan[1].leg: is missing: add it, one of straight"),
+        ('direction = "left"', 'direction = "lift"', 'plan[1].direction: can\'t be "lift": did you mean left'),
+        ("[sensors.gnss]", "[sensors.gns]", 'sensors.gns: there is no sensor of kind "gns": did you mean gnss'),
+        ("[sensors.gnss]", "[sensors.2nd]", 'sensors.2nd: there is no sensor of kind "2nd": choose from '),
+        ("[sensors.gnss]", '[sensors."a/b"]\nkind = "gnss"', 'sensors."a/b": a sensor\'s name is made of letters'),
+        ("[sensors.imu]", "[sensors.imu]\ngrade_ = 3", "sensors.imu.grade_: unknown key: did you mean grade"),
+        ('grade = "mems-industrial"', 'grade = "mems-industrail"', "sensors.imu.grade: can't be"),
+        ('name = "ins"', 'name = "my ins"', "estimator[0].name: is made of letters"),
+        ('name = "ins"', 'name = "run"', "estimator[0].name: 'run' is reserved"),
+        ('kind = "ins"', 'kind = "ukf"', 'estimator[0].kind: can\'t be "ukf": choose from ins'),
+        ('kind = "ins"', 'imu = "gnss"', 'estimator[0].imu: there is no IMU "gnss": choose from imu'),
+        ('aids = ["gnss", ', 'aids = ["gps", ', 'estimator[0].aids[0]: there is no sensor "gps"'),
+        (
+            'aids = ["gnss", ',
+            'aids = ["imu", ',
+            "estimator[0].aids[0]: 'imu' is of kind 'imu', which does not aid 'ins'",
+        ),
+        ('aids = ["gnss", "b', 'aids = ["gnss", "gnss", "b', "estimator[0].aids[1]: 'gnss' is listed twice"),
+        ("[expect]", "[expect]\nposition_rms_m = 3", "expect.position_rms_m: is no metric: write it quoted as"),
+        ("[expect]", '[expect]\n"inz.position_rms_m" = 3', 'expect."inz.position_rms_m": there is no estimator "inz"'),
+        ("[expect]", "[expect]\nins.roll_rms_deg = 3", "expect.ins: takes a maximum, or min and max; a metric's name"),
+        ("[expect]", '[expect]\n"ins.x_m" = {}', 'expect."ins.x_m": give a maximum'),
+        ("[expect]", '[expect]\n"ins.x_m" = {min = 2, max = 1}', 'expect."ins.x_m": min 2 is above max 1'),
+        (
+            "[expect]",
+            '[autopilot]\nfeedback = "ins"\n[expect]',
+            'autopilot.feedback: can\'t be "ins": choose from truth',
+        ),
+        (
+            "[expect]",
+            "[record]\nrate_hz = 30\n[expect]",
+            "record.rate_hz: 30 Hz does not divide the tick rate of 200 Hz",
+        ),
+        ("[expect]", "[record]\nimu = 1\n[expect]", "record.imu: must be true or false, not 1"),
+    ],
+)
+def test_one_mistake_one_message(old: str, new: str, says: str) -> None:
+    text = U_TURN.replace(old, new, 1)
+    assert text != U_TURN
+    message = complaint(text)
+    assert says in message
+    at = next(line for line in message.splitlines() if says in line)
+    line = int(re.match(r"mine\.toml:(\d+): ", at)[1])  # type: ignore[index]
+    changed = [n for n, (a, b) in enumerate(zip(text.splitlines(), U_TURN.splitlines(), strict=False), 1) if a != b]
+    assert changed[0] - 1 <= line <= changed[0] + 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('title = "A', 'title = "A"', "mine.toml:5: is not valid TOML"),
+        ("seed = 1", "seed = 1\nseed = 2", "mine.toml:7: is not valid TOML"),
+        ("[[plan]]", "[[plan]", "mine.toml:17: is not valid TOML"),
+        ("seed = 1", "seed = " + "9" * 5000, "mine.toml: is not valid TOML"),
+        ("seed = 1", "seed = " + "[" * 5000 + "]" * 5000, "mine.toml: tables or lists are nested too deeply"),
+    ],
+)
+def test_text_that_is_not_toml(old: str, new: str, says: str) -> None:
+    assert complaint(U_TURN.replace(old, new, 1)).startswith(says)
+
+
+@pytest.mark.parametrize(
+    ("windows", "says"),
+    [
+        ("[[80, 50]]", "denied: window [80, 50] ends before it starts"),
+        ("[[80, 80]]", "denied: window [80, 80] ends before it starts"),
+        ("[[-5, 20]]", "denied: window [-5, 20] starts before the run"),
+        ("[[50, 80], [70, 90]]", "denied: windows [50, 80] and [70, 90] overlap"),
+        ("[[50, 90], [60, 70]]", "denied: windows [50, 90] and [60, 70] overlap"),
+        ("[[250, 300]]", "denied: window [250, 300] starts after the end of the run: duration_s is 200"),
+        ("[[50]]", "denied[0][1]: is missing: this item needs one more value"),
+        ("[[50, 60, 70]]", "denied[0]: has 3 items, but at most 2 are allowed"),
+        ('[["50", 60]]', 'denied[0][0]: must be a number, not "50"'),
+        ("[50, 60]", "denied[0]: must be a list, not 50"),
+        ("3", "denied: must be a list, not 3"),
+    ],
+)
+def test_windows(windows: str, says: str) -> None:
+    message = complaint(U_TURN.replace("[sensors.gnss]", f"[sensors.gnss]\ndenied = {windows}"))
+    assert message.startswith(f"mine.toml:{line_of(U_TURN, '[sensors.gnss]') + 1}: sensors.gnss.{says}")
+
+
+def test_a_misspelt_key_is_not_missing_as_well() -> None:
+    assert len(complaint(U_TURN.replace("lat_deg", "latt_deg")).splitlines()) == 1
+    assert len(complaint(U_TURN.replace("lat_deg", "bogus")).splitlines()) == 2
+
+
+def test_a_window_may_reach_beyond_the_end() -> None:
+    Scenario.parse(U_TURN, ["sensors.gnss.denied=[[150, 400]]"])
+
+
+def test_rates_divide_the_tick_and_offsets_are_whole_ticks() -> None:
+    message = complaint(
+        U_TURN, "sensors.barometer.rate_hz=60", "sensors.imu.rate_hz=400", "sensors.gnss.offset_s=0.012"
+    )
+    assert "sensors.barometer.rate_hz: 60 Hz does not divide the tick rate of 200 Hz" in message
+    assert "try 50 or 66.66666667" in message
+    assert "sensors.imu.rate_hz: 400 Hz is faster than the tick rate of 200 Hz" in message
+    assert "sensors.gnss.offset_s: is not a multiple of the tick 0.005 s: the nearest is 0.01" in message
+    Scenario.parse(U_TURN, ["sensors.barometer.rate_hz=66.66666667", "sensors.gnss.offset_s=0.015"])
+
+
+def test_all_mistakes_in_one_go_in_order_of_lines() -> None:
+    text = U_TURN.replace("seed = 1", "seed = true").replace("lat_deg = 47.0", "lat_deg = 91")
+    message = complaint(text.replace("direction", "direktion"), "sensors.imu.rate_hz=fast")
+    assert [line.split(": ")[1] for line in message.splitlines() if "--set" not in line] == [
+        "seed",
+        "truth.start.lat_deg",
+        "plan[1].direktion",
+    ]
+    assert 'mine.toml (--set sensors.imu.rate_hz=fast): sensors.imu.rate_hz: must be a number, not "fast"' in message
+
+
+def test_a_flood_of_mistakes_is_cut_short() -> None:
+    message = complaint("\n".join(f"x{i} = 1" for i in range(100)))
+    assert len(message.splitlines()) == 21
+    assert message.endswith("and 83 more")  # 100 unknown and 3 missing keys
+
+
+def test_same_name_for_two_estimators() -> None:
+    second = U_TURN[U_TURN.index("[[estimator]]") : U_TURN.index("[expect]")]
+    message = complaint(U_TURN.replace("[expect]", f"{second}[expect]"))
+    assert "estimator[1].name: 'ins' is taken by an estimator above" in message
+
+
+def test_a_plan_belongs_to_a_flight_and_a_flight_to_a_plan() -> None:
+    assert "plan: a flight needs a plan" in complaint(U_TURN, "plan=[]")
+    static = TEXTS["static_bench"] + '[[plan]]\nleg = "straight"\nlength_m = 100\n'
+    assert "plan: a body of source 'kinematic' flies no plan" in complaint(static)
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("truth.start.airspeed_mps=12", "truth.start.airspeed_mps: 12 m/s true airspeed is below"),
+        ("plan[1].radius_m=80", "plan[1].radius_m: 80 m is below the bank limit"),
+        ("plan[2].airspeed_mps=45", "plan[2].airspeed_mps: 45 m/s true airspeed is above"),
+        ("plan[0].alt_m=10", "plan[0].alt_m: "),
+    ],
+)
+def test_a_plan_that_cannot_be_flown(override: str, says: str) -> None:
+    assert complaint(U_TURN, override).startswith(f"mine.toml (--set {override}): {says}")
+
+
+def test_wind_profile_or_wind() -> None:
+    both = complaint(U_TURN, "truth.wind.profile=[[0, 250, 3]]")
+    assert "truth.wind: a profile replaces from_deg and speed_mps" in both
+    falling = complaint(U_TURN, "truth.wind={profile=[[900, 250, 3], [100, 250, 3]]}")
+    assert "truth.wind: the rows of profile must climb" in falling
+    Scenario.parse(U_TURN, ["truth.wind={profile=[[100, 250, 3], [900, 250, 8]]}"])
+
+
+# --- files
+
+
+def load_complaint(path: Path | str) -> str:
+    with pytest.raises(UserError) as caught:
+        Scenario.load(path)
+    return str(caught.value)
+
+
+def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
+    empty, latin, long = tmp_path / "empty.toml", tmp_path / "latin.toml", tmp_path / "long.toml"
+    empty.write_text("# nothing yet\n\n")
+    latin.write_bytes('seed = 1\ntitle = "Über den Wolken"\n'.encode("latin-1"))
+    long.write_text("# " + "x" * 2_000_000)
+    assert load_complaint(tmp_path) == f"{tmp_path}: is a folder: give a scenario file in it"
+    assert load_complaint(tmp_path / "none.toml") == f"{tmp_path / 'none.toml'}: no such file"
+    assert load_complaint(empty).startswith(f"{empty}: is empty: begin with a copy of ")
+    assert load_complaint(latin) == f"{latin}:2: is not UTF-8 text: save the file as UTF-8"
+    assert load_complaint(long) == f"{long}: is larger than 1000 kB: is this a scenario file?"
+    assert "is larger than" in load_complaint("/dev/zero")
+    assert "too long" in load_complaint("a" * 5000)
+
+
+def test_names_that_are_not_shipped() -> None:
+    assert load_complaint("uturn").endswith("did you mean u_turn?")
+    assert "shipped are jammer_zone, loiter_gnss_outage" in load_complaint("zzz")
+
+
+# --- whatever comes
+
+
+JUNK = st.one_of(
+    st.none().map(lambda _: "x"),
+    st.booleans(),
+    st.integers(),
+    st.integers(10**18, 10**400),
+    st.floats(),
+    st.floats(-10, 10).map(lambda x: round(x, 2)),
+    st.text(max_size=12),
+    st.sampled_from(["imu", "gnss", "ins", "flight", "kinematic", "straight", "loiter", "none", "../..", "a.b", "1"]),
+    st.sampled_from([[], {}, [[]], [{}], {"": 0}, [[1, 2]], [[5, 3]], [[1, 2], [1, 2]], {"kind": 3}, {"name": []}]),
+    st.recursive(
+        st.integers() | st.floats() | st.text(max_size=3),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+        max_leaves=6,
+    ),
+)
+
+
+def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path, *(place for key, item in items for place in places(item, (*path, key)))]
+
+
+@st.composite
+def mutated_documents(draw: st.DrawFn) -> str:
+    """A shipped scenario after a few accidents: keys dropped, renamed, added; values replaced, moved, doubled."""
+    data: dict[str, Any] = tomllib.loads(TEXTS[draw(st.sampled_from(sorted(TEXTS)))])
+    for _ in range(draw(st.integers(1, 4))):
+        *above, last = draw(st.sampled_from(places(data)[1:] or [("title",)]))
+        parent: Any = data
+        for step in above:
+            parent = parent[step]
+        accident = draw(st.sampled_from(["drop", "rename", "add", "replace", "replace", "replace", "move", "double"]))
+        if accident == "drop" and last in parent if isinstance(parent, dict) else accident == "drop":
+            del parent[last]
+        elif accident == "move":
+            *_, other = draw(st.sampled_from(places(data)[1:] or [("title",)]))
+            if isinstance(parent, dict) and isinstance(other, str) and last in parent:
+                parent[other] = copy.deepcopy(parent[last])
+        elif isinstance(parent, list):
+            if accident == "double":
+                parent.append(copy.deepcopy(parent[last]))
+            else:
+                parent[last] = draw(JUNK)
+        elif accident == "rename" and last in parent:
+            name = draw(st.text(max_size=8) | st.just(str(last)[:-1]) | st.just(f"{last}s"))
+            parent[name] = parent.pop(last)
+        elif accident == "add":
+            parent[draw(st.text(max_size=8))] = draw(JUNK)
+        else:
+            parent[last] = draw(JUNK)
+    return "".join(f"{json.dumps(key)} = {toml(value)}\n" for key, value in data.items())
+
+
+@st.composite
+def mutated_texts(draw: st.DrawFn) -> str:
+    """A shipped scenario with bits of its text deleted, doubled, swapped or overwritten."""
+    text = TEXTS[draw(st.sampled_from(sorted(TEXTS)))]
+    for _ in range(draw(st.integers(1, 3))):
+        start = draw(st.integers(0, len(text)))
+        stop = min(len(text), start + draw(st.integers(0, 30)))
+        fill = draw(
+            st.text(max_size=5) | st.sampled_from(["[", "]]", "{", '"""', "'''", "=", "\n", ".", "#", "e", "-"])
+        )
+        text = text[:start] + draw(st.sampled_from([fill, "", text[start:stop] * 2])) + text[stop:]
+    return text
+
+
+def toml(value: Any) -> str:
+    """TOML for what `tomllib` gives or `JUNK` has."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{basic(key)} = {toml(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(toml, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return basic(value) if isinstance(value, str) else str(value)
+
+
+def basic(text: str) -> str:
+    return json.dumps(text).replace("\x7f", "\\u007f")
+
+
+def loads_or_complains(text: str, overrides: list[str]) -> None:
+    try:
+        scenario = Scenario.parse(text, overrides, Path("mine.toml"))
+    except UserError as error:
+        for line in str(error).splitlines():
+            assert re.match(r"mine\.toml(:\d+| \(--set .*\))?: .|--set .", line, re.DOTALL), line
+            assert "pydantic" not in line
+    else:
+        assert scenario.title
+        assert dict(Scenario.parse(scenario.text, scenario.overrides)) == dict(scenario)
+
+
+DOCUMENTS = mutated_documents() | mutated_texts()
+KEYS = st.sampled_from(
+    ["seed", "plan[0].leg", "sensors.gnss.denied", "estimator.ins.aids", "truth.wind", "truth.start.lat"]
+)
+OVERRIDES = st.lists(
+    st.text(max_size=15) | st.builds("{}={}".format, KEYS | st.text(max_size=6), JUNK.map(toml) | st.text(max_size=9)),
+    max_size=2,
+)
+PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+
+
+@settings(PATIENT, max_examples=400)
+@given(DOCUMENTS, OVERRIDES)
+def test_only_clean_loads_or_clean_errors(text: str, overrides: list[str]) -> None:
+    loads_or_complains(text, overrides)
+
+
+@pytest.mark.slow
+@settings(PATIENT, max_examples=10_000)
+@given(DOCUMENTS, OVERRIDES)
+def test_only_clean_loads_or_clean_errors_at_length(text: str, overrides: list[str]) -> None:
+    loads_or_complains(text, overrides)
