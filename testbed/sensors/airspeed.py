@@ -9,7 +9,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from nav.samples import AirspeedSample
-from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.grades import with_grade
+from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import PERCENT
 from testbed.truth import Column, TruthBlock

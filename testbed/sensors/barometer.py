@@ -8,7 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from nav.samples import BarometerSample
-from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.grades import with_grade
+from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.truth import Column, TruthBlock
 

@@ -19,9 +19,10 @@ from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
 from nav.rotation import quat_rotate
 from nav.samples import Array, FixType, GnssSample
 from testbed.schema import Section
-from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.grades import with_grade
+from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
-from testbed.sensors.units import DEG
+from testbed.sensors.units import DEG, LeverArm
 from testbed.truth import Column, TruthBlock
 
 COLUMNS: dict[str, Column] = {
@@ -154,7 +155,7 @@ class GnssConfig(AidingTiming):
     satellites: int = Field(12, ge=MIN_SATELLITES, le=60)
     hdop: float = Field(0.9, gt=0, le=50)
     vdop: float = Field(1.4, gt=0, le=50)
-    lever_arm_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
+    lever_arm_m: LeverArm = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
 
     reacquire_s: float = Field(0.0, ge=0, le=3600, description="from the end of denial to the first fix")
     settle_factor: float = Field(2.0, ge=1, le=100, description="errors and reported accuracy at the first fix")
@@ -258,16 +259,15 @@ class Gnss:
             -(t - self._denied_until - config.reacquire_s) / config.settle_s
         )
         noise = noise * unsettled
-        lat, lon, h = antenna[0], antenna[1], antenna[2]
-        R_M, R_N = radii(lat)
+        lat, lon, h = _displaced(antenna[0], antenna[1], antenna[2], noise)
         satellites = max(MIN_SATELLITES, round((config.satellites + sky) / unsettled))
         dilution = math.sqrt(config.satellites / satellites)
         return GnssSample(
             t,
             t + config.latency_s,
-            float(lat + noise[0] / (R_M + h)),
-            float(wrap_longitude(lon + noise[1] / ((R_N + h) * math.cos(lat)))),
-            float(h - noise[2]),
+            lat,
+            lon,
+            h,
             antenna[3:] + noise[3:],
             self._sigma_position_n * unsettled,
             self._sigma_velocity_n * unsettled,
@@ -315,6 +315,14 @@ class Gnss:
 
 
 @njit
+def _displaced(lat: float, lon: float, h: float, d_n: Array) -> tuple[float, float, float]:
+    """(lat, lon, h) of a point ``d_n`` (3,) metres north, east, down of another, for small ``d_n``."""
+    R_M, R_N = radii(lat)
+    east = d_n[1] / ((R_N + h) * math.cos(lat))
+    return lat + d_n[0] / (R_M + h), wrap_longitude(lon + east), h - d_n[2]
+
+
+@njit
 def _antenna(
     start: int,
     step: int,
@@ -339,10 +347,7 @@ def _antenna(
         if has_lever:
             arm = quat_rotate(q_nb[k], lever)
             rate = quat_rotate(q_nb[k], omega_b[k]) - earth_rate_n(lat[k])
-            R_M, R_N = radii(lat[k])
-            out[i, 0] += arm[0] / (R_M + h[k])
-            out[i, 1] = wrap_longitude(lon[k] + arm[1] / ((R_N + h[k]) * math.cos(lat[k])))
-            out[i, 2] -= arm[2]
+            out[i, 0], out[i, 1], out[i, 2] = _displaced(lat[k], lon[k], h[k], arm)
             out[i, 3] += rate[1] * arm[2] - rate[2] * arm[1]
             out[i, 4] += rate[2] * arm[0] - rate[0] * arm[2]
             out[i, 5] += rate[0] * arm[1] - rate[1] * arm[0]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -18,7 +18,8 @@ from nav._jit import njit
 from nav.rotation import dcm_from_quat, quat_from_euler
 from nav.samples import Array, ImuSamples
 from testbed.schema import Section
-from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.grades import with_grade
+from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import ticks_per_sample
 from testbed.sensors.units import (
     DEG,
@@ -31,8 +32,12 @@ from testbed.sensors.units import (
     MRAD,
     PPM,
     G,
+    LeverArm,
 )
 from testbed.truth import Column, TruthBlock
+
+Triple: TypeAlias = tuple[float, float, float]
+Angle: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 
 COLUMNS: dict[str, Column] = {
     "t": Column("s", 1, "end of the interval"),
@@ -48,12 +53,17 @@ ALLAN_PEAK = 0.6174
 VIBRATION_RPM = 6000.0  # the engine speed at which the vibration keys hold; imbalance forces grow with its square
 SECOND_HARMONIC = 0.5  # amplitude of the tone at two per rev over that at one per rev
 
+# How the unit is mounted and warms up is the aircraft's doing, the same for every real grade: a small engine behind
+# soft rubber (assumed).
+INSTALLATION = {"vibration_mg": 30.0, "vibration_degps": 0.2, "self_heating_k": 5.0}
+
 # Sources. Where a datasheet is silent or gives worst-case limits, the figure is typical of the class: "assumed".
 GRADES: dict[str, dict[str, Any]] = {
     "perfect": {},
     # Honeywell HG9900 brochure N61-1638: gyro bias 0.0035 deg/h, ARW 0.002 deg/sqrt(h), scale 5 ppm; accelerometer bias
     # 25 ug, scale 100 ppm. Turn-on 0.01 deg/h defines the class (Groves 2013, table 4.1). Rest assumed.
     "navigation": {
+        **INSTALLATION,
         "gyro_turn_on_degph": 0.01,
         "gyro_instability_degph": 0.0035,
         "gyro_instability_tau_s": 500.0,
@@ -86,6 +96,7 @@ GRADES: dict[str, dict[str, Any]] = {
     # VRW 0.06 m/s/sqrt(h), scale 300 ppm, on/off 0.75 mg, misalignment 1 mrad, filter up to 262 Hz, 24 bit. Rest
     # assumed.
     "tactical": {
+        **INSTALLATION,
         "gyro_turn_on_degph": 5.0,
         "gyro_instability_degph": 0.5,
         "gyro_instability_tau_s": 200.0,
@@ -118,6 +129,7 @@ GRADES: dict[str, dict[str, Any]] = {
     # accelerometer in-run 3.2 ug, +-8 g; axis to axis 0.05 deg, axis to package 0.25 deg maximum (taken as three
     # sigma). Rest assumed, the turn-on after the bias correction at start-up that the part offers.
     "mems-industrial": {
+        **INSTALLATION,
         "gyro_turn_on_degph": 15.0,
         "gyro_instability_degph": 0.8,
         "gyro_instability_tau_s": 200.0,
@@ -150,6 +162,7 @@ GRADES: dict[str, dict[str, Any]] = {
     # calibration. Noise: Bosch BMI088 datasheet BST-BMI088-DS001, 0.014 deg/s/sqrt(Hz) and 175 ug/sqrt(Hz); 16 bit on
     # +-500 deg/s and +-12 g. Rest assumed, for a calibrated part.
     "mems-consumer": {
+        **INSTALLATION,
         "gyro_turn_on_degph": 40.0,
         "gyro_instability_degph": 5.0,
         "gyro_instability_tau_s": 200.0,
@@ -179,12 +192,6 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_bandwidth_hz": 145.0,
     },
 }
-# How the unit is mounted and warms up is the aircraft's doing, the same for every grade that is not perfect: a small
-# engine behind soft rubber (assumed).
-INSTALLATION = {"vibration_mg": 30.0, "vibration_degps": 0.2, "self_heating_k": 5.0}
-for _name, _grade in GRADES.items():
-    if _name != "perfect":
-        _grade.update(INSTALLATION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,8 +275,8 @@ class ImuConfig(Section):
     self_heating_k: float = Field(0.0, ge=0, le=100, description="how much the unit warms up after power-on")
     self_heating_tau_s: float = Field(300.0, gt=0, le=1e5)
 
-    lever_arm_m: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
-    mounting_deg: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="roll, pitch, heading of the unit")
+    lever_arm_m: LeverArm = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
+    mounting_deg: tuple[Angle, Angle, Angle] = Field((0.0, 0.0, 0.0), description="roll, pitch, heading of the unit")
 
     @model_validator(mode="before")
     @classmethod
@@ -323,7 +330,7 @@ class Imu:
         self._draw_constants(config, seed)
         self._start_processes(seed)
         self._self_heating = (config.self_heating_k, config.self_heating_tau_s)
-        self._temperature_at_start: float | None = None
+        self._temperature_at_start = math.nan
         self._filter = np.stack(
             [_low_pass(config.gyro_bandwidth_hz, self._tick_s), _low_pass(config.accel_bandwidth_hz, self._tick_s)]
         )
@@ -383,18 +390,14 @@ class Imu:
 
     def sense(self, truth: TruthBlock) -> ImuSamples:
         """The increments whose intervals end inside this block, in the axes of the unit."""
+        if math.isnan(self._temperature_at_start) and len(truth):
+            self._temperature_at_start = float(truth.temperature[0])
         first = max(truth.tick, 1)  # row 0 of a run carries no increments
         start = -first % self._every + first - truth.tick
         t = truth.t[start :: self._every].copy()
         n = len(t)
-        bias = self._in_run.take(n)
-        bias += self._walk.take(n)
-        bias += self._turn_on
-        bias += np.outer(self._warming(truth, start, t), self._temperature_slope)
-        if n:
-            self._bias[:] = bias[-1]
-        rate = np.empty((n, 6))
-        _sense(
+        exact = np.empty((n, 6))
+        _accumulate(
             truth.tick,
             self._every,
             self._tick_s,
@@ -411,24 +414,30 @@ class Imu:
             self._filter_state,
             self._sum,
             self._last,
-            rate,
+            exact,
         )
-        increments = rate
-        increments += (bias + self._white.take(n)) * self._dt
-        limit, step = self._limit * self._dt, self._resolution * self._dt
-        np.clip(increments, -limit, limit, out=increments)
-        if step.any():
-            _round(increments, step)
-        return ImuSamples(t, np.full(n, self._dt), increments[:, :3].copy(), increments[:, 3:].copy())
-
-    def _warming(self, truth: TruthBlock, start: int, t: Array) -> Array:
-        """Temperature of the unit less that at power-on (n,) [K]: it follows the air and heats itself up."""
-        if self._temperature_at_start is None and len(truth):
-            self._temperature_at_start = float(truth.temperature[0])
-        rise, tau = self._self_heating
-        return (
-            truth.temperature[start :: self._every] - (self._temperature_at_start or 0.0) + rise * -np.expm1(-t / tau)
+        bias = self._in_run.take(n)
+        bias += self._walk.take(n)
+        warmer = truth.temperature[start :: self._every] - self._temperature_at_start
+        dtheta, dv = np.empty((n, 3)), np.empty((n, 3))
+        _degrade(
+            self._dt,
+            t,
+            exact,
+            self._turn_on,
+            bias,
+            self._temperature_slope,
+            warmer,
+            *self._self_heating,
+            self._white.take(n),
+            self._limit,
+            self._resolution,
+            dtheta,
+            dv,
         )
+        if n:
+            self._bias = bias[-1]
+        return ImuSamples(t, np.full(n, self._dt), dtheta, dv)
 
 
 def _axis_errors(scale: Array, misalignment: Array, skewness: Array) -> Array:
@@ -461,7 +470,36 @@ def _low_pass(bandwidth_hz: float | None, dt: float) -> Array:
 
 
 @njit
-def _sense(
+def _cross(a: Triple, b: Triple) -> Triple:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit
+def _lever_arm(phi: Triple, rate0: Triple, rate1: Triple, r: Triple) -> Triple:
+    """Velocity increment [m/s] of a point at ``r`` [m] relative to the body's origin, over one tick.
+
+    The point moves at u = omega x r. Its inertial velocity change, taken into rotating body axes as that of the origin
+    is (by the inverse of the left Jacobian J of phi = dtheta), is
+    J^-1 (exp(phi) u1 - u0) = (u1 - u0) + phi x (u0 + u1)/2 + c phi x (phi x (u1 - u0)),
+    c = (1 - |phi|/2 cot(|phi|/2)) / |phi|^2 = 1/12 + |phi|^2/720 + ...
+
+    This is alpha x r and omega x (omega x r) in increments, exactly.
+    """
+    mean = _cross((0.5 * (rate0[0] + rate1[0]), 0.5 * (rate0[1] + rate1[1]), 0.5 * (rate0[2] + rate1[2])), r)
+    change = _cross((rate1[0] - rate0[0], rate1[1] - rate0[1], rate1[2] - rate0[2]), r)
+    square = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
+    c = 1.0 / 12.0 + square / 720.0 + square * square / 30240.0
+    turned = _cross(phi, mean)
+    twice = _cross(phi, _cross(phi, change))
+    return (
+        change[0] + turned[0] + c * twice[0],
+        change[1] + turned[1] + c * twice[1],
+        change[2] + turned[2] + c * twice[2],
+    )
+
+
+@njit
+def _accumulate(
     tick: int,
     every: int,
     tick_s: float,
@@ -482,10 +520,8 @@ def _sense(
 ) -> None:
     """Deterministic part of the chain: sums of sensed increments per output interval into ``out`` (n, 6).
 
-    ``state``, ``total`` and ``last`` are carried from call to call. A lever arm r moves at omega x r; between two ticks
-    its velocity changes, in body axes and per left Jacobian of phi = dtheta, by
-    J^-1 (exp(phi) a1 - a0) = (a1 - a0) + phi x (a0 + a1)/2 + c phi x (phi x (a1 - a0)), a = omega x r,
-    c = (1 - |phi|/2 cot(|phi|/2))/|phi|^2.
+    ``state`` (6, 2) of the filters, ``total`` (6,) of the running interval and ``last`` (4,), rate and engine phase at
+    the last tick, are carried from call to call.
     """
     has_lever = lever[0] != 0.0 or lever[1] != 0.0 or lever[2] != 0.0
     has_vibration = False
@@ -497,31 +533,17 @@ def _sense(
     j = 0
     for k in range(dtheta.shape[0]):
         if tick + k == 0:
-            last[0], last[1], last[2], last[3] = omega_b[0, 0], omega_b[0, 1], omega_b[0, 2], 0.0
+            last[0], last[1], last[2] = omega_b[0, 0], omega_b[0, 1], omega_b[0, 2]
             continue
         for i in range(3):
             x[i] = dtheta[k, i]
             x[3 + i] = dv[k, i]
         if has_lever:
-            w0x, w0y, w0z = last[0], last[1], last[2]
-            w1x, w1y, w1z = omega_b[k, 0], omega_b[k, 1], omega_b[k, 2]
-            px, py, pz = x[0], x[1], x[2]
-            # difference and sum of omega x r at the two ends
-            sx, sy, sz = w1x + w0x, w1y + w0y, w1z + w0z
-            ex, ey, ez = w1x - w0x, w1y - w0y, w1z - w0z
-            mx = 0.5 * (sy * lever[2] - sz * lever[1])
-            my = 0.5 * (sz * lever[0] - sx * lever[2])
-            mz = 0.5 * (sx * lever[1] - sy * lever[0])
-            dx = ey * lever[2] - ez * lever[1]
-            dy = ez * lever[0] - ex * lever[2]
-            dz = ex * lever[1] - ey * lever[0]
-            square = px * px + py * py + pz * pz
-            c = 1.0 / 12.0 + square / 720.0 + square * square / 30240.0
-            cx, cy, cz = py * dz - pz * dy, pz * dx - px * dz, px * dy - py * dx
-            x[3] += dx + (py * mz - pz * my) + c * (py * cz - pz * cy)
-            x[4] += dy + (pz * mx - px * mz) + c * (pz * cx - px * cz)
-            x[5] += dz + (px * my - py * mx) + c * (px * cy - py * cx)
-            last[0], last[1], last[2] = w1x, w1y, w1z
+            rate = (omega_b[k, 0], omega_b[k, 1], omega_b[k, 2])
+            moved = _lever_arm((x[0], x[1], x[2]), (last[0], last[1], last[2]), rate, (lever[0], lever[1], lever[2]))
+            for i in range(3):
+                x[3 + i] += moved[i]
+                last[i] = omega_b[k, i]
         if has_vibration and engine_rpm[k] > 0.0:
             # integral of a cos(phase + offset) over the tick, for one and two per rev
             turn = 2.0 * math.pi * engine_rpm[k] / 60.0 * tick_s
@@ -558,9 +580,37 @@ def _sense(
 
 
 @njit
-def _round(increments: Array, step: Array) -> None:
-    """To the nearest multiple of ``step`` (6,), column by column, in place; zero leaves a column alone."""
-    for i in range(increments.shape[1]):
-        if step[i] > 0.0:
-            for k in range(increments.shape[0]):
-                increments[k, i] = step[i] * np.rint(increments[k, i] / step[i])
+def _degrade(
+    dt: float,
+    t: Array,
+    exact: Array,
+    turn_on: Array,
+    bias: Array,
+    slope: Array,
+    warmer: Array,
+    self_heating: float,
+    self_heating_tau: float,
+    white: Array,
+    limit: Array,
+    resolution: Array,
+    dtheta: Array,
+    dv: Array,
+) -> None:
+    """Biases and white noise [rad/s, m/s^2] onto the increments ``exact`` (n, 6), then range and resolution.
+
+    ``bias`` comes in as the in-run part (n, 6) and leaves as the whole. Since power-on the air has become ``warmer``
+    (n,) [K], and the unit heats itself up. Results go to ``dtheta`` and ``dv`` (n, 3).
+    """
+    for k in range(exact.shape[0]):
+        warming = warmer[k] - self_heating * math.expm1(-t[k] / self_heating_tau)
+        for i in range(6):
+            bias[k, i] += turn_on[i] + slope[i] * warming
+            value = exact[k, i] + (bias[k, i] + white[k, i]) * dt
+            value = min(limit[i] * dt, max(-limit[i] * dt, value))
+            step = resolution[i] * dt
+            if step > 0.0:
+                value = step * np.rint(value / step)
+            if i < 3:
+                dtheta[k, i] = value
+            else:
+                dv[k, i - 3] = value

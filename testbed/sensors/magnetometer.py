@@ -15,7 +15,8 @@ from nav._jit import njit
 from nav.rotation import quat_conjugate, quat_rotate
 from nav.samples import Array, MagnetometerSample
 from testbed.errors import UserError
-from testbed.sensors.noise import Process, stream, with_grade
+from testbed.sensors.grades import with_grade
+from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, MICROTESLA, PERCENT
 from testbed.truth import Column, TruthBlock
@@ -188,40 +189,49 @@ class Magnetometer:
     def sense(self, truth: TruthBlock) -> list[MagnetometerSample]:
         """The samples that fall inside this block."""
         rows = self._schedule.rows(truth)
-        noise = self._white.take(len(rows))
-        samples = []
+        n = len(rows)
+        if not n:
+            return []
+        fields = np.empty((n, 3))
         for i, k in enumerate(rows):
-            t = float(truth.t[k])
-            field_n = self._map.field_n(truth.lat[k], truth.lon[k], truth.h[k])
-            field_b = _measured(
-                field_n,
-                truth.q_nb[k],
-                self._iron,
-                self._hard_iron,
-                self._wiring,
-                truth.current[k],
-                noise[i],
-                self._limit,
-            )
-            samples.append(MagnetometerSample(t, t + self._schedule.latency, field_b, self.name))
-        return samples
+            fields[i] = self._map.field_n(truth.lat[k], truth.lon[k], truth.h[k])
+        measured = self._white.take(n)
+        _measure(
+            rows.start,
+            rows.step,
+            truth.q_nb,
+            truth.current,
+            fields,
+            self._iron,
+            self._hard_iron,
+            self._wiring,
+            self._limit,
+            measured,
+        )
+        return [
+            MagnetometerSample(t, t + self._schedule.latency, measured[i], self.name)
+            for i, t in enumerate(truth.t[rows.start :: rows.step].tolist())
+        ]
 
 
 @njit
-def _measured(
-    field_n: Array,
+def _measure(
+    start: int,
+    step: int,
     q_nb: Array,
+    current: Array,
+    fields_n: Array,
     iron: Array,
     hard_iron: Array,
     wiring: Array,
-    current: float,
-    noise: Array,
     limit: float,
-) -> Array:
-    """What the sensor makes of the field (3,) [T]."""
-    field_b = quat_rotate(quat_conjugate(q_nb), field_n)
-    measured = np.empty(3)
-    for i in range(3):
-        bent = iron[i, 0] * field_b[0] + iron[i, 1] * field_b[1] + iron[i, 2] * field_b[2]
-        measured[i] = min(limit, max(-limit, bent + hard_iron[i] + wiring[i] * current + noise[i]))
-    return measured
+    measured: Array,
+) -> None:
+    """What the sensor makes of ``fields_n`` (n, 3) [T] on every ``step``-th row; ``measured`` comes in as noise."""
+    for i in range(measured.shape[0]):
+        k = start + i * step
+        field_b = quat_rotate(quat_conjugate(q_nb[k]), fields_n[i])
+        for c in range(3):
+            bent = iron[c, 0] * field_b[0] + iron[c, 1] * field_b[1] + iron[c, 2] * field_b[2]
+            value = bent + hard_iron[c] + wiring[c] * current[k] + measured[i, c]
+            measured[i, c] = min(limit, max(-limit, value))

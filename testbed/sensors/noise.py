@@ -6,7 +6,6 @@ Every process of every sensor has its own stream: adding a sensor, or switching 
 from __future__ import annotations
 
 import zlib
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,11 +91,3 @@ class Process:
             self._used += count
             filled += count
         return rows
-
-
-def with_grade(data: Any, grades: dict[str, dict[str, Any]], default: str) -> Any:
-    """Keys of a sensor section on top of those of the grade it names: what is written wins over the datasheet."""
-    if not isinstance(data, dict):
-        return data
-    grade = data.get("grade", default)
-    return {**grades.get(grade, {}), **data} if isinstance(grade, str) else data

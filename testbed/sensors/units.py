@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import Annotated, TypeAlias
+
+from pydantic import Field
 
 DEG = math.pi / 180  # rad
 DEG_PER_H = DEG / 3600  # rad/s
@@ -16,3 +19,7 @@ PPM = 1e-6
 PERCENT = 1e-2
 MRAD = 1e-3  # rad
 MICROTESLA = 1e-6  # T
+
+# A lever arm in metres, body forward-right-down; a hundred of them is longer than any aircraft, and likely millimetres.
+Metres: TypeAlias = Annotated[float, Field(ge=-100, le=100)]
+LeverArm: TypeAlias = tuple[Metres, Metres, Metres]
