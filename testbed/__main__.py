@@ -113,7 +113,7 @@ def run(
     loaded = _load(scenario, overrides)
     folder = out or RUNS / Path(scenario).stem
     with _output_folder(folder):
-        result = _fly(loaded, folder, seed=seed, links=_connect(mavlink or []), realtime=realtime)
+        result = _fly(loaded, folder, seed=seed, links=_connect(mavlink or [], loaded), realtime=realtime)
         _conclude(result, folder, report)
 
 
@@ -125,7 +125,7 @@ def check(
     loaded = {name: _load(name) for name in names}
     for name, one in loaded.items():
         if not one.expect:
-            raise UserError(f"{name}: has no [expect], so there is nothing to check: add bounds to it")
+            raise UserError(f"{name}: has no [expect], so there is nothing to check: add it")
     failed = False
     for name, one in loaded.items():
         folder = RUNS / "check" / Path(name).stem
@@ -172,12 +172,32 @@ def campaign(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
 ) -> None:
     """Fly a scenario with many seeds."""
-    from testbed.campaign import campaign as conduct
+    from testbed import campaign as campaigns
+    from testbed import campaign_report, progress
 
-    _load(scenario)
+    varied = parse_vary(vary or [])
     folder = out or RUNS / f"{Path(scenario).stem}_campaign"
-    with _output_folder(folder):
-        conduct(scenario, runs=runs, vary=dict(map(parse_vary, vary or [])), scheduler=scheduler, out=folder)
+    with (
+        _output_folder(folder),
+        _keeping(f"what is finished is in {folder}; the same command carries on"),
+        progress.shown(_console(stderr=True), scenario) as tell,
+    ):
+        result = campaigns.campaign(
+            scenario,
+            runs,
+            vary=varied,
+            scheduler=scheduler,
+            out=folder,
+            progress=lambda now: tell((now.done + now.failed) / now.total, str(now)),
+        )
+    for table in campaign_report.tables(result):
+        _console().print(table)
+    print(f"campaign: {folder}")
+    for failure in result.failures:
+        case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()
+        print(f"testbed: {case}: {failure.message}", file=sys.stderr)
+    if result.failures:
+        raise typer.Exit(EXIT_FAILED)
 
 
 @app.command()
@@ -193,11 +213,26 @@ def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> dict[st
     return {key: key in metrics and bounds.hold(metrics[key]) for key, bounds in expect.items()}
 
 
-def parse_vary(text: str) -> tuple[str, list[str]]:
-    """``key=a,b,c`` as the key and its values; commas inside brackets, braces and quotes do not separate."""
-    key, equals, listed = text.partition("=")
-    values, depth, quote = [""], 0, ""
-    for character in listed:
+def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:
+    """The varied keys of ``key=a,b,c`` texts; commas inside brackets, braces and quotes do not separate values.
+
+    Raises UserError when a text has no key or lacks a value, or when a key comes twice.
+    """
+    varied: dict[str, list[str]] = {}
+    for text in texts:
+        key, _, listed = text.partition("=")
+        values = [value.strip() for value in _split(listed)]
+        if not key.strip() or not all(values):
+            raise UserError(f"--vary {text}: give it as key=a,b,c, such as truth.wind.speed_mps=0,5,10")
+        if key.strip() in varied:
+            raise UserError(f"--vary {text}: {key.strip()} is varied twice: give all its values at once")
+        varied[key.strip()] = values
+    return varied
+
+
+def _split(text: str) -> list[str]:
+    parts, depth, quote = [""], 0, ""
+    for character in text:
         if quote:
             quote = "" if character == quote else quote
         elif character in "\"'":
@@ -205,13 +240,10 @@ def parse_vary(text: str) -> tuple[str, list[str]]:
         else:
             depth += (character in "[{") - (character in "]}")
         if character == "," and not quote and depth == 0:
-            values.append("")
+            parts.append("")
         else:
-            values[-1] += character
-    values = [value.strip() for value in values]
-    if not equals or not key.strip() or not all(values):
-        raise UserError(f"--vary {text}: give it as key=a,b,c, such as truth.wind.speed_mps=0,5,10")
-    return key.strip(), values
+            parts[-1] += character
+    return parts
 
 
 def _explicit_realtime(arguments: Sequence[str]) -> list[str]:
@@ -259,20 +291,22 @@ def _output_folder(folder: Path) -> Iterator[None]:
         raise
 
 
-def _connect(urls: Sequence[str]) -> list[Publisher]:
+@contextmanager
+def _keeping(what_is_left: str) -> Iterator[None]:
+    """Let an interrupted command say what it leaves behind."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"testbed: interrupted: {what_is_left}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _connect(urls: Sequence[str], scenario: Scenario) -> list[Publisher]:
     if not urls:
         return []
-    from testbed import mavlink
+    from testbed.mavlink import MavlinkPublisher
 
-    links: list[Publisher] = []
-    try:
-        for url in urls:
-            links.append(mavlink.connect(url))
-    except UserError:
-        for link in links:
-            link.close()
-        raise
-    return links
+    return [MavlinkPublisher(urls, scenario.date)]
 
 
 def _fly(
@@ -285,12 +319,18 @@ def _fly(
 ) -> RunResult:
     from testbed import loop, progress
 
-    try:
-        with progress.shown(_console(stderr=True), scenario.title) as tell:
-            return loop.run(scenario, seed=seed, out=folder, links=links, realtime=realtime, progress=tell)
-    except KeyboardInterrupt:
-        print(f"testbed: interrupted: the record so far is {folder / 'run.nc'}", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+    with (
+        _keeping(f"the record so far is {folder / 'run.nc'}"),
+        progress.shown(_console(stderr=True), scenario.title) as tell,
+    ):
+        return loop.run(
+            scenario,
+            seed=seed,
+            out=folder,
+            links=links,
+            realtime=realtime,
+            progress=lambda now: tell(*progress.of_run(now)),
+        )
 
 
 def _conclude(result: RunResult, folder: Path, report: bool) -> None:

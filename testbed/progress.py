@@ -1,74 +1,64 @@
-"""How far a run has come: a bar on a terminal, a line now and then elsewhere."""
+"""How far something long has come: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
-from rich.progress import BarColumn, TextColumn
-from rich.progress import Progress as Bar
+from rich.progress import BarColumn, Progress, TextColumn
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from testbed.loop import Progress
+    from testbed import loop
 
-PLAIN_EVERY_PERCENT = 10.0
-PLAIN_EVERY_S = 5.0
+PLAIN_EVERY = 0.1  # of the whole
+PLAIN_EVERY_S = 5.0  # wall time
+
+Tell: TypeAlias = Callable[[float, str], None]
 
 
 @contextmanager
-def shown(console: Console, title: str) -> Iterator[Callable[[Progress], None]]:
-    """A function to be told of progress, shown on ``console`` as long as the context lasts."""
+def shown(console: Console, title: str) -> Iterator[Tell]:
+    """A function to be told the fraction done and what is going on, shown on ``console`` while the context lasts."""
     if not console.is_terminal:
         yield _plain(console)
         return
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
-        TextColumn("{task.fields[clock]}  {task.fields[factor]}  [cyan]{task.fields[activity]}"),
+        TextColumn("{task.fields[text]}", markup=False),
     )
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=None, clock="", factor="", activity="starting")
-
-        def tell(now: Progress) -> None:
-            bar.update(
-                task,
-                total=now.duration,
-                completed=now.t,
-                clock=f"{_clock(now.t)} of {_clock(now.duration)}",
-                factor=_factor(now),
-                activity=now.activity,
-            )
-
-        yield tell
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, text="starting")
+        yield lambda fraction, text: bar.update(task, completed=fraction, text=text)
 
 
-def _plain(console: Console) -> Callable[[Progress], None]:
-    next_percent = PLAIN_EVERY_PERCENT
+def _plain(console: Console) -> Tell:
+    next_fraction = PLAIN_EVERY
     last_line = time.monotonic()
 
-    def tell(now: Progress) -> None:
-        nonlocal next_percent, last_line
-        percent = 100.0 * now.t / now.duration
-        if percent < next_percent and time.monotonic() - last_line < PLAIN_EVERY_S:
+    def tell(fraction: float, text: str) -> None:
+        nonlocal next_fraction, last_line
+        if fraction < next_fraction and time.monotonic() - last_line < PLAIN_EVERY_S:
             return
-        next_percent = (percent // PLAIN_EVERY_PERCENT + 1.0) * PLAIN_EVERY_PERCENT
+        next_fraction = (fraction // PLAIN_EVERY + 1.0) * PLAIN_EVERY
         last_line = time.monotonic()
-        line = f"{percent:3.0f} %  {_clock(now.t)} of {_clock(now.duration)}  {_factor(now)}  {now.activity}"
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{100.0 * fraction:3.0f} %  {text}", markup=False, highlight=False, soft_wrap=True)
 
     return tell
 
 
+def of_run(now: loop.Progress) -> tuple[float, str]:
+    """The fraction of a run that is done; simulated time, real-time factor and what is going on."""
+    factor = f"{now.realtime_factor:.3g} × real time"
+    return now.t / now.duration, f"{_clock(now.t)} of {_clock(now.duration)}  {factor}  {now.activity}"
+
+
 def _clock(seconds: float) -> str:
-    """Simulated time as minutes and seconds, with hours where there are any."""
+    """Minutes and seconds, with hours where there are any."""
     minutes, s = divmod(int(seconds), 60)
     hours, m = divmod(minutes, 60)
     return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m:02d}:{s:02d}"
-
-
-def _factor(now: Progress) -> str:
-    return f"{now.realtime_factor:.3g} × real time"

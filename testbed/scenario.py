@@ -400,6 +400,8 @@ def _estimator_faults(
             yield (*path, "aids", index), _unknown("sensor", aid, usable)
         elif aid in config.aids[:index]:
             yield (*path, "aids", index), f"{aid!r} is listed twice"
+        elif kinds[aid] in [kinds.get(before) for before in config.aids[:index]]:
+            yield (*path, "aids", index), f"{aid!r} is a second {kinds[aid]!r}: {config.kind!r} takes one of each kind"
 
 
 def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
@@ -487,7 +489,7 @@ def _locate(details: ErrorDetails, data: dict[str, Any]) -> tuple[KeyPath, list[
             elif isinstance(step, str):
                 fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
                 models = [model for annotation in fields for model in _sections(annotation)]
-    if loc and (_holds(here, loc[-1]) or details["type"] in ("missing", "union_tag_not_found")):
+    if loc and (_holds(here, loc[-1]) or details["type"] in ("missing", "union_tag_not_found", "scenario")):
         path = (*path, loc[-1])
     if details["type"] == "sensor_kind" and details["input"]["kind"] != path[-1]:
         path = (*path, "kind")

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from testbed import sensors
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.scenario import Scenario
@@ -185,6 +186,11 @@ def test_same_name_for_two_estimators() -> None:
     assert "estimator[1].name: 'ins' is taken by an estimator above" in message
 
 
+def test_two_aids_of_a_kind() -> None:
+    message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
+    assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message
+
+
 def test_a_plan_belongs_to_a_flight_and_a_flight_to_a_plan() -> None:
     assert "plan: a flight needs a plan" in complaint(U_TURN, "plan=[]")
     static = TEXTS["static_bench"] + '[[plan]]\nleg = "straight"\nlength_m = 100\n'
@@ -266,6 +272,10 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path, *(place for key, item in items for place in places(item, (*path, key)))]
 
 
+NAMES = st.text(max_size=8) | st.sampled_from([place[-1] for place in places(tomllib.loads(U_TURN))[1:]]).map(str)
+ACCIDENTS = ["drop", "double", "rename", "replace", "replace"]
+
+
 @st.composite
 def mutated_documents(draw: st.DrawFn) -> str:
     """A shipped scenario after a few accidents: keys dropped, renamed, added; values replaced, moved, doubled."""
@@ -275,25 +285,18 @@ def mutated_documents(draw: st.DrawFn) -> str:
         parent: Any = data
         for step in above:
             parent = parent[step]
-        accident = draw(st.sampled_from(["drop", "rename", "add", "replace", "replace", "replace", "move", "double"]))
-        if accident == "drop" and last in parent if isinstance(parent, dict) else accident == "drop":
-            del parent[last]
-        elif accident == "move":
-            *_, other = draw(st.sampled_from(places(data)[1:] or [("title",)]))
-            if isinstance(parent, dict) and isinstance(other, str) and last in parent:
-                parent[other] = copy.deepcopy(parent[last])
-        elif isinstance(parent, list):
-            if accident == "double":
+        accidents = ["replace"] if isinstance(parent, dict) and last not in parent else ACCIDENTS
+        match draw(st.sampled_from(accidents)), parent:
+            case "drop", _:
+                del parent[last]
+            case "double", list():
                 parent.append(copy.deepcopy(parent[last]))
-            else:
-                parent[last] = draw(JUNK)
-        elif accident == "rename" and last in parent:
-            name = draw(st.text(max_size=8) | st.just(str(last)[:-1]) | st.just(f"{last}s"))
-            parent[name] = parent.pop(last)
-        elif accident == "add":
-            parent[draw(st.text(max_size=8))] = draw(JUNK)
-        else:
-            parent[last] = draw(JUNK)
+            case "double", dict():
+                parent[draw(NAMES)] = copy.deepcopy(parent[last])
+            case "rename", dict():
+                parent[draw(NAMES | st.just(f"{last}s"))] = parent.pop(last)
+            case _:
+                parent[last] = copy.deepcopy(draw(JUNK))
     return "".join(f"{json.dumps(key)} = {toml(value)}\n" for key, value in data.items())
 
 
@@ -335,6 +338,8 @@ def loads_or_complains(text: str, overrides: list[str]) -> None:
             assert "pydantic" not in line
     else:
         assert scenario.title
+        for name, config in scenario.sensors.items():
+            sensors.build(name, config, scenario.truth.rate_hz, scenario.seed, scenario.site())
         assert dict(Scenario.parse(scenario.text, scenario.overrides)) == dict(scenario)
 
 
