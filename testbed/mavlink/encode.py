@@ -1,0 +1,167 @@
+"""Numbers to MAVLink 2 frames: the one layer that rounds, saturates and wraps, and cannot fail whatever the numbers.
+
+Field names, types, order on the wire and checksum seeds come from pymavlink's ``all`` dialect; only the framing is
+done here, because pymavlink's own objects cost several times the rest of the stream.
+Source: MAVLink 2 packet format, https://mavlink.io/en/guide/serialization.html
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import itemgetter
+from typing import Any, TypeAlias
+
+from pymavlink.dialects.v20 import all as dialect  # type: ignore[import-untyped]
+
+Value: TypeAlias = float | bytes | Sequence[float]
+Fields: TypeAlias = Mapping[str, Value]
+
+_HEADER = struct.Struct("<BBBBBBBHB")
+_FLOAT_MAX = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
+_RANGE: dict[str, tuple[float, float]] = {
+    "uint8_t": (0, 2**8 - 1),
+    "int8_t": (-(2**7), 2**7 - 1),
+    "uint16_t": (0, 2**16 - 1),
+    "int16_t": (-(2**15), 2**15 - 1),
+    "uint32_t": (0, 2**32 - 1),
+    "int32_t": (-(2**31), 2**31 - 1),
+    "uint64_t": (0, 2**64 - 1),
+    "float": (-_FLOAT_MAX, _FLOAT_MAX),
+}
+# What an integer field says when its number is NaN; 0 where the message defines nothing. Floats carry NaN themselves.
+_UNKNOWN: dict[tuple[str, str], int] = {
+    ("GLOBAL_POSITION_INT", "hdg"): 2**16 - 1,
+    ("GPS_RAW_INT", "eph"): 2**16 - 1,
+    ("GPS_RAW_INT", "epv"): 2**16 - 1,
+    ("GPS_RAW_INT", "vel"): 2**16 - 1,
+    ("GPS_RAW_INT", "cog"): 2**16 - 1,
+    ("GPS_RAW_INT", "h_acc"): 2**32 - 1,
+    ("GPS_RAW_INT", "v_acc"): 2**32 - 1,
+    ("GPS_RAW_INT", "vel_acc"): 2**32 - 1,
+}
+_MESSAGES: dict[str, Any] = {message.msgname: message for message in dialect.mavlink_map.values()}
+
+
+def boot_ms(t: float) -> int:
+    """Time since boot [ms] of ``t`` [s]; wraps after 49.7 days as the field does, 0 when ``t`` is not finite."""
+    return round(t * 1e3) % 2**32 if math.isfinite(t * 1e3) else 0
+
+
+def microseconds(t: float) -> int:
+    """``t`` [s] in microseconds, 0 when it is not finite."""
+    return round(t * 1e6) if math.isfinite(t * 1e6) else 0
+
+
+def centidegrees(angle: float) -> float:
+    """Angle [rad] as 0 … 35999 hundredths of a degree, clockwise from north; NaN (unknown) when it is not finite."""
+    hundredths = math.degrees(angle) * 100
+    return round(hundredths) % 36000 if math.isfinite(hundredths) else math.nan
+
+
+def latitude_e7(lat: float) -> float:
+    """Latitude [rad] in 1e-7 deg, saturated at the poles."""
+    return max(-90e7, min(90e7, math.degrees(lat) * 1e7)) if lat == lat else math.nan
+
+
+def longitude_e7(lon: float) -> float:
+    """Longitude [rad] in 1e-7 deg, wrapped into [-180, 180] deg; NaN when it is not finite."""
+    return math.degrees(math.remainder(lon, 2 * math.pi)) * 1e7 if math.isfinite(lon) else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class _Number:
+    """One number (or text, without limits) on the wire."""
+
+    limits: tuple[float, float] | None
+    is_integer: bool
+    unknown: int
+
+    def saturate(self, value: Any) -> Any:
+        """``value`` within the field's range, whatever it was."""
+        if self.limits is None or (not self.is_integer and not math.isfinite(value)):
+            return value
+        if value != value:
+            return self.unknown
+        low, high = self.limits
+        bounded = max(low, min(high, value))
+        return round(bounded) if self.is_integer else bounded
+
+
+class _Layout:
+    """How one message lies on the wire."""
+
+    def __init__(self, name: str) -> None:
+        message = _MESSAGES[name]
+        types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+        self.id: int = message.id
+        self.crc_extra = bytes([message.crc_extra])
+        self._pack = message.unpacker.pack
+        self._values = itemgetter(*message.ordered_fieldnames)
+        self._numbers: list[_Number] = []
+        self._arrays: list[int] = []  # positions among the fields, the last first: each is replaced by its numbers
+        for position, (field, length) in enumerate(zip(message.ordered_fieldnames, message.array_lengths, strict=True)):
+            kind = types[field]
+            number = _Number(
+                limits=_RANGE.get(kind),
+                is_integer=kind not in ("float", "char"),
+                unknown=_UNKNOWN.get((name, field), 0),
+            )
+            is_array = length > 0 and kind != "char"
+            self._numbers += [number] * (length if is_array else 1)
+            if is_array:
+                self._arrays.insert(0, position)
+        self._integers = [i for i, number in enumerate(self._numbers) if number.is_integer]
+
+    def payload(self, fields: Fields) -> bytes:
+        """The fields as bytes, without the trailing zeros that MAVLink 2 leaves out."""
+        values: list[Any] = list(self._values(fields))
+        for position in self._arrays:
+            values[position : position + 1] = values[position]
+        try:
+            for i in self._integers:
+                values[i] = round(values[i])
+            packed = self._pack(*values)
+        except (struct.error, OverflowError, ValueError):  # out of range or not a number: rare, so the slow way
+            packed = self._pack(*[number.saturate(v) for v, number in zip(values, self._numbers, strict=True)])
+        return packed.rstrip(b"\0") or b"\0"
+
+
+class Encoder:
+    """Frames of one vehicle, numbered as they are made."""
+
+    def __init__(self, system: int = 1, component: int = 1) -> None:
+        self._system = system
+        self._component = component
+        self._sequence = 0
+        self._layouts: dict[str, _Layout] = {}
+
+    def frame(self, message: str, values: Fields) -> bytes:
+        """One frame of ``message`` (its name in the dialect) with every field of it given, in the field's unit.
+
+        Numbers may be any float: integer fields are rounded and saturate, NaN becomes the field's unknown value;
+        float fields keep NaN and infinities and saturate at the largest float32.
+        """
+        layout = self._layouts.get(message)
+        if layout is None:
+            layout = self._layouts[message] = _Layout(message)
+        payload = layout.payload(values)
+        body = (
+            _HEADER.pack(
+                dialect.PROTOCOL_MARKER_V2,
+                len(payload),
+                0,
+                0,
+                self._sequence,
+                self._system,
+                self._component,
+                layout.id & 0xFFFF,
+                layout.id >> 16,
+            )
+            + payload
+        )
+        self._sequence = (self._sequence + 1) % 256
+        checksum: int = dialect.x25crc(body[1:] + layout.crc_extra).crc
+        return body + checksum.to_bytes(2, "little")

@@ -1,0 +1,58 @@
+"""Simulated time held to the wall clock."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from testbed.errors import UserError
+
+MAX_LAG_S = 0.5  # a run further behind than this gives up the rest instead of racing to make it good
+
+
+class Pacer:
+    """Holds a run to ``factor`` times the speed of the wall clock.
+
+    Every deadline is counted from one start on a monotonic clock, so waits don't add up to a drift. A run that comes
+    late catches up at most `MAX_LAG_S` of wall time; what exceeds it is given up, and the deadlines after it move.
+
+    ``waits`` counts the calls after the first, ``missed`` those that came after their deadline; ``worst_s`` is the
+    latest of them and ``given_up_s`` the wall time that was not made good.
+    """
+
+    def __init__(
+        self,
+        factor: float = 1.0,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Start at the first `wait`. Raises UserError unless ``factor`` is positive and finite."""
+        if not (math.isfinite(factor) and factor > 0):
+            raise UserError(f"--realtime {factor}: the speed must be above 0; 1 is the speed of the wall clock")
+        self._factor = factor
+        self._clock = clock
+        self._sleep = sleep
+        self._start: float | None = None  # clock reading at simulated time 0
+        self.waits = 0
+        self.missed = 0
+        self.worst_s = 0.0
+        self.given_up_s = 0.0
+
+    def wait(self, t: float) -> None:
+        """Return when the wall clock has reached simulated time ``t`` [s]; the first call only sets the start."""
+        now = self._clock()
+        if self._start is None:
+            self._start = now - t / self._factor
+            return
+        self.waits += 1
+        late = now - (self._start + t / self._factor)
+        if late < 0:
+            self._sleep(-late)
+        elif late > 0:
+            self.missed += 1
+            self.worst_s = max(self.worst_s, late)
+            excess = max(0.0, late - MAX_LAG_S)
+            self.given_up_s += excess
+            self._start += excess

@@ -1,0 +1,210 @@
+import os
+import socket
+import struct
+import time
+
+import pytest
+
+from testbed.errors import UserError
+from testbed.mavlink.link import connect, connect_all
+
+FRAME = b"\xfd" + bytes(range(60))
+
+
+def free_port(kind=socket.SOCK_STREAM):
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def read(connection, size):
+    connection.settimeout(5.0)
+    data = b""
+    while len(data) < size:
+        more = connection.recv(size - len(data))
+        assert more, "closed early"
+        data += more
+    return data
+
+
+@pytest.mark.parametrize(
+    ("url", "complaint"),
+    [
+        ("127.0.0.1:14550", "not a MAVLink address"),
+        ("serial:/dev/ttyUSB0", "not a MAVLink address"),
+        ("", "not a MAVLink address"),
+        ("udpout:127.0.0.1", "no port number"),
+        ("udpout:127.0.0.1:", "no port number"),
+        ("udpout:127.0.0.1:0", "no port number"),
+        ("tcp:127.0.0.1:65536", "no port number"),
+        ("tcpin:127.0.0.1:mavlink", "no port number"),
+        ("udpout:no-such-host.invalid:14550", "no-such-host.invalid"),
+        (f"udpout:{'x' * 70}:14550", "is not known"),
+        ("udpout:a\0b:14550", "is not known"),
+        ("udpout:255.255.255.255:14550", "can't send there"),
+        ("tcpin:192.0.2.1:14550", "can't listen there"),
+        ("tlog:/proc/no/run.tlog", "choose another path"),
+        ("tlog:", "choose another path"),
+        ("\0.tlog", "choose another path"),
+    ],
+)
+def test_bad_address_is_named(url, complaint):
+    with pytest.raises(UserError) as caught:
+        connect(url)
+    assert complaint in str(caught.value)
+    assert str(caught.value).startswith(f"{url}:")
+
+
+def test_log_cannot_replace_a_folder(tmp_path):
+    with pytest.raises(UserError, match="Is a directory"):
+        connect(f"tlog:{tmp_path}")
+
+
+def test_nobody_listens():
+    with pytest.raises(UserError, match="start the ground station first"):
+        connect(f"tcp:127.0.0.1:{free_port()}")
+
+
+def test_port_in_use():
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(UserError, match="choose another"):
+        connect(f"tcpin:127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_all_or_none(tmp_path):
+    port = free_port()
+    with pytest.raises(UserError, match="not a MAVLink address"):
+        connect_all([f"tlog:{tmp_path / 'run.tlog'}", f"tcpin::{port}", "nonsense"])
+    assert not (tmp_path / "run.tlog").exists()
+    connect(f"tcpin::{port}").close()  # the port is free again
+
+
+def test_same_address_twice():
+    with pytest.raises(UserError, match="twice"):
+        connect_all(["udpout::14550", "udpout::14550"])
+
+
+def test_order_of_links_is_kept(tmp_path):
+    links = connect_all([str(tmp_path / "a.tlog"), "udpout::14550"])
+    assert [type(link).__name__ for link in links] == ["TelemetryLog", "UdpOut"]
+    for link in links:
+        link.close()
+        link.close()
+
+
+def test_log_is_stamps_and_frames_in_a_folder_that_is_made(tmp_path):
+    path = tmp_path / "runs" / "new" / "run.tlog"
+    log = connect(f"tlog:{path}")
+    log.send(1_700_000_000_000_000, [FRAME, b"two"])
+    log.send(-5, [b"three"])
+    log.close()
+    stamp = struct.pack(">Q", 1_700_000_000_000_000)
+    assert path.read_bytes() == stamp + FRAME + stamp + b"two" + bytes(8) + b"three"
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_full_disk_is_an_error_with_a_name():
+    log = connect("tlog:/dev/full")
+    with pytest.raises(UserError, match="/dev/full.*No space left"):
+        for _ in range(1000):
+            log.send(0, [FRAME])
+    with pytest.raises(UserError, match="/dev/full.*No space left"):
+        log.close()
+
+
+def test_datagrams_carry_one_frame_each_and_go_on_after_the_peer_was_away():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        station.settimeout(5.0)
+        port = station.getsockname()[1]
+        link = connect(f"udpout::{port}")
+        link.send(0, [FRAME, b"two"])
+        assert station.recv(2048) == FRAME
+        assert station.recv(2048) == b"two"
+    for _ in range(100):
+        link.send(0, [FRAME])  # refused by now
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", port))
+        station.settimeout(5.0)
+        link.send(0, [FRAME, FRAME])
+        assert station.recv(2048) == FRAME
+    link.close()
+
+
+def test_datagrams_to_a_peer_that_never_reads_cost_no_time():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.bind(("127.0.0.1", 0))
+        link = connect(f"udpout::{station.getsockname()[1]}")
+        start = time.perf_counter()
+        for _ in range(20_000):
+            link.send(0, [FRAME])
+        assert time.perf_counter() - start < 5.0
+        link.close()
+
+
+def test_client_sends_and_falls_silent_when_the_station_leaves():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = connect(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        station, _ = server.accept()
+        with station:
+            station.sendall(b"hello")  # what a station says is taken and dropped
+            link.send(0, [FRAME, b"two"])
+            assert read(station, len(FRAME) + 3) == FRAME + b"two"
+    for _ in range(10):
+        link.send(0, [FRAME])
+    link.close()
+
+
+def test_end_of_the_stream_arrives_though_the_station_talks():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = connect(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        station, _ = server.accept()
+        with station:
+            link.send(0, [FRAME])
+            station.sendall(b"heartbeat" * 100)
+            time.sleep(0.05)
+            link.close()
+            assert read(station, len(FRAME)) == FRAME
+            assert station.recv(1) == b""
+
+
+def test_server_lets_stations_come_and_go():
+    port = free_port()
+    link = connect(f"tcpin:127.0.0.1:{port}")
+    link.send(0, [FRAME])  # nobody yet
+    with socket.create_connection(("127.0.0.1", port)) as first:
+        link.send(0, [b"one"])
+        assert read(first, 3) == b"one"
+        with socket.create_connection(("127.0.0.1", port)) as second:
+            link.send(0, [b"two"])
+            assert read(first, 3) == b"two"
+            assert read(second, 3) == b"two"
+        for _ in range(10):
+            link.send(0, [b"x"])
+        assert read(first, 10) == b"x" * 10
+    link.send(0, [FRAME])
+    link.close()
+    link.close()
+
+
+def test_slow_station_costs_no_time_and_gets_whole_batches_only():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = connect(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        station, _ = server.accept()
+        with station:
+            batch = b"".join(bytes([k]) * 1000 for k in range(1, 101))
+            start = time.perf_counter()
+            for _ in range(500):  # 50 MB, far beyond what the system holds
+                link.send(0, [batch])
+            assert time.perf_counter() - start < 5.0
+            received = bytearray()
+            station.settimeout(0.2)
+            for _ in range(1000):
+                try:
+                    received += station.recv(1 << 20)
+                except TimeoutError:
+                    break
+                link.send(0, [])  # nothing new: what was cut goes out
+            assert len(received) < 50e6
+            assert len(received) % len(batch) == 0
+            assert bytes(received) == batch * (len(received) // len(batch))
+        link.close()
