@@ -23,6 +23,7 @@ import shutil
 import time
 import traceback
 import uuid
+import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -300,9 +301,9 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
     stem = _stem(folder, combination, seed)
     try:
         values = json.loads(stem.with_suffix(".json").read_bytes())["metrics"]
-        with np.load(stem.with_suffix(".npz")) as file:
+        with np.load(io.BytesIO(stem.with_suffix(".npz").read_bytes())) as file:
             history = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
     return Outcome(combination, seed, values, history)
 
@@ -349,7 +350,7 @@ def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
 
     if scheduler is not None:
         _require_scheduler(scheduler)
-        with Client(scheduler, set_as_default=False) as client:
+        with Client(scheduler, set_as_default=False) as client, client.as_current():
             try:
                 client.wait_for_workers(1, timeout=WORKER_WAIT_S)
             except TimeoutError:
@@ -368,10 +369,12 @@ def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
             processes=True,
             host="127.0.0.1",
             dashboard_address=None,
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # or it would take port 8787 all the same
             memory_limit=None,
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
+        client.as_current(),
     ):
         yield client
 

@@ -409,5 +409,6 @@ def _distribution_figure(result: CampaignResult, key: str, value_of: Callable[[C
     axes.set_ylabel(QUANTITIES[metric])
     axes.set_title("Largest error of each run\nbox: quartiles, whiskers: 5 and 95 %", fontsize="medium")
     axes.grid(alpha=0.3, axis="y")
-    axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    if axes.lines:  # none when no estimator ever aligned
+        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
