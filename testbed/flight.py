@@ -14,7 +14,7 @@ from nav._jit import njit
 from nav.rotation import quat_conjugate, quat_from_euler, quat_rotate
 from nav.samples import Array
 from testbed.data import data_dir
-from testbed.guidance import Feedback, Guidance, Leg
+from testbed.guidance import Feedback, Guidance, Leg, min_airspeed
 from testbed.truth import TruthBlock, increments
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ RANKINE = 5 / 9  # [K]
 GAS_CONSTANT = 287.05287  # of dry air [J/(kg K)]
 
 GUIDANCE_HZ = 20.0
-SETTLING_S = 60.0  # of straight and level flight before the run starts
+SETTLING_S = 90.0  # of straight and level flight before the run starts
 
 # JSBSim's numbers for: second order Adams-Bashforth rates, Adams-Bashforth 3 position, and Buss's augmented second
 # order attitude, which is exact for a constant rate and needs no normalisation.
@@ -65,7 +65,7 @@ STATE: Mapping[str, float] = {
     "propulsion/engine/engine-rpm": 1.0,
     "propulsion/total-fuel-lbs": POUND,
     "fcs/aileron-pos-rad": 1 / 0.35,
-    "fcs/elevator-pos-rad": 1 / 0.35,
+    "fcs/elevator-pos-rad": 1 / 0.45,
     "fcs/rudder-pos-rad": 1 / 0.35,
     "fcs/throttle-pos-norm": 1.0,
 }
@@ -104,7 +104,7 @@ class Flight:
         commands: list[tuple[int, tuple[float, float, float, float]]] = []
         rows = 0
         if self._tick == 0 and ticks > 0 and not self._ended:
-            raw.extend(self._row)
+            raw.fromlist(self._row)
             commands.append((1, self._commands))
             rows = self._tick = 1
         while rows < ticks and not self._ended:
@@ -214,12 +214,12 @@ class Aircraft:
 
     def run(self, steps: int, rows: array[float]) -> list[float]:
         """Fly ``steps`` ticks, appending a row of `STATE` for each; returns the last."""
-        run, read, extend = self.fdm.run, self._read, rows.extend
+        run, read, append = self.fdm.run, self._read, rows.fromlist
         row: list[float] = []
         for _ in range(steps):
             run()
             row = [get() for get in read]
-            extend(row)
+            append(row)
         return row
 
     def command(self, bank: float, altitude: float, climb: float, airspeed: float) -> None:
@@ -270,10 +270,11 @@ class Aircraft:
         fdm = self.fdm
         fuel = fdm["propulsion/tank/contents-lbs"]
         wind = _wind_at(winds, start.alt_m)
-        still = _v_n(start.airspeed_mps, start.heading_deg)
-        self._place(start, (0.0, 0.0, math.radians(start.heading_deg)), still, (0.0, 0.0))
+        # JSBSim's engine start finds no steady state at high advance ratios, so the engine is started slowly.
+        slow = _v_n(1.15 * min_airspeed(start.alt_m), start.heading_deg)
+        self._place(start, (0.0, 0.0, math.radians(start.heading_deg)), slow, (0.0, 0.0))
         fdm["propulsion/set-running"] = -1
-        fdm["fcs/throttle-cmd-norm"] = 0.4
+        fdm["fcs/throttle-cmd-norm"] = 0.5
         fdm["ap/engaged"], fdm["ap/hold"] = 1.0, 0.0
         self.command(0.0, start.alt_m, 0.0, start.airspeed_mps)
         for _ in range(round(SETTLING_S * self.rate_hz)):
@@ -294,7 +295,8 @@ class Aircraft:
         """Initialise JSBSim's state at the start; controls, filters and engine stay as they are."""
         fdm = self.fdm
         fdm["ic/lat-geod-deg"], fdm["ic/long-gc-deg"] = start.lat_deg, start.lon_deg
-        fdm["ic/h-sl-ft"] = start.alt_m / FOOT
+        fdm["ic/h-sl-ft"] = start.alt_m / FOOT  # along the radius; the normal differs by millimetres
+        fdm["ic/h-sl-ft"] += start.alt_m / FOOT - fdm["ic/geod-alt-ft"]
         fdm["ic/phi-rad"], fdm["ic/theta-rad"], fdm["ic/psi-true-rad"] = euler
         for axis, component in zip(("vn", "ve", "vd"), v_n, strict=True):
             fdm[f"ic/{axis}-fps"] = component / FOOT

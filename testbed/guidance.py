@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal, Protocol, Self, TypeAlias, TypeVar
+from typing import Annotated, Literal, NamedTuple, Protocol, Self, TypeAlias, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -27,6 +26,7 @@ STALL_EAS = 17.3  # equivalent airspeed at 1 g stall, full tank [m/s]
 STALL_MARGIN = 1.1  # the slowest that is flown, over the stall speed
 MAX_EAS = 36.0  # [m/s]
 MAX_BANK = math.radians(40.0)
+GENTLE_BANK = math.radians(10.0)  # adds 1.5 % to the load, allowed at any airspeed
 BANK_RESERVE = math.radians(6.0)  # kept back for tracking when a plan is checked
 CLIMB_AT_SEA_LEVEL = 3.5  # steady climb rate that leaves throttle for tracking, at STALL_EAS * 1.4 [m/s]
 MAX_DESCENT = 3.0  # [m/s]
@@ -111,28 +111,22 @@ Bearing: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 # --- segments: what is flown, in the plane tangent to the ellipsoid at the beginning of the leg
 
 
-@dataclass(slots=True)
 class Motion:
-    """Motion in the leg's tangent plane: north, east [m], their rates [m/s], heading [rad], airspeed [m/s]."""
+    """Motion in the leg's tangent plane: north, east [m], their rates [m/s], heading [rad], true airspeed [m/s].
 
-    north: float
-    east: float
-    v_north: float
-    v_east: float
-    heading: float
-    airspeed: float
+    ``ground_speed`` [m/s] and ``course`` [rad] are the polar form of the rates.
+    """
 
-    @property
-    def ground_speed(self) -> float:
-        """Speed over ground [m/s]."""
-        return math.hypot(self.v_north, self.v_east)
+    __slots__ = ("airspeed", "course", "east", "ground_speed", "heading", "north", "v_east", "v_north")
 
-    @property
-    def course(self) -> float:
-        """Direction of travel over ground [rad]."""
-        return math.atan2(self.v_east, self.v_north)
+    def __init__(
+        self, north: float, east: float, v_north: float, v_east: float, heading: float, airspeed: float
+    ) -> None:
+        self.north, self.east, self.v_north, self.v_east = north, east, v_north, v_east
+        self.heading, self.airspeed = heading, airspeed
+        self.ground_speed = math.hypot(v_north, v_east)
+        self.course = math.atan2(v_east, v_north)
 
-    @property
     def wind_speed(self) -> float:
         """Wind that ground velocity, heading and airspeed imply without sideslip [m/s]."""
         return math.hypot(
@@ -235,7 +229,16 @@ class Waypoint(Section):
     lon_deg: float = Field(ge=-180, le=180)
 
 
-class Straight(Section):
+class _Leg(Section):
+    """What the legs have in common."""
+
+    def reached(self, altitude: float, airspeed: float, state: Feedback, measured_airspeed: float) -> bool:
+        """Whether the leg is over before its path is, given the commanded altitude and airspeed, the state, and its
+        airspeed without gusts."""
+        return False
+
+
+class Straight(_Leg):
     """Straight along the present course for a length, or to a place."""
 
     leg: Literal["straight"]
@@ -256,7 +259,7 @@ class Straight(Section):
             yield Line(here.north, here.east, math.atan2(-here.east, -here.north), math.hypot(here.north, here.east))
 
 
-class Turn(Section):
+class Turn(_Leg):
     """Turn the nose to a heading, the shorter way unless a direction is given, or by an angle, right positive."""
 
     leg: Literal["turn"]
@@ -286,7 +289,7 @@ class Turn(Section):
         yield HeadingTurn(angle, TURN_BANK)
 
 
-class Climb(Section):
+class Climb(_Leg):
     """Climb to an altitude along the present course."""
 
     leg: Literal["climb"]
@@ -298,8 +301,12 @@ class Climb(Section):
         """On and on, until the altitude is reached."""
         yield Line(here.north, here.east, course, math.inf)
 
+    def reached(self, altitude: float, airspeed: float, state: Feedback, measured_airspeed: float) -> bool:
+        """At the altitude."""
+        return altitude == self.to_m and abs(state.h - self.to_m) < 5.0
 
-class Descend(Section):
+
+class Descend(_Leg):
     """Descend to an altitude along the present course."""
 
     leg: Literal["descend"]
@@ -311,8 +318,12 @@ class Descend(Section):
         """On and on, until the altitude is reached."""
         yield Line(here.north, here.east, course, math.inf)
 
+    def reached(self, altitude: float, airspeed: float, state: Feedback, measured_airspeed: float) -> bool:
+        """At the altitude."""
+        return altitude == self.to_m and abs(state.h - self.to_m) < 5.0
 
-class Airspeed(Section):
+
+class Airspeed(_Leg):
     """Change the true airspeed along the present course."""
 
     leg: Literal["airspeed"]
@@ -323,8 +334,12 @@ class Airspeed(Section):
         """On and on, until the airspeed is reached."""
         yield Line(here.north, here.east, course, math.inf)
 
+    def reached(self, altitude: float, airspeed: float, state: Feedback, measured_airspeed: float) -> bool:
+        """At the airspeed."""
+        return airspeed == self.to_mps and abs(measured_airspeed - self.to_mps) < 1.0
 
-class Loiter(Section):
+
+class Loiter(_Leg):
     """Circle: about a centre, or from here on, which is then a point of the circle. Counts turns, or lasts a time.
 
     Turns count from where the circle is reached; the time counts from the beginning of the leg.
@@ -352,7 +367,7 @@ class Loiter(Section):
             yield _arc(here.north, here.east, course, self.radius_m, _side(self.direction), sweep)
 
 
-class Racetrack(Section):
+class Racetrack(_Leg):
     """Two straights joined by half circles, from here along the present course. Counts laps, or lasts a time."""
 
     leg: Literal["racetrack"]
@@ -382,7 +397,7 @@ class Racetrack(Section):
             half_laps -= 1
 
 
-class FigureEight(Section):
+class FigureEight(_Leg):
     """Two circles that touch here, one after the other in opposite directions. Counts eights, or lasts a time."""
 
     leg: Literal["figure_eight"]
@@ -406,7 +421,7 @@ class FigureEight(Section):
             side, circles = -side, circles - 1
 
 
-class STurns(Section):
+class STurns(_Leg):
     """Swing from one side of the present course to the other, on arcs; ends on the course it began with."""
 
     leg: Literal["s_turns"]
@@ -429,7 +444,7 @@ class STurns(Section):
             side = -side
 
 
-class UTurn(Section):
+class UTurn(_Leg):
     """Half a circle, back along a parallel course; without a radius at 25 deg of bank."""
 
     leg: Literal["u_turn"]
@@ -440,7 +455,7 @@ class UTurn(Section):
 
     def segments(self, here: Motion, course: float) -> Iterator[Segment]:
         """One half circle, wide enough for its downwind end."""
-        radius = self.radius_m or turn_radius(here.airspeed + here.wind_speed, TURN_BANK)
+        radius = self.radius_m or turn_radius(here.airspeed + here.wind_speed(), TURN_BANK)
         yield _arc(here.north, here.east, course, radius, _side(self.direction), math.pi)
 
 
@@ -543,8 +558,7 @@ def _check_radius(key: str, radius: float, speeds: Sequence[float], alt: float, 
 # --- flying the plan
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(NamedTuple):
     """What closes the loops: true by default, an estimator's when somebody says so. SI, radians, NED, body rates."""
 
     lat: float
@@ -562,8 +576,7 @@ class Feedback:
     airspeed: float
 
 
-@dataclass(frozen=True, slots=True)
-class Command:
+class Command(NamedTuple):
     """What guidance asks of the inner loops: bank [rad], altitude [m] and its slope [m/s], true airspeed [m/s]."""
 
     bank: float
@@ -627,8 +640,10 @@ class Guidance:
                 acceleration = self._segment.steer(motion)
         # Banking accelerates across the air's flow, which is off the ground track by the crab angle.
         crab = max(math.cos(motion.course - motion.heading), 0.5)
-        limit = bank_limit(max(state.airspeed, self._airspeed), state.h)
-        bank = max(-limit, min(limit, math.atan(acceleration / (GRAVITY * crab))))
+        bank = math.atan(acceleration / (GRAVITY * crab))
+        if abs(bank) > GENTLE_BANK:
+            limit = max(bank_limit(self._airspeed, state.h), GENTLE_BANK)
+            bank = max(-limit, min(limit, bank))
         climb = self._ramp_altitude()
         step = ACCELERATION * self._period
         self._airspeed += max(-step, min(step, self._to_airspeed - self._airspeed))
@@ -638,10 +653,9 @@ class Guidance:
         """The leg being flown and how far it is."""
         if self.done:
             return "plan flown"
-        leg, segment, name = self._plan[self.leg], self._segment, self._plan[self.leg].leg.replace("_", " ")
-        duration = getattr(leg, "duration_s", None)
-        if duration is not None:
-            return f"{name} {self._elapsed:.0f}/{duration:g} s"
+        leg, segment, name = self._leg, self._segment, self._leg.leg.replace("_", " ")
+        if self._time_limit < math.inf:
+            return f"{name} {self._elapsed:.0f}/{self._time_limit:g} s"
         match leg:
             case Straight():
                 assert isinstance(segment, Line)
@@ -661,7 +675,7 @@ class Guidance:
 
     def _begin(self, state: Feedback) -> None:
         """Set up the leg that begins at ``state``."""
-        leg = self._plan[self.leg]
+        self._leg = leg = self._plan[self.leg]
         place = getattr(leg, "to", None) or getattr(leg, "centre", None)
         if place is not None:
             self._plane = TangentPlane(math.radians(place.lat_deg), math.radians(place.lon_deg))
@@ -674,18 +688,16 @@ class Guidance:
         self._segment = next(self._segments)
         self._segments_flown = 0
         self._elapsed = 0.0
+        self._time_limit = getattr(leg, "duration_s", None) or math.inf
         self._to_altitude = getattr(leg, "to_m", None) or getattr(leg, "alt_m", None) or self._to_altitude
         self._climb_rate = getattr(leg, "rate_mps", CLIMB_RATE)
         self._to_airspeed = getattr(leg, "to_mps", None) or getattr(leg, "airspeed_mps", None) or self._to_airspeed
 
     def _leg_over(self, state: Feedback) -> bool:
         """Whether the leg's own condition is met; goes on to its next segment where one is done."""
-        leg = self._plan[self.leg]
-        if isinstance(leg, Climb | Descend):
-            return self._altitude == leg.to_m and abs(state.h - leg.to_m) < 5.0
-        if isinstance(leg, Airspeed):
-            return self._airspeed == leg.to_mps and abs(self._measured_airspeed - leg.to_mps) < 1.0
-        if self._elapsed >= (getattr(leg, "duration_s", None) or math.inf):
+        if self._elapsed >= self._time_limit or self._leg.reached(
+            self._altitude, self._airspeed, state, self._measured_airspeed
+        ):
             return True
         if not self._segment.done:
             return False
