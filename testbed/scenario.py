@@ -419,6 +419,8 @@ def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, st
 def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:
     if rate_hz > tick_hz:
         yield path, f"{rate_hz:g} Hz is faster than the tick rate of {tick_hz:g} Hz (truth.rate_hz)"
+    elif rate_hz * LONGEST_RUN_S < 1:
+        yield path, f"{rate_hz:g} Hz is less than once in the longest run"
     elif not _whole(tick_hz / rate_hz):
         ticks = int(tick_hz / rate_hz)
         slower, faster = tick_hz / (ticks + 1), tick_hz / ticks

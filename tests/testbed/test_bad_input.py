@@ -160,6 +160,7 @@ def test_rates_divide_the_tick_and_offsets_are_whole_ticks() -> None:
     assert "try 50 or 66.66666667" in message
     assert "sensors.imu.rate_hz: 400 Hz is faster than the tick rate of 200 Hz" in message
     assert "sensors.gnss.offset_s: is not a multiple of the tick 0.005 s: the nearest is 0.01" in message
+    assert "less than once in the longest run" in complaint(U_TURN, "sensors.gnss.rate_hz=1e-320")
     Scenario.parse(U_TURN, ["sensors.barometer.rate_hz=66.66666667", "sensors.gnss.offset_s=0.015"])
 
 
