@@ -434,12 +434,15 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
-        self.flush()
-        if self.path is not None and self._file is not None:
-            self.attributes["complete"] = 1
-            self._guard(lambda: self._lay_out(final=True))
-            self._file.close()
-            self._file = None
+        try:
+            self.flush()
+            if self._file is not None:
+                self.attributes["complete"] = 1
+                self._guard(lambda: self._lay_out(final=True))
+        finally:
+            if self._file is not None:
+                self._file.close()
+                self._file = None
 
     def dataset(self) -> xarray.DataTree:
         """Everything recorded so far, equal to `load` of the file."""
@@ -640,9 +643,11 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
 
 def _bare_dimension(group: Any, name: str, size: int) -> Any:
     """A netCDF-4 dimension without coordinate values."""
-    from h5py import h5d, h5ds, h5s, h5t
+    from h5py import h5d, h5ds, h5p, h5s, h5t
 
-    scale = h5d.create(group, name.encode(), h5t.IEEE_F32BE, h5s.create_simple((size,)))
+    layout = h5p.create(h5p.DATASET_CREATE)
+    layout.set_obj_track_times(False)
+    scale = h5d.create(group, name.encode(), h5t.IEEE_F32BE, h5s.create_simple((size,)), layout)
     h5ds.set_scale(scale, f"This is a netCDF dimension but not a netCDF variable.{size:10d}".encode())
     return scale
 
@@ -672,9 +677,9 @@ def load(path: Path) -> xarray.DataTree:
             columns: dict[str, dict[str, tuple[Variable, Data]]] = {}
             _read_group(file, "", columns)
             attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        return _tree(columns, attributes)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path}: damaged record ({error}); run the scenario again") from error
-    return _tree(columns, attributes)
 
 
 def _plain(value: Any) -> Any:
