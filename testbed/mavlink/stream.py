@@ -110,7 +110,8 @@ class MavlinkPublisher:
         with np.errstate(all="ignore"):  # an estimate may be anything; the encoder copes
             self._read_imu(imu, float(truth.t[0]))
             for report in reports:
-                self._ratios[report.aid] = math.sqrt(max(0.0, float(report.nis / np.float64(report.threshold))))
+                ratio = float(np.float64(report.nis) / report.threshold)
+                self._ratios[report.aid] = math.sqrt(ratio) if ratio >= 0 else math.nan
             if self._home is None:
                 self._home = messages.known_point(estimate)
             snapshot = Snapshot(

@@ -82,8 +82,8 @@ def test_any_number_in_any_field(name, data):
     for field, kind, length in shape(name):
         if kind == "char":
             continue
-        decoded = getattr(message, field)
-        for got, given_value in zip(decoded if length else [decoded], values[field] if length else [values[field]]):
+        decoded, sent = getattr(message, field), values[field]
+        for got, given_value in zip(decoded, sent, strict=True) if length else [(decoded, sent)]:
             if kind == "float":
                 bounded = given_value
                 if math.isfinite(given_value):
