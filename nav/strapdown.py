@@ -66,27 +66,30 @@ def step(q_nb: Array, v_n: Array, lla: Array, dtheta: Array, dv: Array, dt: floa
     g *= 1 - 2 * (1 + F + M - 2 * F * sin2) * ratio + 3 * ratio * ratio
     north_radius = A * (1 - E2) / (root2 * root) + h
     east_radius = A / root + h
-    mid_north = v_n[0] + 0.5 * dv_north
-    mid_east = v_n[1] + 0.5 * dv_east
-    mid_down = v_n[2] + 0.5 * dv_down + half * g
 
-    # Angles that e turns relative to i, and n relative to i, in the interval; in n
+    # Velocity: specific force seen half-way through the turn of n, Coriolis, gravity. Rates want the velocity in the
+    # middle of the interval, which is half of what they help to find: from that of the start, two rounds do.
     earth_north, earth_down = OMEGA_IE * cos_lat * dt, -OMEGA_IE * sin_lat * dt
-    east_angle = mid_east / east_radius * dt
-    nx, ny, nz = earth_north + east_angle, -mid_north / north_radius * dt, earth_down - east_angle * sin_lat / cos_lat
+    per_north, per_east, tan_lat = dt / north_radius, dt / east_radius, sin_lat / cos_lat
+    mid_north, mid_east, mid_down = v_n[0], v_n[1], v_n[2]
+    nx, ny, nz = 0.0, 0.0, 0.0  # angles that n turns relative to i, in n
+    for _ in range(2):
+        nx = earth_north + mid_east * per_east
+        ny = -mid_north * per_north
+        nz = earth_down - mid_east * per_east * tan_lat
+        cx, cz = nx + earth_north, nz + earth_down
+        gain_north = dv_north - 0.5 * (ny * dv_down - nz * dv_east) - (ny * mid_down - cz * mid_east)
+        gain_east = dv_east - 0.5 * (nz * dv_north - nx * dv_down) - (cz * mid_north - cx * mid_down)
+        gain_down = dv_down - 0.5 * (nx * dv_east - ny * dv_north) - (cx * mid_east - ny * mid_north) + g * dt
+        mid_north, mid_east, mid_down = v_n[0] + 0.5 * gain_north, v_n[1] + 0.5 * gain_east, v_n[2] + 0.5 * gain_down
 
-    # Velocity: specific force seen half-way through the turn of n, Coriolis, gravity
-    cx, cz = nx + earth_north, nz + earth_down
-    new_north = v_n[0] + dv_north - 0.5 * (ny * dv_down - nz * dv_east) - (ny * mid_down - cz * mid_east)
-    new_east = v_n[1] + dv_east - 0.5 * (nz * dv_north - nx * dv_down) - (cz * mid_north - cx * mid_down)
-    new_down = v_n[2] + dv_down - 0.5 * (nx * dv_east - ny * dv_north) - (cx * mid_east - ny * mid_north) + g * dt
-
-    # Position
-    lla[0] += half * (v_n[0] + new_north) / north_radius
-    lon = lla[1] + half * (v_n[1] + new_east) / (east_radius * cos_lat)
-    lla[1] = wrap_longitude(lon)
-    lla[2] -= half * (v_n[2] + new_down)
-    v_n[0], v_n[1], v_n[2] = new_north, new_east, new_down
+    # Position by the trapezoid of velocity, which is what the middle stands for
+    lla[0] += mid_north * per_north
+    lla[1] = wrap_longitude(lla[1] + mid_east * per_east / cos_lat)
+    lla[2] -= mid_down * dt
+    v_n[0] += gain_north
+    v_n[1] += gain_east
+    v_n[2] += gain_down
 
     # Attitude: the body's turn on the right (any size), the turn of n on the left (micro-radians)
     quarter = 0.25 * angle2

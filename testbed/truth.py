@@ -5,16 +5,24 @@ A motion source (`testbed.flight`, `testbed.kinematic`) fills blocks of rows; se
 
 from __future__ import annotations
 
+import json
 import math
+import os
+import shutil
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from numpy.lib.format import open_memmap
 
 from nav._jit import njit
 from nav.earth import OMEGA_IE, ecef_from_geodetic, gravity, quat_en
 from nav.rotation import left_jacobian_solve, quat_conjugate, quat_multiply, quat_rotate, rotvec_from_quat
 from nav.samples import Array
+from testbed.errors import UserError
+
+SAVE_TICKS = 20_000  # rows of a motion being stored that are in memory at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,9 +145,12 @@ def increments(t: Array, lat: Array, lon: Array, h: Array, v_n: Array, q_nb: Arr
     dtheta = log(C_ib(k-1)^T C_ib(k))                                                           [rad]
     dv = J(dtheta)^-1 C_bi(k-1) (v_i(k) - v_i(k-1) - integral of gravitation)                     [m/s]
 
-    with J the left Jacobian, so that they are the integrals of rate and specific force over the interval in turning
-    body axes when both are constant in those axes between rows. The inertial axes are those of e at row k - 1, so
-    nothing grows with time. The trapezoid of gravitation is good to 1e-10 m/s^2 at 200 Hz.
+    with J the left Jacobian: the integrals of rate and specific force in turning body axes of the motion that has both
+    constant in those axes between rows and meets every row. At the tick rate there is hence no coning or sculling left
+    to compensate; an IMU that sums m of them shows what it would at its rate, less what goes on within one tick.
+
+    The inertial axes are those of e at row k - 1, so nothing grows with time. The trapezoid of gravitation is good to
+    1e-10 m/s^2 at 200 Hz.
     """
     dtheta, dv = np.zeros(v_n.shape), np.zeros(v_n.shape)
     q, v, gravitation = _inertial(lat[0], lon[0], h[0], v_n[0], q_nb[0])
@@ -154,3 +165,50 @@ def increments(t: Array, lat: Array, lon: Array, h: Array, v_n: Array, q_nb: Arr
         dv[k] = left_jacobian_solve(dtheta[k], quat_rotate(q_bi, arrived - left))
         q, v, gravitation = q_next, v_next, gravitation_next
     return dtheta, dv
+
+
+class Replay:
+    """A motion source that gives, row for row, what `save_motion` stored in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        stored = json.loads((folder / "motion.json").read_bytes())
+        self.rate_hz = float(stored["rate_hz"])
+        self._rows = int(stored["rows"])
+        self._columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS}
+        self._tick = 0
+
+    def advance(self, ticks: int) -> TruthBlock:
+        """The next ``ticks`` rows, as copies: numba would compile again for arrays that can't be written to."""
+        rows = slice(self._tick, min(self._tick + ticks, self._rows))
+        block = TruthBlock(self._tick, **{name: np.array(column[rows]) for name, column in self._columns.items()})
+        self._tick += len(block)
+        return block
+
+    def activity(self) -> str:
+        """What is going on."""
+        return "replay"
+
+
+def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
+    """Store the first ``ticks`` rows of a motion, one .npy per truth column, for `Replay`.
+
+    The folder appears when it is complete. Raises UserError when it can't be written.
+    """
+    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    try:
+        part.mkdir()
+        columns = {
+            name: open_memmap(part / f"{name}.npy", "w+", float, (ticks, c.width) if c.width > 1 else (ticks,))
+            for name, c in COLUMNS.items()
+        }
+        rows = 0
+        while rows < ticks and len(block := source.advance(min(SAVE_TICKS, ticks - rows))):
+            for name, column in columns.items():
+                column[rows : rows + len(block)] = getattr(block, name)
+            rows += len(block)
+        (part / "motion.json").write_text(json.dumps({"rate_hz": source.rate_hz, "rows": rows}))
+        part.rename(folder)
+    except OSError as error:
+        raise UserError(f"{folder}: can't store the flight: {error.strerror}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
