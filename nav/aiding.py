@@ -1,0 +1,199 @@
+"""Aids: what each one measures, as innovation and Jacobian at the nominal state, and which samples are not fit to use.
+
+Every function returns ``nu`` (m,) = measurement - prediction and ``H`` (m, n) = d prediction / d error state, error
+being estimate - truth; ``x`` (n,) holds the estimated values of the states beyond the motion (`nav.error_model`), and
+an argument named after a block is the index where it begins, -1 when the model has none. Lever arms point from the
+inertial sensor to the aid's, in body axes [m].
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nav._jit import njit
+from nav.earth import earth_rate_n, isa_density, position_difference_n
+from nav.error_model import PHI, POS, VEL, Drive
+from nav.rotation import cross, dcm_from_quat, skew
+from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, MagnetometerSample, Sample
+
+SEA_LEVEL_DENSITY = 1.225  # that defines equivalent airspeed [kg/m^3]
+
+# What an instrument could possibly report; beyond it the sample is broken.
+HEIGHT_LIMITS = (-1000.0, 50_000.0)  # [m]
+SPEED_LIMIT = 600.0  # over ground [m/s]
+PRESSURE_LIMITS = (1_000.0, 120_000.0)  # [Pa]
+FIELD_LIMITS = (5e-6, 200e-6)  # magnitude; the Earth's is 22 to 67 uT [T]
+AIRSPEED_LIMITS = (-10.0, 300.0)  # [m/s]
+
+
+def problem(sample: Sample) -> str:
+    """Why ``sample`` must not be fused, empty when it is sound. A GNSS sample may lack velocity (NaN) altogether."""
+    if not math.isfinite(sample.t):
+        return "time is not finite"
+    match sample:
+        case GnssSample():
+            return _gnss_problem(sample)
+        case BarometerSample():
+            return _range_problem("pressure", sample.pressure, PRESSURE_LIMITS)
+        case MagnetometerSample():
+            return _range_problem("field", float(np.sqrt(sample.field_b @ sample.field_b)), FIELD_LIMITS)
+        case AirspeedSample():
+            return _range_problem("airspeed", sample.eas, AIRSPEED_LIMITS)
+
+
+def _range_problem(what: str, value: float, limits: tuple[float, float]) -> str:
+    if not math.isfinite(value):
+        return f"{what} is not finite"
+    return "" if limits[0] <= value <= limits[1] else f"{what} {value:.6g} is out of range"
+
+
+def _gnss_problem(sample: GnssSample) -> str:
+    if not (math.isfinite(sample.lat) and math.isfinite(sample.lon) and math.isfinite(sample.h)):
+        return "position is not finite"
+    if abs(sample.lat) > math.pi / 2 or abs(sample.lon) > 2 * math.pi:
+        return "position is out of range"
+    if not HEIGHT_LIMITS[0] <= sample.h <= HEIGHT_LIMITS[1]:
+        return f"height {sample.h:.6g} is out of range"
+    if not _positive(sample.sigma_position_n):
+        return "reported accuracy of position is not a positive number"
+    speed2 = float(sample.v_n @ sample.v_n)
+    if math.isnan(speed2):
+        return "" if np.isnan(sample.v_n).all() else "velocity is not finite"
+    if speed2 > SPEED_LIMIT**2:
+        return f"speed {math.sqrt(speed2):.6g} is out of range"
+    return "" if _positive(sample.sigma_velocity_n) else "reported accuracy of velocity is not a positive number"
+
+
+def _positive(sigma: Array) -> bool:
+    return all(0.0 < s < math.inf for s in sigma.tolist())
+
+
+def has_velocity(sample: GnssSample) -> bool:
+    """Whether a sound GNSS sample carries velocity."""
+    return math.isfinite(sample.v_n[0])
+
+
+@njit
+def gnss_position(
+    q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float, lon: float, h: float
+) -> tuple[Array, Array]:
+    """Antenna position [m], NED: p + C_nb arm_b + correlated receiver error."""
+    arm_n = dcm_from_quat(q_nb) @ arm_b
+    nu = position_difference_n(lat, lon, h, lla[0], lla[1], lla[2]) - arm_n
+    H = np.zeros((3, len(x)))
+    H[:, PHI : PHI + 3] = skew(arm_n)
+    for i in range(3):
+        H[i, POS + i] = 1.0
+        if gnss_position_error >= 0:
+            H[i, gnss_position_error + i] = 1.0
+            nu[i] -= x[gnss_position_error + i]
+    return nu, H
+
+
+@njit
+def gnss_velocity(
+    q_nb: Array,
+    v_n: Array,
+    lla: Array,
+    x: Array,
+    omega_b: Array,
+    driven: Array,
+    arm_b: Array,
+    gnss_velocity_error: int,
+    antenna_v_n: Array,
+) -> tuple[Array, Array]:
+    """Antenna velocity over ground [m/s], NED: v + C_nb (omega_ib x arm) - omega_ie x (C_nb arm) + correlated error.
+
+    ``omega_b`` is the angular rate of b relative to i with the estimated gyro errors taken out; ``driven`` tells which
+    states those are (`ErrorModel.driven`).
+    """
+    C_nb = dcm_from_quat(q_nb)
+    arm_n = C_nb @ arm_b
+    swing_n = C_nb @ cross(omega_b, arm_b)
+    earth_n = earth_rate_n(lla[0])
+    nu = antenna_v_n - v_n - swing_n + cross(earth_n, arm_n)
+    H = np.zeros((3, len(x)))
+    H[:, PHI : PHI + 3] = skew(swing_n) - skew(earth_n) @ skew(arm_n)
+    from_gyro = C_nb @ skew(arm_b)  # a gyro bias estimated too high leaves too little rate
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        for i in range(3):
+            for j in range(3):
+                if kind == Drive.GYRO:
+                    H[i, start + j] = from_gyro[i, j]
+                elif kind == Drive.GYRO_SCALE:
+                    H[i, start + j] = from_gyro[i, j] * omega_b[j]
+    for i in range(3):
+        H[i, VEL + i] = 1.0
+        if gnss_velocity_error >= 0:
+            H[i, gnss_velocity_error + i] = 1.0
+            nu[i] -= x[gnss_velocity_error + i]
+    return nu, H
+
+
+@njit
+def barometer(lla: Array, x: Array, barometer_bias: int, pressure_altitude: float) -> tuple[Array, Array]:
+    """Pressure altitude [m]: h + bias."""
+    nu = np.array([pressure_altitude - lla[2] - x[barometer_bias]])
+    H = np.zeros((1, len(x)))
+    H[0, POS + 2] = -1.0
+    H[0, barometer_bias] = 1.0
+    return nu, H
+
+
+@njit
+def magnetometer(q_nb: Array, x: Array, magnetometer_bias: int, field_n: Array, field_b: Array) -> tuple[Array, Array]:
+    """Magnetic field [T] in body axes: C_nb' field_n + bias, ``field_n`` being the reference field at the place."""
+    C_bn = np.ascontiguousarray(dcm_from_quat(q_nb).T)
+    nu = field_b - C_bn @ field_n
+    H = np.zeros((3, len(x)))
+    H[:, PHI : PHI + 3] = -(C_bn @ skew(field_n))
+    if magnetometer_bias >= 0:
+        for i in range(3):
+            H[i, magnetometer_bias + i] = 1.0
+            nu[i] -= x[magnetometer_bias + i]
+    return nu, H
+
+
+@njit
+def airspeed(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, wind: int, gust: int, airspeed_scale: int, eas: float
+) -> tuple[Array, Array]:
+    """Equivalent airspeed along body x [m/s]: (1 + scale) sqrt(rho / rho0) e_x . C_nb' (v - wind - gust), standard density."""
+    C_nb = dcm_from_quat(q_nb)
+    root = (1 + (x[airspeed_scale] if airspeed_scale >= 0 else 0.0)) * math.sqrt(
+        isa_density(lla[2]) / SEA_LEVEL_DENSITY
+    )
+    nu, H = _air_velocity(C_nb, v_n, x, wind, gust, 0)
+    predicted = -root * nu[0]
+    H *= root
+    nu[0] = eas - predicted
+    half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
+    H[0, POS + 2] = -predicted * half_lapse
+    if airspeed_scale >= 0:
+        H[0, airspeed_scale] = predicted / (1 + x[airspeed_scale])
+    return nu, H
+
+
+@njit
+def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[Array, Array]:
+    """The constraint that no air comes from the side: 0 = e_y . C_nb' (v - wind - gust) [m/s]."""
+    return _air_velocity(dcm_from_quat(q_nb), v_n, x, wind, gust, 1)
+
+
+@njit
+def _air_velocity(C_nb: Array, v_n: Array, x: Array, wind: int, gust: int, axis: int) -> tuple[Array, Array]:
+    """Zero minus the velocity through the air along one body axis, and the Jacobian of that velocity."""
+    air_n = v_n.copy()
+    along_n = C_nb[:, axis].copy()
+    H = np.zeros((1, len(x)))
+    for start in (wind, gust):
+        if start >= 0:
+            for i in range(2):
+                air_n[i] -= x[start + i]
+                H[0, start + i] = -along_n[i]
+    H[0, PHI : PHI + 3] = cross(air_n, along_n)
+    H[0, VEL : VEL + 3] = along_n
+    return np.array([-(along_n @ air_n)]), H

@@ -1,0 +1,290 @@
+"""Initial attitude, velocity and position from the sensors alone, at rest or in flight, with honest sigmas.
+
+Between two GNSS fixes the specific force, carried into the axes of one moment by the gyros, must equal the change of
+GNSS velocity less gravity: one pair of vectors known in body and in n, whatever the aircraft does in between. A second
+pair fixes the heading: the magnetic field; else, at rest, the Earth's rate if the gyros are good enough to sense it;
+else, in motion, the course, which is the heading but for wind. Two pairs make an attitude (TRIAD: Black, AIAA J. 2
+(1964)). The covariance follows by differences, correlation with the sensors' biases included: a tilt that was levelled
+on a biased accelerometer is not independent of that bias.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nav._jit import njit
+from nav.aiding import has_velocity
+from nav.earth import earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
+from nav.error_model import MOTION, PHI, POS, VEL, ImuModel
+from nav.rotation import (
+    cross,
+    dcm_from_quat,
+    quat_from_dcm,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_normalise,
+    quat_rotate,
+)
+from nav.samples import Array, GnssSample, ImuSamples
+
+REST_SPEED = 0.5  # slower than this is standing [m/s]
+COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
+HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
+NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
+STEP = 1e-6  # of each input, relative, in the differences
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """Where an estimator begins: motion at ``t`` with the covariance (9, 9) of [phi, dv, dp].
+
+    ``correlated`` gives, by block name, the covariance (9, k) of that motion error with the error of further blocks.
+    """
+
+    t: float
+    lat: float
+    lon: float
+    h: float
+    v_n: Array
+    q_nb: Array
+    covariance: Array
+    correlated: Mapping[str, Array] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class AidSigmas:
+    """What alignment is told of the aids [1-sigma]: field in T, correlated GNSS errors in m and m/s NED, wind in m/s."""
+
+    field: float
+    field_bias: float
+    gnss_position: Array
+    gnss_velocity: Array
+    wind: float
+
+
+@dataclass(frozen=True)
+class _Heading:
+    """The second pair of vectors, with the covariance of the one in body axes and of what else turns the heading.
+
+    ``bias`` (3, 3) is the part of ``variance_b`` that comes from a bias of the block ``block`` times ``gain``.
+    """
+
+    s_b: Array
+    s_n: Array
+    variance_b: Array
+    heading_sigma: float = 0.0
+    block: str = ""
+    gain: float = 0.0
+    bias_variance: float = 0.0
+
+
+class Alignment:
+    """Collects sensors until it can tell where the body is and how it lies; `problem` says what is missing."""
+
+    def __init__(self, imu: ImuModel, aids: AidSigmas, arm_b: Array, duration_s: float) -> None:
+        self.imu, self.aids, self.arm_b, self.duration_s = imu, aids, arm_b, duration_s
+        self.problem = "waiting for GNSS"
+        self._first: GnssSample | None = None
+        self._restart(None)
+
+    def _restart(self, fix: GnssSample | None) -> None:
+        self._first = fix
+        self._q_0b = np.array([1.0, 0.0, 0.0, 0.0])  # body axes now to those at the first fix
+        self._angle_0, self._dv_0, self._field_0 = np.zeros(3), np.zeros(3), np.zeros(3)
+        self._fields = 0
+        self._omega_b = np.zeros(3)
+
+    def propagate(self, imu: ImuSamples) -> None:
+        """Add a block of increments."""
+        if self._first is not None and len(imu):
+            _accumulate(self._q_0b, self._angle_0, self._dv_0, imu.dtheta, imu.dv)
+            if imu.dt[-1] > 0:
+                self._omega_b = imu.dtheta[-1] / imu.dt[-1]
+
+    def add_field(self, field_b: Array) -> None:
+        """Add a magnetic field [T], body axes, at the current time."""
+        self._field_0 += quat_rotate(self._q_0b, field_b)
+        self._fields += 1
+
+    def add_gnss(self, fix: GnssSample, field_n: Array | None) -> InitialState | None:
+        """Add a sound fix at the current time; ``field_n`` is the reference field there [T]. The state once it is known."""
+        if not has_velocity(fix):
+            self.problem = "waiting for GNSS velocity"
+            return None
+        first = self._first
+        if first is None:
+            self.problem = "collecting"
+            self._restart(fix)
+            return None
+        T = fix.t - first.t
+        if self.duration_s - 1e-6 > T:
+            return None
+        C_b0 = np.ascontiguousarray(dcm_from_quat(self._q_0b).T)
+        dv_b = C_b0 @ self._dv_0
+        dv_n = self._specific_force_n(first, fix, T)
+        sigma_dv = math.sqrt(
+            (self.imu.accel_bias_sigma**2 + self.imu.accel_drift_sigma**2) * T**2
+            + float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2))
+        )
+        mismatch = abs(np.linalg.norm(dv_b) - np.linalg.norm(dv_n))
+        if mismatch > 5 * sigma_dv:
+            self.problem = f"accelerometers and GNSS velocity disagree by {mismatch / T:.3g} m/s^2"
+            self._restart(fix)
+            return None
+        heading = self._heading(C_b0, first, fix, T, field_n)
+        if heading is None:
+            if np.linalg.norm(fix.v_n) > REST_SPEED:
+                self._restart(fix)
+            return None
+        self.problem = ""
+        return self._state(fix, T, dv_b, dv_n, heading)
+
+    def _specific_force_n(self, first: GnssSample, fix: GnssSample, T: float) -> Array:
+        """Integral of specific force in n between the fixes: velocity change less gravity and Coriolis."""
+        v_n = 0.5 * (first.v_n + fix.v_n)
+        turn = 2 * earth_rate_n(fix.lat) + transport_rate_n(fix.lat, fix.h, v_n)
+        change: Array = fix.v_n - first.v_n + T * cross(turn, v_n)
+        change[2] -= gravity(fix.lat, 0.5 * (first.h + fix.h)) * T
+        return change
+
+    def _heading(
+        self, C_b0: Array, first: GnssSample, fix: GnssSample, T: float, field_n: Array | None
+    ) -> _Heading | None:
+        speed = math.hypot(fix.v_n[0], fix.v_n[1])
+        if self._fields > 0 and field_n is not None:
+            variance = self.aids.field_bias**2 + self.aids.field**2 / self._fields
+            return _Heading(
+                C_b0 @ self._field_0 / self._fields,
+                field_n,
+                variance * np.eye(3),
+                block="magnetometer_bias",
+                gain=1.0,
+                bias_variance=self.aids.field_bias**2,
+            )
+        if speed >= COURSE_SPEED:
+            course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
+            return _Heading(
+                np.array([1.0, 0.0, 0.0]), course, np.zeros((3, 3)), heading_sigma=min(1.0, self.aids.wind / speed)
+            )
+        if max(speed, float(np.linalg.norm(first.v_n))) > REST_SPEED:
+            self.problem = "no magnetometer and too slow for the course: waiting for flight"
+            return None
+        return self._gyrocompass(C_b0, fix, T)
+
+    def _gyrocompass(self, C_b0: Array, fix: GnssSample, T: float) -> _Heading | None:
+        earth_n = earth_rate_n(fix.lat)
+        level_rate = abs(float(earth_n[0]))
+        bias_variance = self.imu.gyro_bias_sigma**2 + self.imu.gyro_drift_sigma**2
+        sigma = math.sqrt(bias_variance) / level_rate
+        if sigma > HEADING_SIGMA_LIMIT:
+            self.problem = (
+                f"no magnetometer, and gyrocompassing would leave {math.degrees(sigma):.3g} deg: waiting for flight"
+            )
+            return None
+        needed = (self.imu.gyro_noise / (NOISE_SHARE * HEADING_SIGMA_LIMIT * level_rate)) ** 2
+        if needed > T:
+            self.problem = f"gyrocompassing, {needed - T:.0f} s to go"
+            return None
+        return _Heading(
+            C_b0 @ self._angle_0,
+            earth_n * T,
+            (bias_variance * T**2 + self.imu.gyro_noise**2 * T) * np.eye(3),
+            block="gyro_bias",
+            gain=T,
+            bias_variance=self.imu.gyro_bias_sigma**2,
+        )
+
+    def _state(self, fix: GnssSample, T: float, dv_b: Array, dv_n: Array, heading: _Heading) -> InitialState:
+        C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
+        J_b = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 0)
+        J_s = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 1)
+        J_n = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 2)
+
+        bias2 = self.imu.accel_bias_sigma**2
+        variance_dv_b = (bias2 + self.imu.accel_drift_sigma**2) * T**2 + self.imu.accel_noise**2 * T
+        variance_v = np.diag(fix.sigma_velocity_n**2)
+        up = dv_n / np.linalg.norm(dv_n)
+        gyro_turn = (self.imu.gyro_bias_sigma * T) ** 2 + self.imu.gyro_noise**2 * T
+        P = np.zeros((MOTION, MOTION))
+        phi, vel, pos = slice(PHI, PHI + 3), slice(VEL, VEL + 3), slice(POS, POS + 3)
+        P[phi, phi] = (
+            variance_dv_b * J_b @ J_b.T
+            + J_n @ (2 * variance_v) @ J_n.T
+            + J_s @ heading.variance_b @ J_s.T
+            + heading.heading_sigma**2 * np.outer(up, up)
+            + gyro_turn * np.eye(3)
+        )
+        P[phi, vel] = J_n @ variance_v
+        P[vel, phi] = P[phi, vel].T
+        P[vel, vel] = variance_v
+        P[pos, pos] = np.diag(fix.sigma_position_n**2)
+
+        # Every estimated bias is zero, so its error is minus the bias: hence the signs.
+        correlated = {
+            name: np.zeros((MOTION, 3)) for name in ("accel_bias", "gnss_position_error", "gnss_velocity_error")
+        }
+        correlated["accel_bias"][phi] = -bias2 * T * J_b
+        correlated["gnss_position_error"][pos] = -np.diag(self.aids.gnss_position**2)
+        correlated["gnss_velocity_error"][vel] = -np.diag(self.aids.gnss_velocity**2)
+        if heading.block:
+            correlated[heading.block] = np.zeros((MOTION, 3))
+            correlated[heading.block][phi] = -heading.gain * heading.bias_variance * J_s
+
+        q_nb = quat_from_dcm(C_nb)
+        arm_n = C_nb @ self.arm_b
+        R_M, R_N = radii(fix.lat)
+        return InitialState(
+            t=fix.t,
+            lat=fix.lat - arm_n[0] / (R_M + fix.h),
+            lon=wrap_longitude(fix.lon - arm_n[1] / ((R_N + fix.h) * math.cos(fix.lat))),
+            h=fix.h + arm_n[2],
+            v_n=fix.v_n - C_nb @ cross(self._omega_b, self.arm_b),
+            q_nb=q_nb,
+            covariance=P,
+            correlated=correlated,
+        )
+
+
+def _triad(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array) -> Array:
+    """C_nb (3, 3) that takes the first pair exactly and the second as nearly as that allows."""
+    return _axes(primary_n, second_n) @ _axes(primary_b, second_b).T
+
+
+def _axes(primary: Array, second: Array) -> Array:
+    x = primary / np.linalg.norm(primary)
+    y = np.cross(x, second)
+    y /= np.linalg.norm(y)
+    return np.column_stack([x, y, np.cross(x, y)])
+
+
+def _attitude_jacobian(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array, which: int) -> Array:
+    """D phi / d (one of the four vectors), (3, 3), at the TRIAD attitude, by central differences."""
+    vectors = [primary_b, second_b, primary_n, second_n]
+    C = _triad(*vectors)
+    step = STEP * float(np.linalg.norm(vectors[which]))
+    J = np.empty((3, 3))
+    for axis in range(3):
+        turned = []
+        for sign in (1.0, -1.0):
+            moved = [vector.copy() for vector in vectors]
+            moved[which][axis] += sign * step
+            turned.append(_triad(*moved) @ C.T)
+        skewed = (turned[0] - turned[1]) / (2 * step)  # = -[dphi x]
+        J[:, axis] = -0.5 * np.array(
+            [skewed[2, 1] - skewed[1, 2], skewed[0, 2] - skewed[2, 0], skewed[1, 0] - skewed[0, 1]]
+        )
+    return J
+
+
+@njit
+def _accumulate(q_0b: Array, angle_0: Array, dv_0: Array, dtheta: Array, dv: Array) -> None:
+    """Turn ``q_0b`` by increments (N, 3) and add them up in its axes, each taken half-way through its own turn."""
+    for k in range(len(dtheta)):
+        middle = quat_multiply(q_0b, quat_from_rotvec(0.5 * dtheta[k]))
+        angle_0 += quat_rotate(middle, dtheta[k])
+        dv_0 += quat_rotate(middle, dv[k])
+        q_0b[:] = quat_normalise(quat_multiply(q_0b, quat_from_rotvec(dtheta[k])))

@@ -1,0 +1,101 @@
+"""Whether a measurement may be believed: the chi-square gate, and when to believe GNSS again after an outage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from scipy.special import chdtri
+
+from nav.earth import position_difference_n
+from nav.samples import Array, GnssSample
+
+# The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
+TURN_ERROR = 0.6
+
+
+@dataclass(frozen=True)
+class ChiSquareGate:
+    """Accept an innovation when nu' S^-1 nu stays below the chi-square quantile of its dimension.
+
+    ``false_rejection`` is the probability that a sound measurement of a consistent filter is turned away.
+    """
+
+    false_rejection: float
+    thresholds: tuple[float, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.false_rejection < 1:
+            raise ValueError(f"a probability between 0 and 1 is needed, not {self.false_rejection}")
+        object.__setattr__(self, "thresholds", tuple(float(chdtri(m, self.false_rejection)) for m in range(1, 7)))
+
+    def threshold(self, dimension: int) -> float:
+        """The largest accepted statistic for an innovation of ``dimension`` (1 to 6)."""
+        return self.thresholds[dimension - 1]
+
+
+class Verdict(Enum):
+    """What to do with a GNSS fix."""
+
+    FUSE = ""
+    REJECT = "outside the gate"
+    PROBATION = "on probation after an outage"
+    RECOVER = "outside the gate, but consistent for long: covariance reset"
+
+
+@dataclass
+class GnssMonitor:
+    """Decides on each GNSS fix so that a good receiver is never shut out for ever and a bad fix never pulls the filter.
+
+    Successive fixes form a streak while each agrees with the one before and with the velocities in between, which
+    needs no trust in the filter. While the filter is being aided, a fix inside the gate is fused and one outside
+    rejected, and only a streak that stays outside for ``patience_s`` is believed against the filter. After an outage of
+    ``outage_s`` the filter's covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
+    has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
+    ``recovery_s`` the streak is believed.
+    """
+
+    outage_s: float
+    probation_s: float
+    recovery_s: float
+    patience_s: float
+    consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
+    last_fused: float = -math.inf
+    _streak_start: float = math.nan
+    _was_aided: bool = False
+    _previous: tuple[GnssSample, Array] | None = None
+
+    def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool) -> Verdict:
+        """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate."""
+        if not self._continues(fix, v_n, sigma_v):
+            self._streak_start = fix.t
+            self._was_aided = fix.t - self.last_fused <= self.outage_s
+        self._previous = (fix, v_n)
+        lasted = fix.t - max(self._streak_start, self.last_fused)
+        wait = self.patience_s if self._was_aided else self.recovery_s
+        if not self._was_aided and lasted < self.probation_s:
+            verdict = Verdict.PROBATION
+        elif inside_gate:
+            verdict = Verdict.FUSE
+        else:
+            verdict = Verdict.RECOVER if lasted >= wait else Verdict.REJECT
+        if verdict in (Verdict.FUSE, Verdict.RECOVER):
+            self.last_fused = fix.t
+            self._was_aided = True
+        return verdict
+
+    def _continues(self, fix: GnssSample, v_n: Array, sigma_v: Array) -> bool:
+        """Whether ``fix`` is where the fix before it and the mean of both velocities say."""
+        if self._previous is None:
+            return False
+        before, v0_n = self._previous
+        dt = fix.t - before.t
+        if dt > self.outage_s:
+            return False
+        moved = position_difference_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
+        jump = moved - 0.5 * dt * (v0_n + v_n)
+        variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
+        variance += (TURN_ERROR * dt**3) ** 2
+        return float(np.sum(jump * jump / variance)) <= self.consistency_gate

@@ -1,0 +1,261 @@
+"""The error state: which blocks it has, where they lie, and how they grow between measurements.
+
+Error = estimate - truth (see `nav`). The first three blocks are the motion,
+
+    phi  attitude error in n [rad], C_nb_hat = (I - [phi x]) C_nb
+    dv   velocity error, NED [m/s]
+    dp   position error, NED [m]
+
+then come the blocks of inertial sensor errors, which drive the motion, then the errors of the aids, which do not.
+Every block after the motion is a random walk or a first-order Markov process:
+
+    e(t)' = -e / correlation_s + density * white noise
+
+The motion obeys (f and omega of the sensors, b their errors, nominal C = C_nb):
+
+    phi'  = -[w_in x] phi + (dw_in/dv) dv + (dw_in/dp) dp + C b_g
+    dv'   = [f_n x] phi + ([v x] dw_en/dv - [(2 w_ie + w_en) x]) dv + ([v x] d(2 w_ie + w_en)/dp + dg/dp) dp - C b_a
+    dp'   = dv + (dp'/dp) dp
+
+where dp'/dp is the convergence of meridians and the curvature, and dg/dp the gravity gradient 2 g / R. Latitude
+derivatives of the radii and of gravity are left out: they are a thousand times smaller than what is kept.
+
+Source: Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed., section 14.2.4,
+with position in metres; Titterton and Weston, 2nd ed., chapter 12. Verified in the tests by finite differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from nav._jit import njit
+from nav.earth import OMEGA_IE, gravity, radii
+from nav.samples import Array
+
+# Where the blocks of motion begin, and how many states they have together.
+PHI, VEL, POS, MOTION = 0, 3, 6, 9
+
+
+class Drive(IntEnum):
+    """How a block enters the motion: added to a rate or force, or scaling it; NONE for the errors of aids."""
+
+    NONE = -1
+    GYRO = 0
+    ACCEL = 1
+    GYRO_SCALE = 2
+    ACCEL_SCALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One named group of error states.
+
+    ``sigma`` is the 1-sigma at the start, one number or one per state; ``density`` the root spectral density of the
+    driving noise [unit/sqrt(s)]; ``correlation_s`` the time constant, infinite for a random walk.
+    """
+
+    name: str
+    size: int
+    sigma: float | tuple[float, ...]
+    density: float | tuple[float, ...] = 0.0
+    correlation_s: float = math.inf
+    drive: Drive = Drive.NONE
+
+
+def markov(
+    name: str, size: int, sigma: float | tuple[float, ...], correlation_s: float, drive: Drive = Drive.NONE
+) -> Block:
+    """A stationary first-order Markov block: its variance stays sigma^2, density = sigma sqrt(2 / correlation_s)."""
+    scale = math.sqrt(2 / correlation_s)
+    density = scale * sigma if isinstance(sigma, float) else tuple(scale * s for s in sigma)
+    return Block(name, size, sigma, density, correlation_s, drive)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuModel:
+    """What the filter is told of the inertial sensors, each axis alike.
+
+    A bias is a turn-on value that walks, plus, when its sigma is not zero, an in-run part that is first-order Markov.
+    Scale factor errors are states when their sigma is not zero.
+    """
+
+    gyro_noise: float  # angle random walk [rad/sqrt(s)]
+    accel_noise: float  # velocity random walk [m/s/sqrt(s)]
+    gyro_bias_sigma: float  # turn-on bias [rad/s]
+    accel_bias_sigma: float  # [m/s^2]
+    gyro_bias_walk: float = 0.0  # rate random walk [rad/s/sqrt(s)]
+    accel_bias_walk: float = 0.0  # [m/s^2/sqrt(s)]
+    gyro_drift_sigma: float = 0.0  # in-run bias [rad/s]
+    accel_drift_sigma: float = 0.0  # [m/s^2]
+    gyro_drift_correlation_s: float = 300.0
+    accel_drift_correlation_s: float = 300.0
+    gyro_scale_sigma: float = 0.0  # scale factor error [1]
+    accel_scale_sigma: float = 0.0
+
+    def blocks(self) -> list[Block]:
+        """The motion (its noise is the sensors' white noise) and the sensor errors that drive it."""
+        blocks = [
+            Block("phi", 3, 0.0, self.gyro_noise),
+            Block("dv", 3, 0.0, self.accel_noise),
+            Block("dp", 3, 0.0),
+            Block("gyro_bias", 3, self.gyro_bias_sigma, self.gyro_bias_walk, drive=Drive.GYRO),
+            Block("accel_bias", 3, self.accel_bias_sigma, self.accel_bias_walk, drive=Drive.ACCEL),
+        ]
+        if self.gyro_drift_sigma > 0:
+            blocks.append(markov("gyro_drift", 3, self.gyro_drift_sigma, self.gyro_drift_correlation_s, Drive.GYRO))
+        if self.accel_drift_sigma > 0:
+            blocks.append(markov("accel_drift", 3, self.accel_drift_sigma, self.accel_drift_correlation_s, Drive.ACCEL))
+        if self.gyro_scale_sigma > 0:
+            blocks.append(Block("gyro_scale", 3, self.gyro_scale_sigma, drive=Drive.GYRO_SCALE))
+        if self.accel_scale_sigma > 0:
+            blocks.append(Block("accel_scale", 3, self.accel_scale_sigma, drive=Drive.ACCEL_SCALE))
+        return blocks
+
+
+class ErrorModel:
+    """The layout of the error state and the constants of its growth, from the sensors' model and the aids' blocks.
+
+    ``size`` states, the first ``mixing`` of which take part in the motion; ``slices[name]`` is where a block lies and
+    ``start(name)`` where it begins, -1 when there is none. ``sigma``, ``density``, ``decay_rate`` (size,) hold each
+    state's initial 1-sigma, noise density and 1/correlation_s; ``driven`` (blocks, 2) the kind and the start of each
+    block that drives the motion.
+    """
+
+    def __init__(self, imu: ImuModel, aid_blocks: Iterable[Block] = ()) -> None:
+        self.imu = imu
+        self.blocks = [*imu.blocks(), *aid_blocks]
+        if any(block.drive is not Drive.NONE for block in self.blocks[len(imu.blocks()) :]):
+            raise ValueError("the error of an aid cannot drive the motion")
+        self.slices: dict[str, slice] = {}
+        end = 0
+        for block in self.blocks:
+            if block.name in self.slices:
+                raise ValueError(f"two blocks named {block.name}")
+            self.slices[block.name] = slice(end, end + block.size)
+            end += block.size
+        self.size = end
+        self.sigma, self.density, self.decay_rate = np.zeros(end), np.zeros(end), np.zeros(end)
+        driven = []
+        for block in self.blocks:
+            where = self.slices[block.name]
+            self.sigma[where] = block.sigma
+            self.density[where] = block.density
+            self.decay_rate[where] = 1 / block.correlation_s
+            if block.drive is not Drive.NONE:
+                driven.append((int(block.drive), where.start))
+        self.driven = np.array(driven, dtype=np.int64)
+        self.mixing = self.slices[imu.blocks()[-1].name].stop
+
+    def start(self, name: str) -> int:
+        """Index of the first state of block ``name``, -1 when the model has no such block."""
+        return self.slices[name].start if name in self.slices else -1
+
+
+@njit
+def sensor_errors(errors: Array, x: Array, driven: Array) -> None:
+    """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values."""
+    errors[:] = 0.0
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        for axis in range(3):
+            errors[kind, axis] += x[start + axis]
+
+
+@njit
+def transition(Phi: Array, FT: Array, driven: Array, v_n: Array, lat: float, h: float, sums: Array, T: float) -> None:
+    """Fill ``Phi`` (9, mixing), the rows of the motion in the transition over the ``T`` seconds just passed.
+
+    ``sums`` (3, 3, 3) holds, over those T seconds, the integrals of C_nb, of C_nb diag(omega_b) and of C_nb diag(f_b);
+    ``v_n``, ``lat``, ``h`` are where the interval ends; ``FT`` (9, mixing) is scratch. Phi = I + F T + (F T)^2 / 2 with
+    F averaged over the interval. The remaining rows of the whole transition are diagonal and not formed here.
+    """
+    mixing = Phi.shape[1]
+    FT[:] = 0.0
+    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+    tan_lat = sin_lat / cos_lat
+    R_M, R_N = radii(lat)
+    rm, rn = 1 / (R_M + h), 1 / (R_N + h)
+    vn, ve, vd = v_n[0] * T, v_n[1] * T, v_n[2] * T  # every term below is already times T
+    ie_n, ie_d = OMEGA_IE * cos_lat * T, -OMEGA_IE * sin_lat * T
+    en_n, en_e, en_d = ve * rn, -vn * rm, -ve * tan_lat * rn
+    # d(w_en)/d(lat) has a down part only; per metre north, and per metre down (that is -d/dh)
+    en_d_north = -ve * rn / (cos_lat * cos_lat) * rm
+    ie_n_north, ie_d_north = ie_d * rm, -ie_n * rm
+    en_n_down, en_e_down, en_d_down = en_n * rn, en_e * rm, en_d * rn
+
+    # phi
+    _skew(FT, PHI, PHI, -(ie_n + en_n), -en_e, -(ie_d + en_d))
+    FT[PHI, VEL + 1] = rn * T
+    FT[PHI + 1, VEL] = -rm * T
+    FT[PHI + 2, VEL + 1] = -tan_lat * rn * T
+    FT[PHI, POS] = ie_n_north
+    FT[PHI + 2, POS] = ie_d_north + en_d_north
+    FT[PHI, POS + 2] = en_n_down
+    FT[PHI + 1, POS + 2] = en_e_down
+    FT[PHI + 2, POS + 2] = en_d_down
+
+    # dv
+    _skew(
+        FT,
+        VEL,
+        PHI,
+        sums[2, 0, 0] + sums[2, 0, 1] + sums[2, 0, 2],
+        sums[2, 1, 0] + sums[2, 1, 1] + sums[2, 1, 2],
+        sums[2, 2, 0] + sums[2, 2, 1] + sums[2, 2, 2],
+    )
+    _skew(FT, VEL, VEL, -(2 * ie_n + en_n), -en_e, -(2 * ie_d + en_d))
+    # [v x] times the columns of dw_en/dv: north velocity turns n about east, east velocity about north and down
+    FT[VEL, VEL] += vd * rm
+    FT[VEL + 2, VEL] -= vn * rm
+    FT[VEL, VEL + 1] -= ve * tan_lat * rn
+    FT[VEL + 1, VEL + 1] += vd * rn + vn * tan_lat * rn
+    FT[VEL + 2, VEL + 1] -= ve * rn
+    # [v x] times d(2 w_ie + w_en)/dp; v here is not times T
+    turn_n, turn_d = 2 * ie_n_north, 2 * ie_d_north + en_d_north
+    FT[VEL, POS] = v_n[1] * turn_d
+    FT[VEL + 1, POS] = v_n[2] * turn_n - v_n[0] * turn_d
+    FT[VEL + 2, POS] = -v_n[1] * turn_n
+    FT[VEL, POS + 2] = v_n[1] * en_d_down - v_n[2] * en_e_down
+    FT[VEL + 1, POS + 2] = v_n[2] * en_n_down - v_n[0] * en_d_down
+    FT[VEL + 2, POS + 2] = (
+        v_n[0] * en_e_down - v_n[1] * en_n_down + 2 * gravity(lat, h) / (math.sqrt(R_M * R_N) + h) * T
+    )
+
+    # dp
+    FT[POS, VEL] = FT[POS + 1, VEL + 1] = FT[POS + 2, VEL + 2] = T
+    FT[POS, POS] = -vd * rm
+    FT[POS, POS + 2] = vn * rm
+    FT[POS + 1, POS] = ve * tan_lat * rm
+    FT[POS + 1, POS + 1] = -vd * rn - vn * tan_lat * rn
+    FT[POS + 1, POS + 2] = ve * rn
+
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        row, sign = (PHI, 1.0) if kind == Drive.GYRO or kind == Drive.GYRO_SCALE else (VEL, -1.0)
+        term = max(0, kind - 1)  # plain biases share the integral of C_nb
+        for i in range(3):
+            for j in range(3):
+                FT[row + i, start + j] = sign * sums[term, i, j]
+
+    for i in range(MOTION):
+        for j in range(mixing):
+            Phi[i, j] = FT[i, j]
+        Phi[i, i] += 1.0
+        for k in range(MOTION):
+            half = 0.5 * FT[i, k]
+            if half != 0.0:
+                for j in range(mixing):
+                    Phi[i, j] += half * FT[k, j]
+
+
+@njit
+def _skew(matrix: Array, row: int, column: int, x: float, y: float, z: float) -> None:
+    """Write [(x, y, z) x] into ``matrix`` with its corner at (row, column)."""
+    matrix[row, column + 1], matrix[row, column + 2] = -z, y
+    matrix[row + 1, column], matrix[row + 1, column + 2] = z, -x
+    matrix[row + 2, column], matrix[row + 2, column + 1] = -y, x

@@ -1,0 +1,163 @@
+"""Time order: inertial increments and aiding samples reach an estimator as they happened, not as they arrived.
+
+A GNSS fix describes the past by the time it arrives, and a sample may fall between two inertial ones. The estimator
+therefore runs ``lag_s`` behind the newest increment, so that nothing comes too late: each sample is applied at its own
+time, for which an increment is split in two, and the present is predicted from there whenever it is asked for.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import Protocol
+
+import numpy as np
+
+from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from nav.strapdown import compensate
+
+COINCIDENT = 1e-6  # two times this close are the same [s]
+
+
+class Estimator(Protocol):
+    """Whatever turns sensors into an estimate: `nav.ins.Ins` and its kin."""
+
+    def propagate(self, imu: ImuSamples) -> None:
+        """Advance by a block of increments; how the increments are cut into blocks makes no difference."""
+        ...
+
+    def accepts(self, sample: Sample) -> bool:
+        """Whether `update` would use the sample now, for aiding or for alignment."""
+        ...
+
+    def update(self, sample: Sample) -> list[UpdateReport]:
+        """Use a sample that is valid at the estimator's own time."""
+        ...
+
+    def estimate(self) -> Estimate:
+        """The state at the estimator's own time."""
+        ...
+
+    def predict(self, imu: ImuSamples) -> Estimate:
+        """The state after further increments, the estimator itself staying where it is."""
+        ...
+
+
+class FusionHorizon:
+    """Feeds one estimator in time order, ``lag_s`` [s] (the largest latency of its aids) behind the newest increment.
+
+    Only samples cut the increments, never the blocks they are pushed in, so the same data give the same result however
+    they are pushed. With ``coning`` raw increments are compensated for coning and sculling (`nav.strapdown.compensate`):
+    right for an IMU that sums over intervals in which its rate changes, wrong for increments that are rotation vectors.
+    """
+
+    def __init__(self, estimator: Estimator, lag_s: float = 0.0, coning: bool = False) -> None:
+        self.estimator = estimator
+        self.lag_s = lag_s
+        self.coning = coning
+        self._raw: ImuSamples | None = None  # last raw increment, for the compensation of the next
+        self._imu = ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+        self._next = 0  # first row of _imu that the estimator has not used
+        self._t = -math.inf  # up to where the estimator has come
+        self._queue: list[tuple[float, str, int, Sample]] = []
+        self._count = 0
+
+    def push(self, imu: ImuSamples, samples: list[Sample] | None = None) -> list[UpdateReport]:
+        """Add consecutive increments and the samples that arrived with them; what became of the samples applied now."""
+        for sample in samples or ():
+            heapq.heappush(self._queue, (sample.t, sample.sensor, self._count, sample))
+            self._count += 1
+        if len(imu):
+            self._append(imu)
+        reports: list[UpdateReport] = []
+        horizon = (float(self._imu.t[-1]) if len(self._imu) else self._t) - self.lag_s
+        while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
+            t, _, _, sample = heapq.heappop(self._queue)
+            if not self.estimator.accepts(sample):
+                continue
+            if t < self._t - COINCIDENT:
+                reports.append(_too_late(sample, self._t))
+                continue
+            self._advance(t)
+            reports += self.estimator.update(sample)
+        self._propagate_to(horizon)
+        return reports
+
+    def estimate_at(self, t: float) -> Estimate:
+        """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
+
+        Raises ValueError when ``t`` is past the newest increment or before what the estimator has already used.
+        """
+        if abs(t - self._t) <= COINCIDENT or self._t == -math.inf:
+            return self.estimator.estimate()
+        if t < self._t:
+            raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
+        stop = self._row_after(t)
+        front = _cut(self._imu, self._next, stop)
+        if len(front) == 0 or front.t[-1] < t - COINCIDENT:
+            if stop == len(self._imu):
+                raise ValueError(f"no inertial samples up to {t} s")
+            front = _join(front, self._part(stop, t))
+        return self.estimator.predict(front)
+
+    def _append(self, imu: ImuSamples) -> None:
+        if self._t == -math.inf:
+            self._t = float(imu.t[0] - imu.dt[0])
+        ready = compensate(imu, self._raw) if self.coning else imu
+        self._raw = _cut(imu, len(imu) - 1, len(imu))
+        self._imu = _join(_cut(self._imu, self._next, len(self._imu)), ready)
+        self._next = 0
+
+    def _advance(self, t: float) -> None:
+        """Bring the estimator to ``t``, splitting an increment in which it falls."""
+        self._propagate_to(t)
+        if t > self._t + COINCIDENT and self._next < len(self._imu):
+            part = self._part(self._next, t)
+            for rest, used in ((self._imu.dt, part.dt), (self._imu.dtheta, part.dtheta), (self._imu.dv, part.dv)):
+                rest[self._next] -= used[0]
+            self.estimator.propagate(part)
+            self._t = t
+
+    def _propagate_to(self, t: float) -> None:
+        """Hand over the whole increments that end by ``t``."""
+        stop = self._row_after(t)
+        if stop > self._next:
+            self.estimator.propagate(_cut(self._imu, self._next, stop))
+            self._t = float(self._imu.t[stop - 1])
+            self._next = stop
+
+    def _row_after(self, t: float) -> int:
+        return max(self._next, int(np.searchsorted(self._imu.t, t + COINCIDENT, side="right")))
+
+    def _part(self, row: int, t: float) -> ImuSamples:
+        """The part of one increment up to ``t``: rate and force are constant over an increment."""
+        whole = _cut(self._imu, row, row + 1)
+        share = 1 - (whole.t[0] - t) / whole.dt[0]
+        return ImuSamples(np.array([t]), share * whole.dt, share * whole.dtheta, share * whole.dv)
+
+
+def _cut(imu: ImuSamples, start: int, stop: int) -> ImuSamples:
+    return ImuSamples(imu.t[start:stop], imu.dt[start:stop], imu.dtheta[start:stop], imu.dv[start:stop])
+
+
+def _join(first: ImuSamples, second: ImuSamples) -> ImuSamples:
+    return ImuSamples(
+        np.concatenate([first.t, second.t]),
+        np.concatenate([first.dt, second.dt]),
+        np.concatenate([first.dtheta, second.dtheta]),
+        np.concatenate([first.dv, second.dv]),
+    )
+
+
+def _too_late(sample: Sample, now: float) -> UpdateReport:
+    return UpdateReport(
+        t=sample.t,
+        sensor=sample.sensor,
+        aid=sample.sensor,
+        innovation=np.empty(0),
+        S=np.empty((0, 0)),
+        nis=math.nan,
+        threshold=math.nan,
+        weight=0.0,
+        reason=f"{now - sample.t:.3g} s too late",
+    )
