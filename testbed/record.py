@@ -26,6 +26,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
 from pathlib import Path
@@ -54,6 +55,7 @@ SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 AXES: dict[str, tuple[str, ...]] = {
     "ned": ("north", "east", "down"),
     "body": ("forward", "right", "down"),
+    "north_east": ("north", "east"),
     "quaternion": ("w", "x", "y", "z"),
     "surface": ("aileron", "elevator", "rudder", "throttle"),
     "command": ("bank", "altitude", "airspeed"),
@@ -64,6 +66,7 @@ AXES: dict[str, tuple[str, ...]] = {
 AXES["error_column"] = AXES["error"]
 _FRAME = {
     "ned": "n: local north-east-down",
+    "north_east": "n: local north-east-down",
     "body": "b: forward-right-down",
     "quaternion": "from b (forward-right-down) to n (north-east-down)",
     "error": "n: local north-east-down",
@@ -161,20 +164,31 @@ ESTIMATE = {
     ),
 }
 
-# Unit and meaning of the further states that estimators may carry, by name.
+# The further states that estimators may carry, by name.
 EXTRA = {
-    "wind_n": ("m/s", "estimated wind over ground, north and east"),
-    "baro_bias": ("m", "estimated bias of barometric height"),
-    "barometer_bias": ("m", "estimated bias of barometric height"),
-    "heading_bias": ("rad", "estimated bias of magnetic heading"),
-    "airspeed_scale": ("1", "estimated scale factor error of the airspeed sensor"),
+    "gyro_drift": Variable("rad/s", "estimated correlated part of the gyro bias", ("body",)),
+    "accel_drift": Variable("m/s^2", "estimated correlated part of the accelerometer bias", ("body",)),
+    "gyro_scale": Variable("1", "estimated gyro scale factor error", ("body",)),
+    "accel_scale": Variable("1", "estimated accelerometer scale factor error", ("body",)),
+    "gnss_position_error": Variable("m", "estimated correlated error of GNSS position", ("ned",)),
+    "gnss_velocity_error": Variable("m/s", "estimated correlated error of GNSS velocity", ("ned",)),
+    "barometer_bias": Variable("m", "estimated bias of pressure altitude"),
+    "magnetometer_bias": Variable("T", "estimated magnetometer bias", ("body",)),
+    "wind": Variable("m/s", "estimated velocity of the air over ground, without gusts", ("north_east",)),
+    "gust": Variable("m/s", "estimated gust beside the steady wind", ("north_east",)),
+    "airspeed_scale": Variable("1", "estimated scale factor error of the airspeed sensor"),
 }
 
+# Unit of the innovation of each aid, and its components.
+AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "gnss_position": ("m", ("ned",)),
+    "gnss_velocity": ("m/s", ("ned",)),
+    "magnetometer": ("T", ("body",)),
+    "barometer": ("m", ("component",)),
+    "airspeed": ("m/s", ("component",)),
+    "sideslip": ("m/s", ("component",)),
+}
 REPORT = {
-    "innovation": Variable("units of the aid", "measurement - prediction", ("component",)),
-    "S": Variable(
-        "units of the aid, squared", "innovation covariance before the update", ("component", "component_column")
-    ),
     "nis": Variable("1", "normalised innovation squared"),
     "threshold": Variable("1", "gate for nis"),
     "weight": Variable("1", "factor on the information of the sample: 1 taken as it is, 0 rejected"),
@@ -251,7 +265,8 @@ class _Table:
 
     def rows_expected(self, t: float, duration: float) -> int:
         """Rows at the end of the run at the rate so far, with some room to spare."""
-        rate = self.rows_now / max(t - self.started, 1.0)
+        elapsed = t - self.started
+        rate = self.rows_now / elapsed if elapsed > 1.0 else self.rows_now
         expected = self.rows_now + 1.05 * rate * max(duration - t, 0.0)
         return int(max(expected, 1.25 * self.rows_now)) + SPARE_ROWS
 
@@ -307,17 +322,29 @@ def _pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]
     return block, SAMPLE
 
 
-def _pack_reports(reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Variable]]:
-    block: Block = {
-        "sample_time": _scalars(reports, "t"),
-        "innovation": _vectors(reports, "innovation"),
-        "S": _vectors(reports, "S"),
-        "nis": _scalars(reports, "nis"),
-        "threshold": _scalars(reports, "threshold"),
-        "weight": _scalars(reports, "weight"),
-        "reason": _text([r.reason for r in reports], REPORT["reason"].dtype),
-    }
-    return block, REPORT
+def _pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {"sample_time": _scalars(reports, "t")}
+    variables = dict(REPORT)
+    sizes = {len(r.innovation) for r in reports}
+    m = max(sizes)
+    if m:
+        unit, dims = AIDS.get(aid, ("unknown", ("component",)))
+        variables["innovation"] = Variable(unit, "measurement - prediction", dims)
+        variables["S"] = Variable(
+            f"({unit})^2", "innovation covariance before the update", ("component", "component_column")
+        )
+        if sizes == {m}:
+            block["innovation"], block["S"] = _vectors(reports, "innovation"), _vectors(reports, "S")
+        else:  # broken samples are refused before an innovation is formed
+            block["innovation"] = np.full((len(reports), m), np.nan)
+            block["S"] = np.full((len(reports), m, m), np.nan)
+            for k, report in enumerate(reports):
+                if len(report.innovation) == m:
+                    block["innovation"][k], block["S"][k] = report.innovation, report.S
+    for name in ("nis", "threshold", "weight"):
+        block[name] = _scalars(reports, name)
+    block["reason"] = _text([r.reason for r in reports], REPORT["reason"].dtype)
+    return block, variables
 
 
 def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Variable]]:
@@ -330,15 +357,15 @@ def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Var
     sigma = np.sqrt(np.maximum(np.diagonal(block["covariance"], axis1=1, axis2=2), 0.0))  # nan stays nan
     for k, name in enumerate(("sigma_position_n", "sigma_velocity_n", "sigma_attitude_n")):
         block[name] = sigma[:, 3 * k : 3 * k + 3]
-    for name in sorted({key for e in estimates for key in e.extra}):
-        unit, meaning = EXTRA.get(name, ("unknown", "further state"))
+    for name in dict.fromkeys(key for e in estimates for key in e.extra):
         width = next(len(e.extra[name][0]) for e in estimates if name in e.extra)
+        variable = EXTRA.get(name, Variable("unknown", "further state", (f"{name}_component",)))
         blank = (np.full(width, np.nan), np.full(width, np.nan))
         pairs = [e.extra.get(name, blank) for e in estimates]
-        for k, (column, what) in enumerate(((name, meaning), (f"sigma_{name}", f"1-sigma of {name}"))):
+        for k, column in enumerate((name, f"sigma_{name}")):
             values = np.concatenate([pair[k] for pair in pairs]).reshape(len(pairs), width)
-            block[column] = values[:, 0] if width == 1 else values
-            variables[column] = Variable(unit, what, () if width == 1 else (f"{name}_component",))
+            block[column] = values if variable.dims else values[:, 0]
+            variables[column] = variable if k == 0 else replace(variable, meaning=f"1-sigma of {name}")
     return block, variables
 
 
@@ -413,7 +440,7 @@ class Recorder:
         """Take what became of aiding samples, one group per aid."""
         for report in reports:
             path = f"estimators/{name}/innovations/{report.aid}"
-            table = self._tables.get(path) or self._table(path, _pack_reports, "sample_time")
+            table = self._tables.get(path) or self._table(path, partial(_pack_reports, report.aid), "sample_time")
             table.objects.append(report)
 
     def event(self, t: float, severity: str, text: str) -> None:
@@ -606,7 +633,7 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
             dataset.make_scale(axis)
             scales[axis] = dataset.id
         for group_path, table in tables.items():
-            group = file.require_group(group_path).id
+            group = _group(file, group_path).id
             local: dict[str, Any] = {}
             for name, column in table.columns.items():
                 dtype = column.dtype
@@ -639,6 +666,14 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
                     note.text(dataset, "_Encoding", "utf-8")
                 column.offset = dataset.get_offset()
             table.grown = False
+
+
+def _group(file: h5py.File, path: str) -> h5py.Group:
+    """Make a group and those above it, each listing its members in the order in which they were made."""
+    group = file
+    for part in path.split("/"):
+        group = group[part] if part in group else group.create_group(part, track_order=True)
+    return group
 
 
 def _bare_dimension(group: Any, name: str, size: int) -> Any:
@@ -693,8 +728,8 @@ def _read_group(group: h5py.Group, path: str, found: dict[str, dict[str, tuple[V
 
     time_name = next((name for name in ("time", "sample_time") if name in group), None)
     if time_name is not None:
-        t = group[time_name][()]
-        rows = int(np.argmin(np.isfinite(t))) if not np.isfinite(t).all() else len(t)
+        written = np.flatnonzero(np.isfinite(group[time_name][()]))
+        rows = int(written[-1]) + 1 if len(written) else 0
         found[path] = {
             name: _read_column(item, rows)
             for name, item in group.items()

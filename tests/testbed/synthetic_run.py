@@ -109,8 +109,8 @@ def estimate(truth: TruthBlock, k: int, errors: Errors, rng: np.random.Generator
         sigma_accel_bias=np.full(3, 1e-3 + 2e-2 * np.exp(-t / 100)),
         status=Status.ALIGNED | (Status.DEAD_RECKONING if outage else Status.GNSS_FUSED),
         extra={
-            "wind_n": (truth.wind_n[k, :2] + rng.normal(size=2) * 0.3, np.full(2, 0.3)),
-            "baro_bias": (np.array([3.0]), np.array([1.0])),
+            "wind": (truth.wind_n[k, :2] + rng.normal(size=2) * 0.3, np.full(2, 0.3)),
+            "barometer_bias": (np.array([3.0]), np.array([1.0])),
         },
     )
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import synthetic_run
 import xarray
 from synthetic_run import Errors, circle, scenario
 
-from nav.samples import ImuSamples
+from nav.samples import ImuSamples, UpdateReport
 from testbed import record
 from testbed.errors import UserError
 from testbed.record import Recorder, load
@@ -103,10 +104,10 @@ def test_samples_estimates_reports_and_events_come_back(run_file: Path) -> None:
     for k, name in enumerate(("sigma_position_n", "sigma_velocity_n", "sigma_attitude_n")):
         np.testing.assert_array_equal(ins[name], sigma[:, 3 * k : 3 * k + 3])
     aligned = [e for e in estimates if e.extra]
-    assert np.isnan(ins["wind_n"].values[: -len(aligned)]).all()
-    np.testing.assert_array_equal(ins["wind_n"][-len(aligned) :], [e.extra["wind_n"][0] for e in aligned])
+    assert np.isnan(ins["wind"].values[: -len(aligned)]).all()
+    np.testing.assert_array_equal(ins["wind"][-len(aligned) :], [e.extra["wind"][0] for e in aligned])
     np.testing.assert_array_equal(
-        ins["sigma_baro_bias"][-len(aligned) :], [e.extra["baro_bias"][1][0] for e in aligned]
+        ins["sigma_barometer_bias"][-len(aligned) :], [e.extra["barometer_bias"][1][0] for e in aligned]
     )
     reports = tree["estimators/ins/innovations/gnss_position"]
     S = reports["S"].values
@@ -206,9 +207,29 @@ def test_a_column_that_appears_late_is_blank_before(tmp_path: Path) -> None:
         recorder.estimate("ins", synthetic_run.estimate(truth, k, Errors(), rng))
         recorder.flush()
     recorder.close()
-    wind = load(tmp_path / "run.nc")["estimators/ins"]["wind_n"].values
+    wind = load(tmp_path / "run.nc")["estimators/ins"]["wind"].values
     assert np.isnan(wind[:2]).all()
     assert np.isfinite(wind[2:]).all()
+
+
+def test_a_report_without_innovation_keeps_its_place(tmp_path: Path) -> None:
+    """A broken sample is refused before an innovation is formed; its time may be broken too."""
+    recorder = Recorder(tmp_path / "run.nc", scenario(), 3)
+    fused = synthetic_run._report(1.0, "gnss", "gnss_position", 3, np.random.default_rng(0))
+    refused = UpdateReport(
+        np.nan, "gnss", "gnss_position", np.empty(0), np.empty((0, 0)), np.nan, np.nan, 0.0, "broken"
+    )
+    for reports in ([refused], [fused, refused], [fused], [fused]):
+        recorder.reports("ins", reports)
+        recorder.reports("ins", [replace(refused, t=2.0, aid="gnss")])
+        recorder.flush()
+    recorder.close()
+    innovations = load(tmp_path / "run.nc")["estimators/ins/innovations"]
+    assert innovations["gnss"]["reason"].values.tolist() == ["broken"] * 4
+    position = innovations["gnss_position"]
+    assert position["reason"].values.tolist() == ["broken", "", "broken", "", ""]
+    np.testing.assert_array_equal(np.isnan(position["innovation"].values[:, 0]), [True, False, True, False, False])
+    np.testing.assert_array_equal(position["S"][1], fused.S)
 
 
 def test_long_text_is_cut_at_a_whole_character() -> None:
