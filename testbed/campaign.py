@@ -19,7 +19,6 @@ import json
 import logging
 import math
 import os
-import shutil
 import time
 import traceback
 import uuid
@@ -32,7 +31,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.lib.format import open_memmap
 
 import nav
 from nav.samples import Array
@@ -40,21 +38,18 @@ from testbed import metrics
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.scenario import FlightTruth, Scenario
-from testbed.truth import COLUMNS, MotionSource, TruthBlock
+from testbed.truth import Replay, save_motion
 
 if TYPE_CHECKING:
     import xarray
     from distributed import Client
-    from rich.console import Console
 
     from testbed.campaign_report import Statistics
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
 CONNECT_S = 3.0  # how long a scheduler may take to answer
 WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
-SAVE_TICKS = 20_000  # rows of a shared flight in memory at a time
 POLL_S = 2.0  # how often progress is told when no run finishes
-PLAIN_EVERY_S = 5.0  # how often a line says so where the output is no terminal
 SETUP = "setup.json"
 
 
@@ -501,56 +496,6 @@ def _false_alarms_per_h(dataset: xarray.DataTree, estimator: str) -> float:
     return rejected * 3600.0 * float(dataset.attrs["record_rate_hz"]) / len(counted)
 
 
-# --- a flight that was flown before
-
-
-class Replay:
-    """A motion source that gives, row for row, what `save_motion` stored in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        stored = json.loads((folder / "motion.json").read_bytes())
-        self.rate_hz = float(stored["rate_hz"])
-        self._rows = int(stored["rows"])
-        self._columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS}
-        self._tick = 0
-
-    def advance(self, ticks: int) -> TruthBlock:
-        """The next ``ticks`` rows, as copies: numba would compile again for arrays that can't be written to."""
-        rows = slice(self._tick, min(self._tick + ticks, self._rows))
-        block = TruthBlock(self._tick, **{name: np.array(column[rows]) for name, column in self._columns.items()})
-        self._tick += len(block)
-        return block
-
-    def activity(self) -> str:
-        """What is going on."""
-        return "replay"
-
-
-def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
-    """Store the first ``ticks`` rows of a motion, one .npy per truth column, for `Replay`.
-
-    The folder appears when it is complete. Raises UserError when it can't be written.
-    """
-    part = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    try:
-        part.mkdir()
-        columns = {
-            name: open_memmap(part / f"{name}.npy", "w+", float, (ticks, c.width) if c.width > 1 else (ticks,))
-            for name, c in COLUMNS.items()
-        }
-        rows = 0
-        while rows < ticks and len(block := source.advance(min(SAVE_TICKS, ticks - rows))):
-            for name, column in columns.items():
-                column[rows : rows + len(block)] = getattr(block, name)
-            rows += len(block)
-        (part / "motion.json").write_text(json.dumps({"rate_hz": source.rate_hz, "rows": rows}))
-        part.rename(folder)
-    except OSError as error:
-        raise UserError(f"{folder}: can't store the flight: {error.strerror}") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-
-
 # --- telling
 
 
@@ -573,54 +518,3 @@ class _Teller:
         if self._progress is not None:
             elapsed = time.monotonic() - self._started
             self._progress(Progress(self._done, self._failed, self._total, self._before, elapsed, activity))
-
-
-def conduct(
-    console: Console,
-    scenario: str | Path,
-    runs: int,
-    *,
-    vary: Mapping[str, Sequence[str]] | None = None,
-    overrides: Sequence[str] = (),
-    scheduler: str | None = None,
-    out: Path,
-) -> bool:
-    """A `campaign` for people: progress, tables and failures on the console; whether every run succeeded."""
-    from testbed import campaign_report
-
-    with _shown(console) as tell:
-        result = campaign(scenario, runs, vary=vary, overrides=overrides, scheduler=scheduler, out=out, progress=tell)
-    for table in campaign_report.tables(result):
-        console.print(table)
-    for failure in result.failures:
-        which = ", ".join(filter(None, [str(result.combinations[failure.combination]), f"seed {failure.seed}"]))
-        console.print(f"failed: {which}: {failure.message}", markup=False, highlight=False, soft_wrap=True)
-    console.print(f"campaign: {out}", markup=False, highlight=False, soft_wrap=True)
-    return not result.failures
-
-
-@contextmanager
-def _shown(console: Console) -> Iterator[Callable[[Progress], None]]:
-    """Progress as a bar on a terminal, as a line now and then elsewhere."""
-    if not console.is_terminal:
-        yield _plain(console)
-        return
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    with Bar(TextColumn("runs"), BarColumn(), TextColumn("{task.description}"), console=console, transient=True) as bar:
-        task = bar.add_task("starting", total=None)
-        yield lambda now: bar.update(task, total=now.total, completed=now.done + now.failed, description=str(now))
-
-
-def _plain(console: Console) -> Callable[[Progress], None]:
-    last = -math.inf
-
-    def tell(now: Progress) -> None:
-        nonlocal last
-        if now.done + now.failed < now.total and now.elapsed_s - last < PLAIN_EVERY_S:
-            return
-        last = now.elapsed_s
-        console.print(f"runs {now}", markup=False, highlight=False, soft_wrap=True)
-
-    return tell
