@@ -146,6 +146,23 @@ class _Latest:
         return arrived
 
 
+def _push(horizon, imu, samples, times):
+    import numpy as np
+
+    reports, out, a = [], [], 0
+    for t in times:
+        b = int(np.searchsorted(imu.t, t + 1e-6, side="right"))
+        reports += horizon.push(
+            ImuSamples(imu.t[a:b], imu.dt[a:b], imu.dtheta[a:b], imu.dv[a:b]), samples if a == 0 else []
+        )
+        if a == 0:
+            samples = []
+        out.append(horizon.estimate_at(t))
+        a = b
+    reports += horizon.push(ImuSamples(imu.t[a:], imu.dt[a:], imu.dtheta[a:], imu.dv[a:]), samples)
+    return reports, out
+
+
 def run(
     scenario: Scenario,
     *,
@@ -212,8 +229,8 @@ def run(
             times = [float(block.t[k]) for k in outputs]
             estimates: dict[str, list[Estimate]] = {}
             for name, one in filters.items():
-                reports, estimates[name] = one.horizon.push(
-                    imu[one.imu], [s for aid in one.sensors for s in samples[aid]], times
+                reports, estimates[name] = _push(
+                    one.horizon, imu[one.imu], [s for aid in one.sensors for s in samples[aid]], times
                 )
                 recorder.reports(name, reports)
                 for report in reports:

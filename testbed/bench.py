@@ -1,0 +1,302 @@
+"""Speed, each figure as a ratio measured in one run: machines differ and are noisy, ratios much less so.
+
+Peers come with the bench extra (`make bench` installs it): pyins (PyPI python-ins) and smsfusion. Alternating rounds,
+the median of each side.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from nav import strapdown
+from nav.alignment import InitialState
+from nav.earth import position_difference_n
+from nav.error_model import ImuModel
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.rotation import quat_from_euler
+from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
+from testbed import loop
+from testbed.errors import UserError
+from testbed.scenario import Scenario
+
+MAIN = "loiter_gnss_outage"
+ROUNDS = 5
+DEG = np.pi / 180
+HAS_PEERS = find_spec("pyins") is not None and find_spec("smsfusion") is not None
+
+# The oracle hour: 100 Hz IMU, 1 Hz GNSS position, errors of an industrial MEMS unit.
+RATE_HZ, HOUR_S = 100, 3600.0
+START = (50.0, 30.0, 500.0)  # lat, lon [deg], h [m]
+GYRO_NOISE, ACCEL_NOISE = 0.3 * DEG / 60, 0.05 / 60  # [rad/sqrt(s)], [m/s/sqrt(s)]
+GYRO_BIAS = np.array([60.0, -40.0, 50.0]) * DEG / 3600  # [rad/s]
+ACCEL_BIAS = np.array([0.05, -0.04, 0.06])  # [m/s^2]
+GYRO_WALK, ACCEL_WALK = 1e-6, 1e-5  # [rad/s/sqrt(s)], [m/s^2/sqrt(s)]
+GNSS_SIGMA = 1.0  # [m]
+IMU_COLUMNS = ("gyro", "accel")  # as pyins names them
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One figure with the bound it must keep: at most or at least ``bound``; no bound, only a figure."""
+
+    what: str
+    value: float
+    unit: str = "x"
+    at_most: float | None = None
+    at_least: float | None = None
+    detail: str = ""
+
+    @property
+    def kept(self) -> bool:
+        """Whether the bound is kept."""
+        if self.at_most is not None and not self.value <= self.at_most:
+            return False
+        return self.at_least is None or self.value >= self.at_least
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def _alternate(first: Callable[[], object], second: Callable[[], object], rounds: int = ROUNDS) -> tuple[float, float]:
+    """Median seconds of each side, the two taken in turn after one warm-up."""
+    first()
+    second()
+    pairs = [(_seconds(first), _seconds(second)) for _ in range(rounds)]
+    return median(a for a, _ in pairs), median(b for _, b in pairs)
+
+
+def whole_run() -> list[Row]:
+    """Fly, sense, two estimators, record to disk; over JSBSim stepping the same aircraft as long, nothing read."""
+    from testbed.flight import Aircraft
+    from testbed.scenario import FlightTruth
+
+    scenario = Scenario.load(MAIN)
+    assert isinstance(scenario.truth, FlightTruth)
+    truth = scenario.truth
+    ticks = round(scenario.duration_s * truth.rate_hz)
+    with tempfile.TemporaryDirectory() as folder:
+
+        def fly() -> None:
+            loop.run(scenario, out=Path(folder))
+
+        def step() -> None:
+            aircraft = Aircraft(truth.aircraft, truth.rate_hz)
+            aircraft.start(truth.start, [(0.0, 0.0, 0.0)])
+            aircraft.turbulence(truth.wind.turbulence, 1)
+            run = aircraft.fdm.run
+            for _ in range(ticks):
+                run()
+
+        whole, bare = _alternate(fly, step, 3)
+    detail = f"{whole:.2f} s over {bare:.2f} s ({bare / ticks * 1e6:.1f} us per step), {scenario.duration_s:g} s flown"
+    return [Row("whole run / bare JSBSim stepping", whole / bare, at_most=2.0, detail=detail)]
+
+
+def strapdown_alone() -> list[Row]:
+    """The strapdown kernel over pyins' batch integration, the same increments."""
+    if not HAS_PEERS:
+        return []
+    from pyins import strapdown as peer
+
+    trajectory, imu, _ = _oracle_hour()
+    samples = _increments(imu)
+    theirs_increments = peer.compute_increments_from_imu(imu, "increment")
+
+    def ours() -> None:
+        q, v, lla = _initial(trajectory)
+        strapdown.propagate(q, v, lla, samples.dtheta, samples.dv, samples.dt)
+
+    def theirs() -> None:
+        peer.Integrator(trajectory.iloc[0]).integrate(theirs_increments)
+
+    us, them = _alternate(ours, theirs)
+    speeds = f"{len(samples) / us / 1e6:.1f} M steps/s against {len(samples) / them / 1e6:.2f} M"
+    return [Row("strapdown: pyins batch / ours", them / us, at_least=4.0, detail=speeds)]
+
+
+def ins_at_every_sample() -> list[Row]:
+    """The 15-state INS with covariance at every IMU sample over smsfusion's aided INS, the same hour."""
+    if not HAS_PEERS:
+        return []
+    from smsfusion import AidedINS
+
+    trajectory, imu, fixes = _oracle_hour()
+    samples, aids = _increments(imu), _fixes(fixes)
+    rate, force = samples.dtheta * RATE_HZ, samples.dv * RATE_HZ
+    q, v, lla = _initial(trajectory)
+    start = np.concatenate([np.zeros(3), v, q, np.zeros(6)])
+    # smsfusion navigates on a flat Earth; it gets the fixes in metres about the start, for the same number of updates
+    local = np.array([position_difference_n(s.lat, s.lon, s.h, *lla) for s in aids if isinstance(s, GnssSample)])
+    variance = np.full(3, GNSS_SIGMA**2)
+
+    def ours() -> None:
+        FusionHorizon(_aligned(trajectory)).push(samples, aids)
+
+    def theirs() -> None:
+        accel = {"N": ACCEL_NOISE, "B": 0.05, "tau_cb": 1e4}
+        gyro = {"N": GYRO_NOISE, "B": 3e-4, "tau_cb": 1e4}
+        aided = AidedINS(RATE_HZ, start, np.eye(15) * 1e-2, accel, gyro, ignore_bias_acc=False, cold_start=False)
+        for k in range(len(rate)):
+            second, rest = divmod(k + 1, RATE_HZ)
+            if rest == 0 and second <= len(local):
+                aided.update(force[k], rate[k], pos=local[second - 1], pos_var=variance)
+            else:
+                aided.update(force[k], rate[k])
+
+    us, them = _alternate(ours, theirs, 3)
+    speeds = f"{len(rate) / us / 1e3:.0f} k samples/s against {len(rate) / them / 1e3:.1f} k"
+    return [Row("15-state INS: smsfusion / ours", them / us, at_least=10.0, detail=speeds)]
+
+
+def start_up() -> list[Row]:
+    """Cold compile of every kernel, and the time from process start to the first tick when they are compiled."""
+    script = (
+        "import time; from testbed import Scenario, run\n"
+        "first = []\n"
+        "def tick(p):\n"
+        "    first or first.append(time.time())\n"
+        f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]']), progress=tick)\n"
+        "print(first[0])\n"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        cold, _ = _process(script, {"NUMBA_CACHE_DIR": cache})
+        warm = [_process(script, {"NUMBA_CACHE_DIR": cache}) for _ in range(3)]
+    return [
+        Row("cold JIT compile", cold - median(total for total, _ in warm), "s", at_most=15.0),
+        Row("second start to first tick", median(first for _, first in warm), "s", at_most=3.0),
+    ]
+
+
+def _process(script: str, environment: dict[str, str]) -> tuple[float, float]:
+    """Wall seconds of a fresh interpreter, in all and until the moment that it prints."""
+    began = time.time()
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | environment, capture_output=True, text=True, check=True
+    )
+    return time.time() - began, float(done.stdout) - began
+
+
+def growth() -> list[tuple[str, float, float, float]]:
+    """What a run costs as it grows: (case, wall seconds, seconds per simulated hour, peak memory MiB)."""
+    base = ["duration_s=600", "sensors.gnss.denied=[[200, 400]]"]
+    one = ["duration_s=600", "sensors.gnss.denied=[[200, 400]]", "estimator=[{name='ins', aids=['gnss']}]"]
+    many = ", ".join(f"{{name='ins{k}', aids=['gnss', 'barometer', 'magnetometer', 'airspeed']}}" for k in range(4))
+    cases = {
+        "600 s": (base, 600),
+        "1200 s": (["duration_s=1200", "sensors.gnss.denied=[[200, 400]]"], 1200),
+        "2400 s": (["duration_s=2400", "sensors.gnss.denied=[[200, 400]]"], 2400),
+        "600 s, IMU at 100 Hz": ([*base, "sensors.imu.rate_hz=100"], 600),
+        "600 s, GNSS and barometer at 20 Hz": ([*base, "sensors.gnss.rate_hz=20", "sensors.barometer.rate_hz=20"], 600),
+        "600 s, 1 estimator": (one, 600),
+        "600 s, 4 estimators": (["duration_s=600", "sensors.gnss.denied=[[200, 400]]", f"estimator=[{many}]"], 600),
+    }
+    rows = []
+    for case, (overrides, duration) in cases.items():
+        script = (
+            "import resource, tempfile, time; from pathlib import Path; from testbed import Scenario, run\n"
+            f"scenario = Scenario.load('{MAIN}', {overrides!r})\n"
+            "with tempfile.TemporaryDirectory() as folder:\n"
+            "    began = time.perf_counter(); run(scenario, out=Path(folder)); wall = time.perf_counter() - began\n"
+            "print(wall, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+        )
+        out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+        wall, memory = map(float, out.split())
+        rows.append((case, wall, wall * 3600 / duration, memory))
+    return rows
+
+
+@cache
+def _oracle_hour() -> tuple[Any, Any, Any]:
+    """Trajectory, increments with errors and GNSS fixes of the hour, from pyins' own simulator, as its frames."""
+    from pyins import inertial_sensor, sim
+
+    dt = 1 / RATE_HZ
+    trajectory, imu = sim.generate_sine_velocity_motion(
+        dt, HOUR_S + dt, list(START), [25.0, 15.0, 0.0], [8.0, 8.0, 0.5], 60, sensor_type="increment"
+    )
+    gyro = inertial_sensor.Parameters(bias=GYRO_BIAS, noise=GYRO_NOISE, bias_walk=GYRO_WALK, rng=1)
+    accel = inertial_sensor.Parameters(bias=ACCEL_BIAS, noise=ACCEL_NOISE, bias_walk=ACCEL_WALK, rng=2)
+    imu = inertial_sensor.apply_imu_parameters(imu, "increment", gyro, accel)
+    legacy = np.random.RandomState(3)  # the kind that pyins takes
+    fixes = sim.generate_position_measurements(trajectory.iloc[::RATE_HZ].iloc[1:], GNSS_SIGMA, legacy)
+    return trajectory, imu, fixes
+
+
+def _increments(imu: Any) -> ImuSamples:
+    """The hour's increments as samples; the first row ends at time zero and is left out."""
+    t = imu.index.to_numpy()[1:]
+    columns = [np.ascontiguousarray(imu[[f"{name}_{axis}" for axis in "xyz"]].to_numpy()[1:]) for name in IMU_COLUMNS]
+    return ImuSamples(t, np.full(len(t), 1 / RATE_HZ), columns[0], columns[1])
+
+
+def _fixes(fixes: Any) -> list[Sample]:
+    """The hour's fixes as samples: position only."""
+    sigma, unknown, still = np.full(3, GNSS_SIGMA), np.full(3, np.nan), np.zeros(3)
+    return [
+        GnssSample(t, t, lat * DEG, lon * DEG, alt, still, sigma, unknown, FixType.FIX_3D, 12, hdop=1.0, vdop=1.0)
+        for t, (lat, lon, alt) in zip(fixes.index, fixes[["lat", "lon", "alt"]].to_numpy(), strict=True)
+    ]
+
+
+def _initial(trajectory: Any) -> tuple[Array, Array, Array]:
+    """Attitude, velocity and position at the start of the hour."""
+    first = trajectory.iloc[0]
+    return (
+        quat_from_euler(first.roll * DEG, first.pitch * DEG, first.heading * DEG),
+        first[["VN", "VE", "VD"]].to_numpy(dtype=float),
+        np.array([first.lat * DEG, first.lon * DEG, first.alt]),
+    )
+
+
+def _aligned(trajectory: Any) -> Ins:
+    """A 15-state INS told the true error levels, at the start of the hour."""
+    imu = ImuModel(GYRO_NOISE, ACCEL_NOISE, 60 * DEG / 3600, 0.06, GYRO_WALK, ACCEL_WALK)
+    ins = Ins(InsConfig(imu, aids=("gnss",), covariance_period=1, gnss_use_velocity=False))
+    q, v, lla = _initial(trajectory)
+    covariance = np.diag(np.repeat([2 * DEG, 0.5, 1.0], 3) ** 2)
+    ins.start(InitialState(0.0, lla[0], lla[1], lla[2], v, q, covariance))
+    return ins
+
+
+def main() -> None:
+    """Measure and print everything; ends with an error message naming any bound that was not kept."""
+    console = Console()
+    rows: list[Row] = []
+    for measure in (whole_run, strapdown_alone, ins_at_every_sample, start_up):
+        with console.status(measure.__doc__ or ""):
+            rows += measure()
+    table = Table("figure", "value", "bound", "", "detail", title="Speed")
+    for row in rows:
+        bound = f"<= {row.at_most:g}" if row.at_most is not None else f">= {row.at_least:g}"
+        verdict = "[green]kept[/]" if row.kept else "[red]MISSED[/]"
+        table.add_row(row.what, f"{row.value:.2f} {row.unit}", bound, verdict, row.detail)
+    console.print(table)
+    costs = Table("run", "wall s", "s per simulated hour", "peak MiB", title="How the cost of a run grows")
+    with console.status("runs of growing size"):
+        for case, wall, hourly, memory in growth():
+            costs.add_row(case, f"{wall:.2f}", f"{hourly:.2f}", f"{memory:.0f}")
+    console.print(costs)
+    if not HAS_PEERS:
+        console.print("The peers are not installed: `make bench` installs them and compares.")
+    missed = [row.what for row in rows if not row.kept]
+    if missed:
+        raise UserError(f"bench: bound missed by {', '.join(missed)}")

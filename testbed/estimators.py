@@ -1,0 +1,129 @@
+"""From scenario sections to estimators: what each filter is told of the sensors it is given.
+
+A filter knows the datasheets, never the errors that were drawn from them. Terms that it has no state for
+(g-sensitivity, temperature, misalignment) widen the bias that it does estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from nav.earth import STANDARD_GRAVITY
+from nav.error_model import ImuModel
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from testbed.scenario import EstimatorConfig, Scenario
+from testbed.sensors import SensorConfig, geomagnetic_field_n
+from testbed.sensors.airspeed import AirspeedConfig
+from testbed.sensors.barometer import BarometerConfig
+from testbed.sensors.gnss import GnssConfig
+from testbed.sensors.imu import ImuConfig, ImuErrors
+from testbed.sensors.magnetometer import MagnetometerConfig
+
+WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
+TURN_RATE = 0.05  # of a standard turn of this aircraft [rad/s]: scale and misalignment act on it
+METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
+FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
+PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """An estimator behind its fusion horizon: the IMU it integrates, the sensors whose samples it is handed."""
+
+    horizon: FusionHorizon
+    imu: str
+    sensors: tuple[str, ...]
+
+
+def build(scenario: Scenario) -> dict[str, Running]:
+    """The scenario's estimators by name, not yet aligned."""
+    return {config.name: _ins(config, scenario) for config in scenario.estimator}
+
+
+def imu_model(errors: ImuErrors) -> ImuModel:
+    """The datasheet as the filter's error model.
+
+    In-run instability (Gauss-Markov, sigma and tau) becomes a random walk of the same driving noise,
+    q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two cannot be told apart.
+    """
+    walk = np.hypot
+    tilt = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, errors.accel_scale)
+    turn = math.hypot(errors.gyro_misalignment, errors.gyro_nonorthogonality, errors.gyro_scale) * TURN_RATE
+    return ImuModel(
+        gyro_noise=errors.gyro_noise,
+        accel_noise=errors.accel_noise,
+        gyro_bias_sigma=math.hypot(
+            errors.gyro_turn_on,
+            errors.gyro_in_run,
+            errors.gyro_g_sensitivity * STANDARD_GRAVITY,
+            errors.gyro_temperature * WARM_UP_K,
+            turn,
+        ),
+        accel_bias_sigma=math.hypot(
+            errors.accel_turn_on, errors.accel_in_run, errors.accel_temperature * WARM_UP_K, tilt * STANDARD_GRAVITY
+        ),
+        gyro_bias_walk=float(walk(errors.gyro_random_walk, _drive(errors.gyro_in_run, errors.gyro_in_run_tau))),
+        accel_bias_walk=float(walk(errors.accel_random_walk, _drive(errors.accel_in_run, errors.accel_in_run_tau))),
+    )
+
+
+def _drive(sigma: float, tau: float) -> float:
+    return sigma * math.sqrt(2 / tau)
+
+
+def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
+    imu = scenario.sensors[config.imu]
+    assert isinstance(imu, ImuConfig)  # the scenario was checked
+    kinds: Mapping[str, SensorConfig] = {
+        section.kind: section for section in (scenario.sensors[name] for name in config.aids)
+    }
+    told: dict[str, object] = {}
+    errors = imu.errors()
+    gnss = kinds.get("gnss")
+    if isinstance(gnss, GnssConfig):
+        e = gnss.errors()
+        told |= {
+            "gnss_arm_b": tuple(e.lever_arm_b - errors.lever_arm_b),
+            "gnss_position_error_sigma": tuple(e.position_correlated_n),
+            "gnss_position_error_correlation_s": e.position_tau,
+            "gnss_velocity_error_sigma": tuple(e.velocity_correlated_n),
+            "gnss_velocity_error_correlation_s": e.velocity_tau,
+        }
+    barometer = kinds.get("barometer")
+    if isinstance(barometer, BarometerConfig):
+        b = barometer.errors()
+        told |= {
+            "barometer_sigma": b.noise * METRES_PER_PASCAL,
+            "barometer_bias_walk": _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL,
+        }
+    magnetometer = kinds.get("magnetometer")
+    if isinstance(magnetometer, MagnetometerConfig):
+        m = magnetometer.errors()
+        told |= {
+            "magnetometer_sigma": math.hypot(m.noise, m.soft_iron * FIELD_SIZE),
+            "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * PAYLOAD_CURRENT),
+        }
+    airspeed = kinds.get("airspeed")
+    if isinstance(airspeed, AirspeedConfig):
+        a = airspeed.errors()
+        told |= {
+            "airspeed_sigma": math.hypot(a.noise, 0.3),
+            "airspeed_scale_sigma": math.hypot(a.scale, a.bias / 25.0),
+            "gust_sigma": 1.0,
+            "gust_correlation_s": 8.0,
+            "sideslip_sigma": 0.5,
+        }
+    ins = Ins(
+        InsConfig(imu=imu_model(errors), aids=tuple(kinds), **told),  # type: ignore[arg-type]
+        partial(geomagnetic_field_n, date=scenario.date),
+    )
+    # Every sensor is offered: what is no aid still serves the alignment.
+    offered = tuple(name for name, section in scenario.sensors.items() if not isinstance(section, ImuConfig))
+    lag_s = max((scenario.sensors[name].latency_s for name in offered), default=0.0)  # type: ignore[union-attr]
+    return Running(FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz), config.imu, offered)
