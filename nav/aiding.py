@@ -14,7 +14,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.earth import earth_rate_n, isa_density, position_difference_n
-from nav.error_model import PHI, POS, VEL, Drive
+from nav.error_model import PHI, POS, VEL, Drive, Indices
 from nav.rotation import cross, dcm_from_quat, skew
 from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, MagnetometerSample, Sample
 
@@ -99,7 +99,7 @@ def gnss_velocity(
     lla: Array,
     x: Array,
     omega_b: Array,
-    driven: Array,
+    driven: Indices,
     arm_b: Array,
     gnss_velocity_error: int,
     antenna_v_n: Array,
@@ -161,11 +161,13 @@ def magnetometer(q_nb: Array, x: Array, magnetometer_bias: int, field_n: Array, 
 def airspeed(
     q_nb: Array, v_n: Array, lla: Array, x: Array, wind: int, gust: int, airspeed_scale: int, eas: float
 ) -> tuple[Array, Array]:
-    """Equivalent airspeed along body x [m/s]: (1 + scale) sqrt(rho / rho0) e_x . C_nb' (v - wind - gust), standard density."""
+    """Equivalent airspeed along body x [m/s]: (1 + scale) sqrt(rho / rho0) e_x . C_nb' (v - wind - gust).
+
+    The density rho is the standard atmosphere's at the estimated height.
+    """
     C_nb = dcm_from_quat(q_nb)
-    root = (1 + (x[airspeed_scale] if airspeed_scale >= 0 else 0.0)) * math.sqrt(
-        isa_density(lla[2]) / SEA_LEVEL_DENSITY
-    )
+    scale = x[airspeed_scale] if airspeed_scale >= 0 else 0.0
+    root = (1 + scale) * math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
     nu, H = _air_velocity(C_nb, v_n, x, wind, gust, 0)
     predicted = -root * nu[0]
     H *= root
@@ -173,7 +175,7 @@ def airspeed(
     half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
     H[0, POS + 2] = -predicted * half_lapse
     if airspeed_scale >= 0:
-        H[0, airspeed_scale] = predicted / (1 + x[airspeed_scale])
+        H[0, airspeed_scale] = predicted / (1 + scale)
     return nu, H
 
 

@@ -57,7 +57,7 @@ class InitialState:
 
 @dataclass(frozen=True)
 class AidSigmas:
-    """What alignment is told of the aids [1-sigma]: field in T, correlated GNSS errors in m and m/s NED, wind in m/s."""
+    """What alignment is told of the aids [1-sigma]: field in T, correlated GNSS errors in m, m/s NED; wind in m/s."""
 
     field: float
     field_bias: float
@@ -111,7 +111,7 @@ class Alignment:
         self._fields += 1
 
     def add_gnss(self, fix: GnssSample, field_n: Array | None) -> InitialState | None:
-        """Add a sound fix at the current time; ``field_n`` is the reference field there [T]. The state once it is known."""
+        """Add a sound fix at the current time, ``field_n`` the reference field there [T]; the state once it is known."""
         if not has_velocity(fix):
             self.problem = "waiting for GNSS velocity"
             return None
@@ -224,9 +224,8 @@ class Alignment:
         P[pos, pos] = np.diag(fix.sigma_position_n**2)
 
         # Every estimated bias is zero, so its error is minus the bias: hence the signs.
-        correlated = {
-            name: np.zeros((MOTION, 3)) for name in ("accel_bias", "gnss_position_error", "gnss_velocity_error")
-        }
+        names = ("accel_bias", "gnss_position_error", "gnss_velocity_error")
+        correlated = {name: np.zeros((MOTION, 3)) for name in names}
         correlated["accel_bias"][phi] = -bias2 * T * J_b
         correlated["gnss_position_error"][pos] = -np.diag(self.aids.gnss_position**2)
         correlated["gnss_velocity_error"][vel] = -np.diag(self.aids.gnss_velocity**2)

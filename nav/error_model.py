@@ -30,12 +30,16 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
 from nav.earth import OMEGA_IE, gravity, radii
 from nav.samples import Array
+
+Indices: TypeAlias = npt.NDArray[np.int64]
 
 # Where the blocks of motion begin, and how many states they have together.
 PHI, VEL, POS, MOTION = 0, 3, 6, 9
@@ -157,7 +161,7 @@ class ErrorModel:
 
 
 @njit
-def sensor_errors(errors: Array, x: Array, driven: Array) -> None:
+def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
     """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values."""
     errors[:] = 0.0
     for block in range(len(driven)):
@@ -167,7 +171,7 @@ def sensor_errors(errors: Array, x: Array, driven: Array) -> None:
 
 
 @njit
-def transition(Phi: Array, FT: Array, driven: Array, v_n: Array, lat: float, h: float, sums: Array, T: float) -> None:
+def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h: float, sums: Array, T: float) -> None:
     """Fill ``Phi`` (9, mixing), the rows of the motion in the transition over the ``T`` seconds just passed.
 
     ``sums`` (3, 3, 3) holds, over those T seconds, the integrals of C_nb, of C_nb diag(omega_b) and of C_nb diag(f_b);
@@ -222,9 +226,8 @@ def transition(Phi: Array, FT: Array, driven: Array, v_n: Array, lat: float, h: 
     FT[VEL + 2, POS] = -v_n[1] * turn_n
     FT[VEL, POS + 2] = v_n[1] * en_d_down - v_n[2] * en_e_down
     FT[VEL + 1, POS + 2] = v_n[2] * en_n_down - v_n[0] * en_d_down
-    FT[VEL + 2, POS + 2] = (
-        v_n[0] * en_e_down - v_n[1] * en_n_down + 2 * gravity(lat, h) / (math.sqrt(R_M * R_N) + h) * T
-    )
+    FT[VEL + 2, POS + 2] = v_n[0] * en_e_down - v_n[1] * en_n_down
+    FT[VEL + 2, POS + 2] += 2 * gravity(lat, h) / (math.sqrt(R_M * R_N) + h) * T
 
     # dp
     FT[POS, VEL] = FT[POS + 1, VEL + 1] = FT[POS + 2, VEL + 2] = T

@@ -19,7 +19,19 @@ from nav._jit import njit
 from nav.alignment import AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
 from nav.earth import pressure_altitude, radii, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL, Block, ErrorModel, ImuModel, markov, sensor_errors, transition
+from nav.error_model import (
+    MOTION,
+    PHI,
+    POS,
+    VEL,
+    Block,
+    ErrorModel,
+    ImuModel,
+    Indices,
+    markov,
+    sensor_errors,
+    transition,
+)
 from nav.kalman import correct, innovate, predict
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import (
@@ -43,6 +55,10 @@ TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
+
+# Of the covariance in an estimate; and the blocks that have a place of their own there
+ESTIMATE_ORDER = np.ix_(*2 * [np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]])
+REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
 
 FieldModel = Callable[[float, float, float], Array]
 
@@ -106,14 +122,9 @@ class InsConfig:
         """The error states of the aids in use."""
         blocks = []
         if "gnss" in self.aids:
-            blocks += [
-                markov(
-                    "gnss_position_error", 3, self.gnss_position_error_sigma, self.gnss_position_error_correlation_s
-                ),
-                markov(
-                    "gnss_velocity_error", 3, self.gnss_velocity_error_sigma, self.gnss_velocity_error_correlation_s
-                ),
-            ]
+            for of in ("position", "velocity"):
+                sigma = getattr(self, f"gnss_{of}_error_sigma")
+                blocks.append(markov(f"gnss_{of}_error", 3, sigma, getattr(self, f"gnss_{of}_error_correlation_s")))
         if "barometer" in self.aids:
             blocks.append(Block("barometer_bias", 1, self.barometer_bias_sigma, self.barometer_bias_walk))
         if "magnetometer" in self.aids:
@@ -149,7 +160,7 @@ class _State:
 class _Constants:
     """What the kernels need of the error model, and their scratch."""
 
-    driven: Array
+    driven: Indices
     decay_rate: Array
     variance_rate: Array
     Phi: Array
@@ -210,10 +221,8 @@ class Ins:
         self._airspeed_R = np.array([config.airspeed_sigma**2])
         self._sideslip_R = np.array([(config.sideslip_sigma or 0.0) ** 2])
         start = model.start
-        self._gnss_position_error, self._gnss_velocity_error = (
-            start("gnss_position_error"),
-            start("gnss_velocity_error"),
-        )
+        self._gnss_position_error = start("gnss_position_error")
+        self._gnss_velocity_error = start("gnss_velocity_error")
         self._barometer_bias, self._magnetometer_bias = start("barometer_bias"), start("magnetometer_bias")
         self._wind, self._gust, self._airspeed_scale = start("wind"), start("gust"), start("airspeed_scale")
 
@@ -252,7 +261,7 @@ class Ins:
         self._monitor.last_fused = initial.t
 
     def propagate(self, imu: ImuSamples) -> None:
-        """Advance by a block of increments. A non-finite or impossible one is bridged with the rates of the last sound."""
+        """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
         if len(imu) == 0:
             return
         if self._state is None:
@@ -443,9 +452,9 @@ class Ins:
                 nothing, nothing, Status.ALIGNING | bad,
             )  # fmt: skip
         self._settle(state)
-        order = np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]
-        gyro_bias, sigma_gyro = self._sum(state, "gyro_bias", "gyro_drift")
-        accel_bias, sigma_accel = self._sum(state, "accel_bias", "accel_drift")
+        sigma = np.sqrt(state.P.diagonal())
+        gyro_bias, sigma_gyro = self._with_drift(state, "gyro")
+        accel_bias, sigma_accel = self._with_drift(state, "accel")
         aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
         return Estimate(
             t=t,
@@ -456,22 +465,25 @@ class Ins:
             q_nb=state.q_nb,
             gyro_bias=gyro_bias,
             accel_bias=accel_bias,
-            covariance=state.P[np.ix_(order, order)],
+            covariance=state.P[ESTIMATE_ORDER],
             sigma_gyro_bias=sigma_gyro,
             sigma_accel_bias=sigma_accel,
             status=Status.ALIGNED | (Status.GNSS_FUSED if aided else Status.DEAD_RECKONING) | bad,
             extra={
-                block.name: (state.x[where].copy(), np.sqrt(np.diag(state.P)[where]))
-                for block in self.model.blocks[5:]
-                for where in (self.model.slices[block.name],)
+                name: (state.x[where], sigma[where])
+                for name, where in self.model.slices.items()
+                if name not in REPORTED
             },
         )
 
-    def _sum(self, state: _State, *names: str) -> tuple[Array, Array]:
-        """Value and sigma of the sum of blocks of three, those that exist."""
-        where = [self.model.slices[name] for name in names if name in self.model.slices]
-        value = np.sum([state.x[w] for w in where], axis=0)
-        variance = np.sum([np.diag(state.P[a, b]) for a in where for b in where], axis=0)
+    def _with_drift(self, state: _State, sensor: str) -> tuple[Array, Array]:
+        """Bias of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
+        bias = self.model.slices[f"{sensor}_bias"]
+        value, variance = state.x[bias], state.P.diagonal()[bias]
+        drift = self.model.slices.get(f"{sensor}_drift")
+        if drift is not None:
+            value = value + state.x[drift]
+            variance = variance + state.P.diagonal()[drift] + 2 * state.P[bias, drift].diagonal()
         return value, np.sqrt(variance)
 
 
@@ -523,7 +535,7 @@ def _inject(q_nb: Array, v_n: Array, lla: Array, x: Array, correction: Array) ->
 @njit
 def _covariance_step(
     v_n: Array, lla: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    driven: Array, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
+    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
     work: Array,
 ) -> None:  # fmt: skip
     """Take covariance and Markov states over the time in ``elapsed``, and empty the integrals."""
@@ -543,7 +555,7 @@ def _covariance_step(
 @njit
 def _propagate(
     q_nb: Array, v_n: Array, lla: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array, rates: Array,
-    driven: Array, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
+    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
     work: Array, period: int, dtheta: Array, dv: Array, dt: Array,
 ) -> int:  # fmt: skip
     """Strapdown and covariance over N increments in place; how many increments were not usable."""
