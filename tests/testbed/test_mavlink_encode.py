@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pymavlink.dialects.v20 import all as mav
@@ -259,15 +259,16 @@ def test_no_state_can_stop_the_stream(state, before, status, fix):
 
 
 @settings(max_examples=200, deadline=None)
-@given(text=st.text(max_size=300), number=st.integers(0, 10**6))
+@given(text=st.text(max_size=300) | st.text("aé", min_size=20, max_size=110), number=st.integers(0, 10**6))
+@example(text="x" * 50, number=0)
+@example(text="x" * 51, number=0)
+@example(text="x" * 100, number=2**16 - 2)
 def test_text_survives_its_chunks(text, number):
     encoder = encode.Encoder()
     chunks = [decode(encoder.frame("STATUSTEXT", chunk)) for chunk in messages.statustext("warning", text, number)]
-    # As a ground station does it: bytes of all chunks in order, up to the zero that ends the text.
-    raw = b"".join(chunk._text_raw[:50] for chunk in chunks)
-    ended, _, rest = raw.partition(b"\0")
-    assert not rest.strip(b"\0")
-    assert ended == text.replace("\0", " ").encode(errors="replace")
+    # As a ground station does it: the bytes of all chunks in order, up to the zero that ends the text.
+    raw = b"".join(chunk._text_raw.ljust(50, b"\0") for chunk in chunks)
+    assert raw.rstrip(b"\0") == text.replace("\0", " ").encode(errors="replace")
     assert [chunk.chunk_seq for chunk in chunks] == list(range(len(chunks)))
     assert {chunk.severity for chunk in chunks} == {mav.MAV_SEVERITY_WARNING}
     if len(chunks) == 1:
@@ -275,7 +276,8 @@ def test_text_survives_its_chunks(text, number):
     else:
         assert len({chunk.id for chunk in chunks}) == 1
         assert chunks[0].id > 0
-        assert b"\0" in chunks[-1]._text_raw
+        assert all(len(chunk._text_raw) == 50 for chunk in chunks[:-1])
+        assert len(chunks[-1]._text_raw) < 50
 
 
 def test_endless_text_is_cut():
