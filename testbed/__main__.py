@@ -156,9 +156,9 @@ def export(
     out: Annotated[Path | None, typer.Option(metavar="PATH", help="Where to; beside the run file.")] = None,
 ) -> None:
     """Turn a run file into CSV or MATLAB."""
-    from testbed import record
+    from testbed.export import export as write
 
-    print(record.export(run_file, format.value, out))
+    print(write(run_file, format.value, out))
 
 
 @app.command()

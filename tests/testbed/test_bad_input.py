@@ -362,7 +362,7 @@ def test_only_clean_loads_or_clean_errors(text: str, overrides: list[str]) -> No
 
 
 @pytest.mark.slow
-@settings(PATIENT, max_examples=10_000)
+@settings(PATIENT, max_examples=5_000)
 @given(DOCUMENTS, OVERRIDES)
 def test_only_clean_loads_or_clean_errors_at_length(text: str, overrides: list[str]) -> None:
     loads_or_complains(text, overrides)
