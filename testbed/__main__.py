@@ -142,7 +142,7 @@ def check(
 
 @app.command()
 def report(run_file: RunFile) -> None:
-    """Write metrics, figures and report.html again from a run file, beside it."""
+    """Write figures and report.html again from a run file, beside it."""
     from testbed import loop, metrics, record
 
     dataset = record.load(run_file)

@@ -239,14 +239,14 @@ def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "testbed", "run", "static_bench", "--realtime", "50", "--no-report"]
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as running:
         assert running.stderr is not None
-        assert running.stderr.readline().startswith(" 10 %")
+        percent = int(running.stderr.readline().split("%")[0])  # under load a line comes before the first 10 %
         running.send_signal(signal.SIGINT)
         rest = running.stderr.read()
     assert running.returncode == 130
     assert rest.splitlines()[-1] == "testbed: interrupted: the record so far is runs/static_bench/run.nc"
     assert "Traceback" not in rest
     rows = record.load(tmp_path / "runs/static_bench/run.nc")["truth"].sizes["time"]
-    assert rows >= 300
+    assert rows >= 30 * percent > 0  # at 10 Hz over 300 s
 
 
 def test_export_and_report_of_a_run(testbed: Testbed, tmp_path: Path) -> None:
