@@ -346,7 +346,9 @@ def _antenna(
         out[i, 3], out[i, 4], out[i, 5] = v_n[k, 0], v_n[k, 1], v_n[k, 2]
         if has_lever:
             arm = quat_rotate(q_nb[k], lever)
-            rate = quat_rotate(q_nb[k], omega_b[k]) - earth_rate_n(lat[k])
+            rate, earth = quat_rotate(q_nb[k], omega_b[k]), earth_rate_n(lat[k])
+            for c in range(3):
+                rate[c] -= earth[c]
             out[i, 0], out[i, 1], out[i, 2] = _displaced(lat[k], lon[k], h[k], arm)
             out[i, 3] += rate[1] * arm[2] - rate[2] * arm[1]
             out[i, 4] += rate[2] * arm[0] - rate[0] * arm[2]

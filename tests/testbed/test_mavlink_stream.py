@@ -488,6 +488,23 @@ def test_sensors(tmp_path):
     assert (wind.wind_x, wind.wind_y, wind.horiz_accuracy) == (4.0, -3.0, 0.5)
 
 
+@pytest.mark.parametrize("ticks", [8, 200])
+def test_slow_imu_reads_the_same_however_the_run_is_cut(tmp_path, ticks):
+    """An IMU at 12.5 Hz whose increments are their own time, handed over in blocks of the calls' length or a second."""
+    times = np.arange(1, 60) * 0.08 - 0.02
+
+    def block(t):
+        first = round(t * 200) // ticks * ticks / 200
+        inside = (times >= first - 1e-9) & (times < first + ticks / 200 - 1e-9)
+        own = times[inside]
+        return ImuSamples(own, np.ones(len(own)), np.repeat(own[:, None], 3, axis=1), np.ones((len(own), 3)))
+
+    heard = log_of(tmp_path, range(100), imu=block)
+    for message in heard["ATTITUDE"][2:]:
+        t = message.time_boot_ms / 1e3
+        assert message.rollspeed + 0.01 == pytest.approx(times[times <= t + 1e-9][-1], abs=1e-6)
+
+
 def test_without_sensors(tmp_path):
     heard = log_of(tmp_path, range(25), samples=lambda t: {}, imu=lambda t: None)
     assert not {"GPS_RAW_INT", "GNSS_INTEGRITY", "SCALED_PRESSURE"} & set(heard)
