@@ -42,7 +42,7 @@ SEA_LEVEL_DENSITY = 1.225  # of the standard atmosphere [kg/m^3], the reference 
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
 PX4_HOLD = 4 << 16 | 3 << 24  # main mode auto, sub mode loiter, as PX4 packs them
 TERRAIN_UNKNOWN = -10000.0  # ALTITUDE: below -1000 means unknown
-NO_ARRAY = [0.0, 0.0, 0.0, 0.0]  # quaternion fields: not supported
+NO_OFFSET = [0.0, 0.0, 0.0, 0.0]  # ATTITUDE_QUATERNION: no other attitude for display
 
 # Blocks of an estimate's covariance.
 _POSITION, _VELOCITY, _ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -169,9 +169,9 @@ class Snapshot:
         """Root of the summed variances of the first ``dimensions`` components of a block of the covariance."""
         return _root(np.diagonal(self.estimate.covariance)[block][:dimensions])
 
-    def ratio(self, word: str) -> float:
-        """Newest innovation over its gate among the aids whose name has ``word`` in it, NaN when there is none."""
-        return max((ratio for aid, ratio in self.ratios.items() if word in aid), default=math.nan)
+    def ratio(self, aid: str) -> float:
+        """Newest innovation of an aid over its gate, NaN when it is not known."""
+        return self.ratios.get(aid, math.nan)
 
 
 def known_point(estimate: Estimate) -> Point | None:
@@ -286,7 +286,7 @@ def home_position(s: Snapshot) -> Fields | None:
         "x": 0,
         "y": 0,
         "z": 0,
-        "q": NO_ARRAY,
+        "q": [1.0, 0.0, 0.0, 0.0],
         "approach_x": 0,
         "approach_y": 0,
         "approach_z": 0,
@@ -329,7 +329,7 @@ def attitude_quaternion(s: Snapshot) -> Fields | None:
         "rollspeed": p,
         "pitchspeed": q,
         "yawspeed": r,
-        "repr_offset_q": NO_ARRAY,
+        "repr_offset_q": NO_OFFSET,
     }
 
 
@@ -476,10 +476,10 @@ def estimator_status(s: Snapshot) -> Fields:
     return {
         "time_usec": s.usec,
         "flags": _solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else 0,
-        "vel_ratio": s.ratio("velocity"),
-        "pos_horiz_ratio": s.ratio("position"),
-        "pos_vert_ratio": s.ratio("baro"),
-        "mag_ratio": s.ratio("magnet"),
+        "vel_ratio": s.ratio("gnss_velocity"),
+        "pos_horiz_ratio": s.ratio("gnss_position"),
+        "pos_vert_ratio": s.ratio("barometer"),
+        "mag_ratio": s.ratio("magnetometer"),
         "hagl_ratio": math.nan,
         "tas_ratio": s.ratio("airspeed"),
         "pos_horiz_accuracy": s.sigma(_POSITION, 2),
@@ -491,10 +491,10 @@ def ekf_status_report(s: Snapshot) -> Fields:
     """The same in ArduPilot's form."""
     return {
         "flags": _solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED,
-        "velocity_variance": s.ratio("velocity"),  # "variance" means the same ratio, in ArduPilot's usage
-        "pos_horiz_variance": s.ratio("position"),
-        "pos_vert_variance": s.ratio("baro"),
-        "compass_variance": s.ratio("magnet"),
+        "velocity_variance": s.ratio("gnss_velocity"),  # "variance" means the same ratio, in ArduPilot's usage
+        "pos_horiz_variance": s.ratio("gnss_position"),
+        "pos_vert_variance": s.ratio("barometer"),
+        "compass_variance": s.ratio("magnetometer"),
         "terrain_alt_variance": math.nan,
         "airspeed_variance": s.ratio("airspeed"),
     }

@@ -88,6 +88,7 @@ class MavlinkPublisher:
         self._calls = 0
         self._long_texts = 0
         self._home: Point | None = None
+        self._imu_before: ImuSamples | None = None
         self._gyro: Array = np.full(3, math.nan)
         self._accel: Array = np.full(3, math.nan)
         self._ratios: dict[str, float] = {}
@@ -151,9 +152,11 @@ class MavlinkPublisher:
             link.send(time_us, frames)
 
     def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
-        if imu is None:
-            return
-        newest = int(imu.t.searchsorted(t + 1e-6)) - 1
-        if newest >= 0:
-            self._gyro = imu.dtheta[newest] / imu.dt[newest]
-            self._accel = imu.dv[newest] / imu.dt[newest]
+        """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""
+        for block in (imu, self._imu_before):
+            newest = int(block.t.searchsorted(t + 1e-6)) - 1 if block is not None else -1
+            if block is not None and newest >= 0:
+                self._gyro = block.dtheta[newest] / block.dt[newest]
+                self._accel = block.dv[newest] / block.dt[newest]
+                break
+        self._imu_before = imu
