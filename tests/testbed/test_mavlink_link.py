@@ -105,7 +105,10 @@ def test_log_is_stamps_and_frames_in_a_folder_that_is_made(tmp_path):
 def test_full_disk_is_an_error_with_a_name():
     log = connect("tlog:/dev/full")
     with pytest.raises(UserError, match="/dev/full: the log can't be written any further"):
-        log.send(0, [FRAME] * 1000)
+        log.send(0, [FRAME] * 10_000)  # more than is buffered
+    log.close()
+    log = connect("tlog:/dev/full")
+    log.send(0, [FRAME])
     with pytest.raises(UserError, match="/dev/full: the end of the log can't be written"):
         log.close()
 
