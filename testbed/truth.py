@@ -127,7 +127,7 @@ def _inertial(lat: float, lon: float, h: float, v_n: Array, q_nb: Array) -> tupl
     q_en = quat_en(lat, lon)
     r_e = ecef_from_geodetic(lat, lon, h)
     v_e = quat_rotate(q_en, v_n)
-    # Gravity is gravitation less the centripetal acceleration of the turning Earth.
+    # Gravity includes the centrifugal acceleration of the turning Earth, gravitation does not.
     gravitation = quat_rotate(q_en, np.array([0.0, 0.0, gravity(lat, h)]))
     for axis in range(2):
         gravitation[axis] -= OMEGA_IE**2 * r_e[axis]
@@ -137,7 +137,7 @@ def _inertial(lat: float, lon: float, h: float, v_n: Array, q_nb: Array) -> tupl
 
 @njit
 def _plus(u: Array, factor: float, v: Array) -> Array:
-    """u + factor v (3,), written out: array expressions in the loop triple its compile time."""
+    """The sum u + factor v (3,), written out: array expressions in the loop triple its compile time."""
     return np.array([u[0] + factor * v[0], u[1] + factor * v[1], u[2] + factor * v[2]])
 
 
