@@ -181,7 +181,7 @@ def _stride(n: int) -> slice:
 
 
 def _figure(rows: int, columns: int = 1, height: float = 2.1, gap: float = 0.16, **options: Any) -> tuple[Figure, Any]:
-    """A figure with margins in inches; ``gap`` is the space between rows. Fixed margins draw once, fitted ones thrice."""
+    """A figure with margins in inches, ``gap`` between rows. Fixed margins are drawn once, fitted ones thrice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -685,9 +685,9 @@ def _html_table(metrics: Mapping[str, float]) -> str:
 def _html_events(run: _Run) -> str:
     if not run.has("events"):
         return ""
-    t, severity, text = (column(run.dataset, f"events/{name}").tolist() for name in ("time", "severity", "text"))
+    columns = [list(column(run.dataset, f"events/{name}")) for name in ("time", "severity", "text")]
     body = "".join(
-        f"<tr><td>{when:.1f} s</td><td>{html.escape(how)}</td><td>{html.escape(what)}</td></tr>"
-        for when, how, what in zip(t, severity, text, strict=True)
+        f"<tr><td>{when:.1f} s</td><td>{html.escape(str(how))}</td><td>{html.escape(str(what))}</td></tr>"
+        for when, how, what in zip(*columns, strict=True)
     )
     return f"<details><summary>Events</summary><table>{body}</table></details>"
