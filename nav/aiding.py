@@ -98,7 +98,8 @@ def gnss_velocity(
     v_n: Array,
     lla: Array,
     x: Array,
-    omega_b: Array,
+    omega_measured_b: Array,
+    errors: Array,
     driven: Indices,
     arm_b: Array,
     gnss_velocity_error: int,
@@ -106,9 +107,11 @@ def gnss_velocity(
 ) -> tuple[Array, Array]:
     """Antenna velocity over ground [m/s], NED: v + C_nb (omega_ib x arm) - omega_ie x (C_nb arm) + correlated error.
 
-    ``omega_b`` is the angular rate of b relative to i with the estimated gyro errors taken out; ``driven`` tells which
-    states those are (`ErrorModel.driven`).
+    omega_ib is the measured angular rate less the estimated sensor ``errors`` (4, 3), rows as `Drive`; ``driven`` tells
+    which states those are (`ErrorModel.driven`).
     """
+    gain = 1 / (1 + errors[Drive.GYRO_SCALE])
+    omega_b = (omega_measured_b - errors[Drive.GYRO]) * gain
     C_nb = dcm_from_quat(q_nb)
     arm_n = C_nb @ arm_b
     swing_n = C_nb @ cross(omega_b, arm_b)
@@ -122,9 +125,9 @@ def gnss_velocity(
         for i in range(3):
             for j in range(3):
                 if kind == Drive.GYRO:
-                    H[i, start + j] = from_gyro[i, j]
+                    H[i, start + j] = from_gyro[i, j] * gain[j]
                 elif kind == Drive.GYRO_SCALE:
-                    H[i, start + j] = from_gyro[i, j] * omega_b[j]
+                    H[i, start + j] = from_gyro[i, j] * gain[j] * omega_b[j]
     for i in range(3):
         H[i, VEL + i] = 1.0
         if gnss_velocity_error >= 0:

@@ -111,7 +111,7 @@ class Alignment:
         self._fields += 1
 
     def add_gnss(self, fix: GnssSample, field_n: Array | None) -> InitialState | None:
-        """Add a sound fix at the current time, ``field_n`` the reference field there [T]; the state once it is known."""
+        """Add a sound fix at the current time, ``field_n`` the reference field there [T]; the state once known."""
         if not has_velocity(fix):
             self.problem = "waiting for GNSS velocity"
             return None

@@ -47,8 +47,8 @@ class FusionHorizon:
     """Feeds one estimator in time order, ``lag_s`` [s] (the largest latency of its aids) behind the newest increment.
 
     Only samples cut the increments, never the blocks they are pushed in, so the same data give the same result however
-    they are pushed. With ``coning`` raw increments are compensated (`nav.strapdown.compensate`): right for an IMU that sums
-    over intervals in which its rate changes, wrong for increments that are rotation vectors already.
+    they are pushed. With ``coning`` raw increments are compensated (`nav.strapdown.compensate`): right for an IMU that
+    sums over intervals in which its rate changes, wrong for increments that are rotation vectors already.
     """
 
     def __init__(self, estimator: Estimator, lag_s: float = 0.0, coning: bool = False) -> None:

@@ -380,10 +380,9 @@ class Ins:
         )
 
     def _gnss_velocity(self, state: _State, sample: GnssSample) -> tuple[Array, Array]:
-        omega_b = (state.rates[0] - state.errors[0]) / (1 + state.errors[2])
         return aiding.gnss_velocity(
-            state.q_nb, state.v_n, state.lla, state.x, omega_b, self.model.driven, self._arm_b,
-            self._gnss_velocity_error, sample.v_n,
+            state.q_nb, state.v_n, state.lla, state.x, state.rates[0], state.errors, self.model.driven,
+            self._arm_b, self._gnss_velocity_error, sample.v_n,
         )  # fmt: skip
 
     def _give_up_position(self, state: _State, sample: GnssSample, nu: Array, S: Array, use_velocity: bool) -> None:
