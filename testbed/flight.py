@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import jsbsim
 import numpy as np
@@ -43,6 +43,8 @@ TURBULENCE = {"light": (25.3, 3), "moderate": (50.6, 4), "severe": (76.0, 6)}
 PAYLOAD_CURRENT, SERVO_IDLE, SERVO_RUNNING = 1.5, 0.01, 0.4
 SERVO_RATE = 10.0  # normalised travel per second at full rate
 
+TRAVEL = {"aileron": 0.35, "elevator": 0.52, "rudder": 0.35}  # of the surfaces [rad], as in the autopilot's actuators
+
 # What is read on every tick: property and its unit in SI.
 STATE: Mapping[str, float] = {
     "position/lat-geod-rad": 1.0,
@@ -64,11 +66,23 @@ STATE: Mapping[str, float] = {
     "atmosphere/T-R": RANKINE,
     "propulsion/engine/engine-rpm": 1.0,
     "propulsion/total-fuel-lbs": POUND,
-    "fcs/aileron-pos-rad": 1 / 0.35,
-    "fcs/elevator-pos-rad": 1 / 0.45,
-    "fcs/rudder-pos-rad": 1 / 0.35,
+    "fcs/aileron-pos-rad": 1 / TRAVEL["aileron"],
+    "fcs/elevator-pos-rad": 1 / TRAVEL["elevator"],
+    "fcs/rudder-pos-rad": 1 / TRAVEL["rudder"],
     "fcs/throttle-pos-norm": 1.0,
 }
+# What is linearised: initial condition and rate of change, in JSBSim's units.
+LINEAR_STATE: Mapping[str, str] = {
+    "u-fps": "accelerations/udot-ft_sec2",
+    "v-fps": "accelerations/vdot-ft_sec2",
+    "w-fps": "accelerations/wdot-ft_sec2",
+    "p-rad_sec": "accelerations/pdot-rad_sec2",
+    "q-rad_sec": "accelerations/qdot-rad_sec2",
+    "r-rad_sec": "accelerations/rdot-rad_sec2",
+    "phi-rad": "velocities/phidot-rad_sec",
+    "theta-rad": "velocities/thetadot-rad_sec",
+}
+ENGINE_SETTLING_S = 3.0
 WIDTH = len(STATE)
 UNITS = np.array(list(STATE.values()))
 
@@ -285,6 +299,40 @@ class Aircraft:
         self._place(start, euler, (air_n[0] + wind[0], air_n[1] + wind[1], air_n[2]), wind)
         fdm["propulsion/tank/contents-lbs"] = fuel
 
+    def linearise(self) -> tuple[Array, Array]:
+        """State matrices of the bare airframe about the present trim in still air, SI, body axes.
+
+        Longitudinal over (u, w, q, pitch) and lateral over (v, p, r, roll); the weak coupling between them by engine
+        torque is left out.
+        """
+        fdm = self.fdm
+        for surface, travel in TRAVEL.items():
+            fdm[f"fcs/{surface}-cmd-norm"] = fdm[f"fcs/{surface}-pos-rad"] / travel
+        fdm["fcs/throttle-cmd-norm"] = fdm["fcs/throttle-pos-norm"]
+        fdm["ap/engaged"], fdm["ap/hold"] = 0.0, -1.0
+        for integrator in INTEGRATORS:
+            fdm[f"simulation/integrator/{integrator}"] = 0
+        trim = np.array([fdm[f"ic/{name}"] for name in LINEAR_STATE])
+        steps = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.02])
+        columns = []
+        for step in np.diag(steps):
+            ahead, behind = self._rates(trim + step), self._rates(trim - step)
+            columns.append((ahead - behind) / (2 * step.max()))
+        matrix = np.array(columns).T
+        longitudinal, lateral = [0, 2, 4, 7], [1, 3, 5, 6]
+        scale = np.array([FOOT, FOOT, FOOT, 1.0, 1.0, 1.0, 1.0, 1.0])
+        matrix *= scale[:, None] / scale
+        return matrix[np.ix_(longitudinal, longitudinal)], matrix[np.ix_(lateral, lateral)]
+
+    def _rates(self, state: Array) -> Array:
+        """Rates of change of `LINEAR_STATE` at ``state``, in JSBSim's units, with the engine at its steady speed."""
+        for name, value in zip(LINEAR_STATE, state, strict=True):
+            self.fdm[f"ic/{name}"] = value
+        self.fdm.run_ic()
+        for _ in range(round(ENGINE_SETTLING_S * self.rate_hz)):
+            self.fdm.run()
+        return np.array([self.fdm[name] for name in LINEAR_STATE.values()])
+
     def _place(
         self,
         start: Start,
@@ -304,6 +352,71 @@ class Aircraft:
         fdm["ic/vw-mag-fps"] = math.hypot(*wind) / FOOT
         fdm["ic/vw-dir-deg"] = math.degrees(math.atan2(wind[1], wind[0]))
         fdm.run_ic()
+
+
+class Mode(NamedTuple):
+    """One natural mode of the bare airframe: eigenvalue [1/s], and what can be seen of it.
+
+    ``period`` [s] is infinite for a mode that does not oscillate; ``time_constant`` [s] is 1/|real part|.
+    """
+
+    name: str
+    eigenvalue: complex
+    damping: float
+    period: float
+    time_constant: float
+
+
+def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[Mode]:
+    """Short period, phugoid, Dutch roll, roll and spiral at a trimmed true airspeed [m/s], loops off, controls fixed.
+
+    From central differences of JSBSim's own accelerations. The airframe is frozen at each perturbed state until the
+    engine has found its speed there, so thrust is what a fixed throttle gives.
+    """
+    aircraft = Aircraft(name, 200.0)
+    aircraft.start(_LevelStart(alt_m, airspeed), [(0.0, 0.0, 0.0)])
+    longitudinal, lateral = (np.linalg.eigvals(block) for block in aircraft.linearise())
+    phugoid, _, short, _ = sorted(longitudinal, key=lambda s: (abs(s), s.imag))
+    spiral, *dutch, roll = sorted(lateral, key=lambda s: (abs(s.real) if s.imag == 0 else 1.0, s.imag))
+    named = {
+        "short period": short,
+        "phugoid": phugoid,
+        "Dutch roll": dutch[-1],
+        "roll": roll,
+        "spiral": spiral,
+    }
+    return [_mode(name, complex(s)) for name, s in named.items()]
+
+
+def modes_table(airspeeds: Sequence[float] = (20.0, 25.0, 30.0, 35.0), alt_m: float = 800.0) -> str:
+    """The modes at several trimmed airspeeds, as a Markdown table."""
+    lines = [
+        "| airspeed m/s | mode | eigenvalue 1/s | damping | period s | time constant s |",
+        "|---|---|---|---|---|---|",
+    ]
+    for airspeed in airspeeds:
+        for mode in modes(airspeed, alt_m):
+            s, period = mode.eigenvalue, f"{mode.period:.2f}" if math.isfinite(mode.period) else "–"
+            value = f"{s.real:.3f} ± {abs(s.imag):.3f}i" if s.imag else f"{s.real:.4f}"
+            lines.append(
+                f"| {airspeed:g} | {mode.name} | {value} | {mode.damping:.2f} | {period} | {mode.time_constant:.2f} |"
+            )
+    return "\n".join(lines)
+
+
+class _LevelStart(NamedTuple):
+    """A `testbed.scenario.Start` on the equator, northwards."""
+
+    alt_m: float
+    airspeed_mps: float
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    heading_deg: float = 0.0
+
+
+def _mode(name: str, s: complex) -> Mode:
+    period = 2 * math.pi / abs(s.imag) if s.imag else math.inf
+    return Mode(name, s, -s.real / abs(s), period, 1.0 / abs(s.real))
 
 
 @njit

@@ -28,15 +28,14 @@ MAX_EAS = 36.0  # [m/s]
 MAX_BANK = math.radians(40.0)
 GENTLE_BANK = math.radians(10.0)  # adds 1.5 % to the load, allowed at any airspeed
 BANK_RESERVE = math.radians(6.0)  # kept back for tracking when a plan is checked
-CLIMB_AT_SEA_LEVEL = 3.5  # steady climb rate that leaves throttle for tracking, at STALL_EAS * 1.4 [m/s]
-MAX_DESCENT = 3.0  # [m/s]
-CEILING = 5000.0  # [m]
+CEILING = 4500.0  # [m]
 FLOOR = 30.0  # lowest altitude over the ellipsoid, which is the ground here [m]
 
 CLIMB_RATE = 2.0  # when a leg asks for an altitude but not for a rate [m/s]
 ACCELERATION = 0.4  # slope of airspeed changes [m/s^2]
 FIELD_RATE = 0.25  # decay of a small cross-track error [1/s]
 COURSE_RATE = 0.9  # decay of a course error [1/s]
+ON_PATH = 30.0  # the next leg begins on the path of the one before when it was followed this closely [m]
 TURN_BANK = math.radians(25.0)  # of a turn to a heading
 
 
@@ -57,10 +56,18 @@ def bank_limit(airspeed: float, alt_m: float) -> float:
 
 
 def climb_limit(airspeed: float, alt_m: float) -> float:
-    """Steady climb rate [m/s] that leaves some throttle for tracking; fit to the aircraft, good to 0.3 m/s."""
-    sigma = isa_density(alt_m) / SEA_LEVEL_DENSITY
-    eas = airspeed * math.sqrt(sigma)
-    return CLIMB_AT_SEA_LEVEL - 0.0006 * alt_m - 0.15 * max(0.0, eas - 27.0)
+    """Steepest steady climb [m/s] at a true airspeed that leaves a tenth of the throttle for tracking.
+
+    Fit to the aircraft, on the safe side: near the stall by its airspeed protection, above by the engine.
+    """
+    eas = airspeed * math.sqrt(isa_density(alt_m) / SEA_LEVEL_DENSITY)
+    return min(4.0, 1.5 * (eas - 19.3), 5.0 - 0.0007 * alt_m - 0.2 * (eas - 23.0))
+
+
+def descent_limit(airspeed: float, alt_m: float) -> float:
+    """Steepest steady descent [m/s] at idle that leaves the airspeed less than 1 m/s high; fit to the aircraft."""
+    to_tas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(alt_m))
+    return min(3.0, to_tas * (0.9 + 0.35 * (airspeed / to_tas - 20.5)))
 
 
 def wrap(angle: float) -> float:
@@ -139,9 +146,13 @@ class Segment(Protocol):
 
     done: bool
     course: float
+    error: float
 
     def steer(self, motion: Motion) -> float:
-        """Acceleration to the right [m/s^2]; updates ``done`` and the nominal ``course`` [rad]."""
+        """Acceleration to the right [m/s^2].
+
+        Updates ``done``, the path's ``course`` [rad] here, and ``error``, the distance to the right of the path [m].
+        """
         ...
 
 
@@ -150,7 +161,7 @@ class Line:
 
     def __init__(self, north: float, east: float, course: float, length: float) -> None:
         self.north, self.east, self.course, self.length = north, east, course, length
-        self.along = 0.0
+        self.along = self.error = 0.0
         self.done = False
         self._cos, self._sin = math.cos(course), math.sin(course)
 
@@ -159,7 +170,7 @@ class Line:
         north, east = motion.north - self.north, motion.east - self.east
         self.along = north * self._cos + east * self._sin
         self.done = self.along >= self.length
-        error = east * self._cos - north * self._sin
+        self.error = error = east * self._cos - north * self._sin
         speed = max(motion.ground_speed, 5.0)
         k = FIELD_RATE / speed
         error_rate = motion.v_east * self._cos - motion.v_north * self._sin
@@ -173,8 +184,7 @@ class Arc:
 
     def __init__(self, north: float, east: float, radius: float, side: int, sweep: float) -> None:
         self.north, self.east, self.radius, self.side, self.sweep = north, east, radius, side, sweep
-        self.swept = 0.0
-        self.course = 0.0
+        self.swept = self.course = self.error = 0.0
         self.done = False
         self._bearing: float | None = None
 
@@ -191,6 +201,7 @@ class Arc:
         speed = max(motion.ground_speed, 5.0)
         k = FIELD_RATE / speed
         error = distance - self.radius
+        self.error = -self.side * error
         off = wrap(motion.course - self.course)
         tangential, outward = speed * math.cos(off), -self.side * speed * math.sin(off)
         field = self.course + self.side * math.atan(k * error)
@@ -203,7 +214,7 @@ class HeadingTurn:
 
     def __init__(self, angle: float, bank: float) -> None:
         self.remaining = angle
-        self.course = 0.0
+        self.course = self.error = 0.0
         self.done = False
         self._limit = GRAVITY * math.tan(bank)
         self._heading: float | None = None
@@ -233,8 +244,7 @@ class _Leg(Section):
     """What the legs have in common."""
 
     def reached(self, altitude: float, airspeed: float, state: Feedback, measured_airspeed: float) -> bool:
-        """Whether the leg is over before its path is, given the commanded altitude and airspeed, the state, and its
-        airspeed without gusts."""
+        """Whether the leg is over before its path is, given the commands, the state, and its airspeed less gusts."""
         return False
 
 
@@ -515,7 +525,7 @@ def check_plan(plan: Sequence[Leg], start: Beginning, wind_mps: float = 0.0) -> 
         to_speed = getattr(leg, speed_key, None) or speed
         for height in (alt, to_alt):
             _check_speed(f"{at}.{speed_key}", to_speed, height)
-        _check_vertical(at, leg, alt, to_alt, min(speed, to_speed), max(speed, to_speed))
+        _check_vertical(at, leg, alt, to_alt, (speed, to_speed))
         radius = getattr(leg, "radius_m", None)
         if radius is not None:
             _check_radius(f"{at}.radius_m", radius, (speed, to_speed), max(alt, to_alt), wind_mps)
@@ -524,26 +534,26 @@ def check_plan(plan: Sequence[Leg], start: Beginning, wind_mps: float = 0.0) -> 
 
 def _check_speed(key: str, speed: float, alt: float) -> None:
     slowest, fastest = min_airspeed(alt), max_airspeed(alt)
-    if not slowest <= speed <= fastest:
-        limit = f"below {slowest:.1f}, too near the stall" if speed < slowest else f"above {fastest:.1f}, the maximum"
-        raise ValueError(f"{key}: {speed:g} m/s true airspeed is {limit} at {alt:g} m")
+    if speed < slowest:
+        raise ValueError(
+            f"{key}: {speed:g} m/s true airspeed at {alt:g} m is too near the stall: {slowest:.1f} is the least"
+        )
+    if speed > fastest or climb_limit(speed, alt) < 0.2:
+        raise ValueError(f"{key}: {speed:g} m/s true airspeed at {alt:g} m is more than engine and airframe stand")
 
 
-def _check_vertical(at: str, leg: Leg, alt: float, to_alt: float, slow: float, fast: float) -> None:
+def _check_vertical(at: str, leg: Leg, alt: float, to_alt: float, speeds: Sequence[float]) -> None:
     if isinstance(leg, Climb) and to_alt <= alt:
         raise ValueError(f"{at}.to_m: {to_alt:g} m is not above the {alt:g} m before it: use a descend leg")
     if isinstance(leg, Descend) and to_alt >= alt:
         raise ValueError(f"{at}.to_m: {to_alt:g} m is not below the {alt:g} m before it: use a climb leg")
-    rate = getattr(leg, "rate_mps", CLIMB_RATE)
-    key = f"{at}.rate_mps" if isinstance(leg, Climb | Descend) else f"{at}.alt_m"
-    if to_alt > alt:
-        limit = min(climb_limit(speed, height) for speed in (slow, fast) for height in (alt, to_alt))
-        if rate > limit:
-            raise ValueError(
-                f"{key}: a climb of {rate:g} m/s is too steep: {max(limit, 0):.1f} m/s can be kept up to {to_alt:g} m"
-            )
-    elif to_alt < alt and rate > MAX_DESCENT:
-        raise ValueError(f"{key}: a descent of {rate:g} m/s is too steep: {MAX_DESCENT:g} m/s is the most")
+    climbing = to_alt > alt
+    limits = [(climb_limit if climbing else descent_limit)(v, height) for v in speeds for height in (alt, to_alt)]
+    rate = getattr(leg, "rate_mps", 0.2 if to_alt != alt else 0.0)
+    if rate > min(limits):
+        key, what = ("rate_mps", f"{rate:g} m/s") if isinstance(leg, Climb | Descend) else ("alt_m", "a change")
+        way = "climb" if climbing else "descent"
+        raise ValueError(f"{at}.{key}: {what} is too much of a {way}: {max(min(limits), 0.0):.1f} m/s can be kept")
 
 
 def _check_radius(key: str, radius: float, speeds: Sequence[float], alt: float, wind: float) -> None:
@@ -624,7 +634,8 @@ class Guidance:
         self._altitude, self._airspeed = altitude, airspeed  # commands now
         self._to_altitude, self._climb_rate, self._to_airspeed = altitude, CLIMB_RATE, airspeed  # and where they go
         self._measured_airspeed = state.airspeed
-        self._course: float | None = None
+        self._course: float | None = None  # nominal, at the end of the leg before, and the distance right of its path
+        self._error = 0.0
         self._begin(state)
 
     def step(self, state: Feedback) -> Command:
@@ -684,13 +695,16 @@ class Guidance:
         here = self._plane.motion(state)
         track = math.atan2(state.v_east, state.v_north)
         course = track if self._course is None else self._course
-        self._segments = leg.segments(here, wrap(course + here.course - track))
+        course = wrap(course + here.course - track)
+        here.north, here.east = _abeam(here.north, here.east, course, -self._error)
+        self._segments = leg.segments(here, course)
         self._segment = next(self._segments)
         self._segments_flown = 0
         self._elapsed = 0.0
         self._time_limit = getattr(leg, "duration_s", None) or math.inf
         self._to_altitude = getattr(leg, "to_m", None) or getattr(leg, "alt_m", None) or self._to_altitude
-        self._climb_rate = getattr(leg, "rate_mps", CLIMB_RATE)
+        limit = climb_limit if self._to_altitude > self._altitude else descent_limit
+        self._climb_rate = getattr(leg, "rate_mps", min(CLIMB_RATE, limit(self._airspeed, state.h)))
         self._to_airspeed = getattr(leg, "to_mps", None) or getattr(leg, "airspeed_mps", None) or self._to_airspeed
 
     def _leg_over(self, state: Feedback) -> bool:
@@ -709,9 +723,10 @@ class Guidance:
         return False
 
     def _finish_leg(self, state: Feedback, motion: Motion) -> None:
-        """Keep the nominal course, as a true course here, and begin the next leg."""
+        """Keep the nominal end of the path, course as a true course here, and begin the next leg there."""
         track = math.atan2(state.v_east, state.v_north)
         self._course = wrap(self._segment.course - motion.course + track)
+        self._error = self._segment.error if abs(self._segment.error) < ON_PATH else 0.0
         self.leg += 1
         self.done = self.leg == len(self._plan)
         if not self.done:
