@@ -19,6 +19,7 @@ import json
 import logging
 import math
 import os
+import shutil
 import time
 import traceback
 import uuid
@@ -38,7 +39,7 @@ from testbed import metrics
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.scenario import FlightTruth, Scenario
-from testbed.truth import Replay, save_motion
+from testbed.truth import MotionSource, Replay, save_motion
 
 if TYPE_CHECKING:
     import xarray
@@ -51,6 +52,7 @@ CONNECT_S = 3.0  # how long a scheduler may take to answer
 WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
 POLL_S = 2.0  # how often progress is told when no run finishes
 SETUP = "setup.json"
+PRESENTATION = ("__main__.py", "progress.py", "report.py", "campaign_report.py")  # change no number
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +233,7 @@ def _setup(scenario: Scenario, vary: Mapping[str, Sequence[str]], overrides: Seq
 
 @functools.cache
 def _code() -> str:
-    """Digest of the code and the aircraft that this process would fly with."""
+    """Digest of the code and the aircraft that decide the numbers of a run in this process."""
     digest = hashlib.sha256()
     package = Path(__file__).parent
     for folder, pattern in (
@@ -240,7 +242,7 @@ def _code() -> str:
         (package / "sensors", "*.py"),
         (data_dir("aircraft"), "**/*.xml"),
     ):
-        for file in sorted(folder.glob(pattern)):
+        for file in sorted(set(folder.glob(pattern)) - {package / name for name in PRESENTATION}):
             digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
@@ -317,7 +319,19 @@ def _share_truth(folder: Path, combinations: Sequence[Combination]) -> Path | No
     if not truth.is_dir():
         source = motion(first, first.seed)
         save_motion(source, round(first.duration_s * source.rate_hz) + 1, truth)
+        try:
+            _require_control(source)
+        except UserError:
+            shutil.rmtree(truth)
+            raise
     return truth
+
+
+def _require_control(source: MotionSource) -> None:
+    """A flight that got out of control says nothing about navigation: don't let its numbers in among the others."""
+    failure = getattr(source, "failure", "")
+    if failure:
+        raise UserError(f"the flight ended early: {failure}")
 
 
 def _same_motion(one: Scenario, other: Scenario) -> bool:
@@ -449,13 +463,17 @@ def _result(future: Any, task: _Task) -> Outcome | Failure:
 
 def _fly(task: _Task) -> Outcome | Failure:
     """Fly one run. Called on a worker."""
-    from testbed.loop import run
+    from testbed.loop import motion, run
 
     try:
         if _code() != task.code:
-            raise UserError("this worker has another version of the testbed than the campaign: install the same there")
-        source = Replay(task.truth) if task.truth is not None and task.truth.is_dir() else None
+            raise UserError(
+                "this worker has other code than the campaign began with: has a file been edited meanwhile?"
+            )
+        shared = task.truth if task.truth is not None and task.truth.is_dir() else None
+        source = Replay(shared) if shared else motion(task.scenario, task.seed)
         result = run(task.scenario, seed=task.seed, source=source)
+        _require_control(source)
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
         for name in metrics.names(result.dataset):
@@ -470,13 +488,18 @@ def _fly(task: _Task) -> Outcome | Failure:
 def _history(dataset: xarray.DataTree) -> dict[str, Array]:
     """The errors of a run over time, as `Outcome` keeps them."""
     t = metrics.column(dataset, "truth/time")
-    every = max(1, round(float(dataset.attrs["record_rate_hz"]) / HISTORY_HZ))
     kept = {"time": t, "outage": metrics.inside(t, metrics.outages(dataset)).astype(float)}
     for name in metrics.names(dataset):
         errors = metrics.errors(dataset, name)
-        kept[f"{name}.error"] = errors.horizontal
-        kept[f"{name}.sigma"] = np.hypot(errors.sigma_position[:, 0], errors.sigma_position[:, 1])
-        kept[f"{name}.nees"] = np.where(errors.valid, errors.position_nees, np.nan)
+        rows = np.searchsorted(t, errors.t - metrics.SAME_TIME_S)
+        for what, values in (
+            ("error", errors.horizontal),
+            ("sigma", np.hypot(errors.sigma_position[:, 0], errors.sigma_position[:, 1])),
+            ("nees", np.where(errors.valid, errors.position_nees, np.nan)),
+        ):
+            kept[f"{name}.{what}"] = np.full(len(t), np.nan)
+            kept[f"{name}.{what}"][rows] = values
+    every = max(1, round(float(dataset.attrs["record_rate_hz"]) / HISTORY_HZ))
     return {name: values[::every].copy() for name, values in kept.items()}
 
 

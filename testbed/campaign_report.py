@@ -148,9 +148,15 @@ def nees_mean(outcomes: Sequence[Outcome], estimator: str) -> tuple[Array, npt.N
 
 
 def _stack(outcomes: Sequence[Outcome], name: str) -> Array:
-    """One row per run, as long as the shortest: a motion that ends by itself may end earlier in some gusts."""
+    """One row per run, NaN after its end: a motion that ends by itself ends sooner in some gusts than in others."""
     rows = [outcome.history[name] for outcome in outcomes]
-    return np.array([row[: min(map(len, rows))] for row in rows])
+    longest = max(map(len, rows))
+    return np.array([np.pad(row, (0, longest - len(row)), constant_values=np.nan) for row in rows])
+
+
+def _longest(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
+    """History of the run that lasted longest; all have the same times as far as they go."""
+    return max((outcome.history for outcome in outcomes), key=lambda history: len(history["time"]))
 
 
 # --- files
@@ -284,13 +290,13 @@ def _panels(result: CampaignResult, title: str, columns: int = 1) -> tuple[Figur
 
 def _outages(result: CampaignResult) -> list[tuple[float, float]]:
     """Windows without a fix, when they are the same in all runs."""
-    histories = [outcome.history for outcome in result.outcomes]
-    first = histories[0]
-    if not all(np.array_equal(h["outage"], first["outage"]) for h in histories):
+    longest = _longest(result.outcomes)
+    time, outage = longest["time"], longest["outage"]
+    if not all(np.array_equal(o.history["outage"], outage[: len(o.history["outage"])]) for o in result.outcomes):
         return []
-    edges = np.flatnonzero(np.diff(first["outage"], prepend=0.0, append=0.0))
-    times = np.append(first["time"], first["time"][-1])
-    return [(float(times[a]), float(times[b])) for a, b in edges.reshape(-1, 2)]
+    edges = np.flatnonzero(np.diff(outage, prepend=0.0, append=0.0))
+    times = np.append(time, time[-1])
+    return [(float(times[start]), float(times[end])) for start, end in edges.reshape(-1, 2)]
 
 
 def _groups(result: CampaignResult) -> Iterator[tuple[str, Any, list[Outcome]]]:
@@ -318,7 +324,7 @@ def _error_figure(result: CampaignResult) -> Figure:
             axes = row[i if apart else 0]
             error = _stack(own, f"{estimator.name}.error")
             known = np.flatnonzero(np.isfinite(error).any(axis=0))
-            time, error = own[0].history["time"][known], error[:, known]
+            time, error = _longest(own)["time"][known], error[:, known]
             low, median, high = np.nanpercentile(error, (5, 50, 95), axis=0)
             axes.plot(time, median, color=colour, linewidth=1.4, label="median" if apart else label)
             if apart:
@@ -341,7 +347,7 @@ def _nees_figure(result: CampaignResult) -> Figure:
         axes.axhline(1.0, color="0.4", linewidth=0.8)
         for label, colour, own in groups:
             mean, _ = nees_mean(own, estimator.name)
-            axes.plot(own[0].history["time"][: len(mean)], mean, color=colour, linewidth=1.0, label=label or "mean")
+            axes.plot(_longest(own)["time"], mean, color=colour, linewidth=1.0, label=label or "mean")
         axes.set_ylabel("NEES / dof")
         _logarithmic(axes)
     panels[0, 0].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))

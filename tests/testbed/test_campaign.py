@@ -198,6 +198,7 @@ def test_two_workers_give_what_one_process_gives(at_rest: Path, tmp_path: Path) 
 def command(*arguments: str) -> tuple[int, str, str]:
     """Exit code, output and messages of the command line."""
     result = CliRunner().invoke(app, ["campaign", *arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.stdout, result.stderr
 
 
@@ -278,6 +279,23 @@ def test_failing_run_is_reported_and_stops_no_other(
     result = campaign(at_rest, 3, scheduler=threads, out=out)
     assert flown.seeds == [12]
     assert not result.failures
+
+
+def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Falls(Kinematic):
+        failure = "control lost: bank -90 deg"
+
+        def advance(self, ticks: int) -> TruthBlock:
+            return super().advance(ticks if self._tick < 200 else 0)
+
+    start = SimpleNamespace(lat_deg=10.0, lon_deg=9.0, alt_m=5.0, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0)
+    monkeypatch.setattr(loop, "motion", lambda scenario, seed: Falls(start, 200.0))
+    result = campaign("u_turn", 2, scheduler=threads, out=tmp_path / "gusty")
+    assert not result.outcomes
+    assert [f.message for f in result.failures] == ["the flight ended early: control lost: bank -90 deg"] * 2
+    with pytest.raises(UserError, match="control lost"):
+        campaign("u_turn", 2, overrides=["truth.wind.turbulence=none"], scheduler=threads, out=tmp_path / "calm")
+    assert not (tmp_path / "calm" / "truth").exists()
 
 
 def dask(*arguments: str) -> subprocess.Popen[bytes]:
@@ -480,3 +498,15 @@ def test_outages_that_differ_between_runs_are_not_shaded(tmp_path: Path) -> None
     assert campaign_report._outages(result) == [(100.0, 200.0)]
     result.outcomes[1].history["outage"][150:] = 1.0
     assert campaign_report._outages(result) == []
+
+
+def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
+    result = made_up_campaign(tmp_path, [""], runs=3)
+    history = result.outcomes[0].history
+    result.outcomes[0] = Outcome(0, 0, result.outcomes[0].metrics, {k: v[:150] for k, v in history.items()})  # type: ignore[index]
+    mean, runs = campaign_report.nees_mean(result.outcomes, "ins")
+    assert (runs[149], runs[150], len(mean)) == (3, 2, 400)
+    assert np.isfinite(mean[10:]).all()
+    assert campaign_report._outages(result) == [(100.0, 200.0)]
+    drawn = campaign_report.figures(result)["errors"]
+    assert drawn.axes[0].get_lines()[0].get_xdata()[-1] == 399.0
