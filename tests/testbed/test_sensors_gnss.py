@@ -156,11 +156,12 @@ def test_jammer_zone_by_geodesic_distance(lat_deg, lon_deg):
             assert (sample.fix_type == FixType.NO_FIX) == (distance < radius)
 
 
-def test_time_to_reacquire_counts_from_leaving_the_zone():
+@pytest.mark.parametrize("denied", [(), ((2.0, 5.0),)])
+def test_time_to_reacquire_counts_from_leaving_the_zone(denied):
     truth = still(60, 1.0)
     truth.lat[:] = np.arange(60) * 10.0 / 6_335_439  # 10 m/s north from the equator
     jammers = ({"lat_deg": 0.0, "lon_deg": 0.0, "radius_m": 204.0},)
-    samples = sense(GnssConfig(rate_hz=1.0, jammers=jammers, reacquire_s=3.5), truth, rate_hz=1.0)
+    samples = sense(GnssConfig(rate_hz=1.0, jammers=jammers, denied=denied, reacquire_s=3.5), truth, rate_hz=1.0)
     assert next(s.t for s in samples if s.fix_type == FixType.FIX_3D) == 24.0  # last jammed at 20 s
 
 
