@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import synthetic_run
 from distributed import LocalCluster
 from typer.testing import CliRunner
 
-from testbed import Scenario, campaign_report, loop, run
+from testbed import Scenario, campaign_report, loop, metrics, run
 from testbed import campaign as campaigns
 from testbed.__main__ import app
 from testbed.campaign import Combination, Failure, Outcome, Progress, campaign
@@ -472,6 +473,30 @@ def test_statistics(tmp_path: Path) -> None:
     assert rms.p95 == pytest.approx(0.95 * 29)
     recovery = next(s for s in statistics.spreads if s.metric == "recovery_s")
     assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
+
+
+def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
+    dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
+    for aid in ("barometer", "gnss_position", "gnss_velocity"):
+        dataset[f"estimators/ins/innovations/{aid}"]["weight"][:] = 1.0
+    barometer = dataset["estimators/ins/innovations/barometer"]
+    for t in (30.0, 80.0, 90.2, 120.0, 190.0):  # aligned at 5 s, and settled a minute later; 120 s is in the outage
+        barometer["weight"][round(t * 5)] = 0.0
+    # From 65 s to 100 s, and from the arrival of the first fix at 150.1 s to the end.
+    assert campaigns._false_alarms_per_h(dataset, "ins") == pytest.approx(3 / (84.9 / 3600), rel=0.005)
+
+
+def test_history_is_the_error_once_a_second() -> None:
+    dataset = synthetic_run.dataset(100.0, denied=((40.0, 50.0),))
+    history = campaigns._history(dataset)
+    np.testing.assert_allclose(history["time"], np.arange(101.0))
+    np.testing.assert_array_equal(np.flatnonzero(history["outage"]), np.arange(40, 51))  # the fix comes at 50.1 s
+    assert np.flatnonzero(np.isfinite(history["ins.error"]))[0] == 5
+    assert np.flatnonzero(np.isfinite(history["ins.nees"]))[0] == 65
+    errors = metrics.errors(dataset, "ins")
+    row = int(np.argmin(np.abs(errors.t - 77.0)))
+    assert history["ins.error"][77] == pytest.approx(math.hypot(*errors.position[row, :2]))
+    assert history["ins.sigma"][77] == pytest.approx(math.sqrt(2.0))
 
 
 @pytest.mark.parametrize("values", [[""], ["0", "5"], ["0", "1", "2", "3", "4", "5", "6"]])
