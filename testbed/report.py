@@ -180,16 +180,18 @@ def _stride(n: int) -> slice:
 # -- figures --------------------------------------------------------------------------------------------------------
 
 
-def _figure(rows: int, columns: int = 1, height: float = 2.1, gap: float = 0.16, **options: Any) -> tuple[Figure, Any]:
-    """A figure with margins in inches, ``gap`` between rows. Fixed margins are drawn once, fitted ones thrice."""
+def _figure(
+    rows: int, columns: int = 1, height: float = 2.1, gap: float = 0.16, head: float = 0.45
+) -> tuple[Figure, Any]:
+    """A figure, its rows on one time axis. Margins are in inches: fixed ones are drawn once, fitted ones thrice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    tall = 1.0 + (height + gap) * rows - gap
+    tall = 0.55 + head + (height + gap) * rows - gap
     figure = Figure(figsize=(10.5, tall), dpi=100)
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False, **options)
-    figure.subplots_adjust(0.085, 0.55 / tall, 0.99, 1 - 0.45 / tall, wspace=0.2, hspace=gap / height)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=rows > 1)
+    figure.subplots_adjust(0.085, 0.55 / tall, 0.99, 1 - head / tall, wspace=0.2, hspace=gap / height)
     return figure, axes
 
 
@@ -226,6 +228,17 @@ def _legend(run: _Run, ax: Axes, **options: Any) -> None:
         )  # fmt: skip
 
 
+def _head_legend(run: _Run, figure: Figure, handles: list[Any]) -> None:
+    """A legend for the whole figure, above everything."""
+    from matplotlib.patches import Patch
+
+    if run.windows:
+        handles = [*handles, Patch(color=SHADE, label="no GNSS fix")]
+    figure.legend(
+        handles=handles, loc="upper right", ncols=6, frameon=False, fontsize=9, borderaxespad=0.2, columnspacing=1.4
+    )
+
+
 def ground_track(run: _Run) -> Figure:
     """Where it flew and where each estimator thought it was."""
     truth = run.track(run.truth("lat"), run.truth("lon"))
@@ -237,7 +250,7 @@ def ground_track(run: _Run) -> Figure:
         for name, points in believed.items()
         if np.isfinite(points).any() and max(np.nanmax(points - high), np.nanmax(low - points)) > extent / FAR
     ]
-    figure, axes = _figure(1, 2 if far else 1, height=5.6)
+    figure, axes = _figure(1, 2 if far else 1, height=5.2, head=0.6)
     for k, ax in enumerate(axes[0]):
         denied = scores.inside(run.t, run.windows)
         ax.plot(truth[:, 1], truth[:, 0], color=TRUTH, lw=1.2, label="truth")
@@ -249,18 +262,17 @@ def ground_track(run: _Run) -> Figure:
         ax.plot(truth[0, 1], truth[0, 0], "o", color=TRUTH, ms=7, label="start")
         ax.plot(truth[-1, 1], truth[-1, 0], "s", color=TRUTH, ms=7, label="end")
         ax.set_xlabel("east of the start [km]")
-        ax.set_aspect("equal", adjustable="datalim")
+        ax.set_aspect("equal", adjustable="box" if far and k == 0 else "datalim")
         _dress(ax)
     axes[0, 0].set_ylabel("north of the start [km]")
     if far:
         margin = 0.12 * extent
-        axes[0, 0].set_aspect("equal", adjustable="box")
         centre = (low + high) / 2
         half = extent / 2 + margin
         axes[0, 0].set_xlim(centre[1] - half, centre[1] + half)
         axes[0, 0].set_ylim(centre[0] - half, centre[0] + half)
         axes[0, 0].set_title("around the true track", fontsize=10)
-        axes[0, 1].set_title(f"all of it, {', '.join(far)} included", fontsize=10)
+        axes[0, 1].set_title("as far as the estimates go", fontsize=10)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper center", ncols=6, frameon=False, fontsize=9)
     return figure
@@ -268,11 +280,11 @@ def ground_track(run: _Run) -> Figure:
 
 def flight(run: _Run) -> Figure:
     """Height and speed of the flight."""
-    figure, axes = _figure(2, sharex=True, height=2.5, gap=0.35)
+    figure, axes = _figure(2, height=2.5, gap=0.35)
     top, bottom = axes[:, 0]
     top.plot(*thin(run.t, run.truth("h")), color=TRUTH, lw=1.4, label="truth")
-    for name, e in run.aligned.items():
-        top.plot(*thin(e.t, run.estimate(name, "h")), color=run.colours[name], lw=1, label=name)
+    for name in run.aligned:
+        top.plot(*thin(run.estimate(name, "time"), run.estimate(name, "h")), color=run.colours[name], lw=1, label=name)
     truth = run.truth("h")
     margin = max(0.15 * float(np.ptp(truth)), 20.0)
     top.set_ylim(truth.min() - margin, truth.max() + margin)
@@ -289,7 +301,7 @@ def flight(run: _Run) -> Figure:
 
 def comparison(run: _Run) -> Figure:
     """Size of the errors of all estimators, logarithmic so that a good one stays readable beside a bad one."""
-    figure, axes = _figure(4, sharex=True, height=1.9)
+    figure, axes = _figure(4, height=1.9)
     panels: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
         ("horizontal\nposition [m]", lambda e: e.horizontal),
         ("height [m]", lambda e: np.abs(e.position[:, 2])),
@@ -317,10 +329,10 @@ def _moving_rms(t: Array, y: Array, seconds: float) -> Array:
     if len(t) < 3:
         return np.abs(y)
     n = max(1, round(seconds / float(np.median(np.diff(t)))))
-    total = np.cumsum(np.where(np.isfinite(y), y, 0.0) ** 2)
-    total[n:] = total[n:] - total[:-n]
-    count = np.minimum(np.arange(1, len(y) + 1), n)
-    result: Array = np.where(np.isfinite(y), np.sqrt(np.maximum(total, 0.0) / count), np.nan)
+    finite = np.isfinite(y)
+    total, count = np.cumsum(np.where(finite, y, 0.0) ** 2), np.cumsum(finite)
+    total[n:], count[n:] = total[n:] - total[:-n], count[n:] - count[:-n]
+    result: Array = np.where(finite, np.sqrt(np.maximum(total, 0.0) / np.maximum(count, 1)), np.nan)
     return result
 
 
@@ -349,7 +361,7 @@ def _error_panels(run: _Run, axes: Any, name: str, t: Array, error: Array, sigma
         ax.set_ylabel(labels[k])
 
 
-def _focus(axes: Any, e: Errors, error: Array, sigma: Array, mask: scores.Mask) -> None:
+def _focus(axes: Any, error: Array, sigma: Array, mask: scores.Mask) -> None:
     """Symmetric limits that hold errors and bounds of the rows in ``mask``."""
     for k, ax in enumerate(axes):
         values = np.concatenate([np.abs(error[mask, k]), np.minimum(3 * sigma[mask, k], 1e12)])
@@ -365,12 +377,14 @@ def position_errors(run: _Run, name: str) -> Figure:
     with_gnss = e.valid & ~_near_outage(run, e)
     largest = [float(np.abs(e.position[m]).max()) if m.any() else 0.0 for m in (e.valid, with_gnss)]
     two = with_gnss.any() and largest[0] > FAR * largest[1]
-    figure, axes = _figure(3, 2 if two else 1, sharex=True)
-    for k in range(axes.shape[1]):
-        _error_panels(run, axes[:, k], name, e.t, e.position, e.sigma_position, ("north [m]", "east [m]", "down [m]"))
-    _focus(axes[:, 0], e, e.position, e.sigma_position, e.valid if e.valid.any() else _any_row(e))
+    figure, axes = _figure(3, 2 if two else 1)
+    masks = [e.valid if e.valid.any() else _any_row(e), *([with_gnss] if two else [])]
+    for k, mask in enumerate(masks):
+        scale, unit = (1e-3, "km") if np.abs(e.position[mask]).max(initial=0.0) > 5000 else (1.0, "m")
+        error, sigma = scale * e.position, scale * e.sigma_position
+        _error_panels(run, axes[:, k], name, e.t, error, sigma, [f"{d} [{unit}]" for d in ("north", "east", "down")])
+        _focus(axes[:, k], error, sigma, mask)
     if two:
-        _focus(axes[:, 1], e, e.position, e.sigma_position, with_gnss)
         axes[0, 1].set_title("the same, closer", fontsize=10, loc="left")
     _against_time(run, axes)
     _legend(run, axes[0, -1])
@@ -388,14 +402,14 @@ def _any_row(e: Errors) -> scores.Mask:
 def motion_errors(run: _Run, name: str) -> Figure:
     """Velocity and attitude error with ±3 sigma."""
     e = run.errors[name]
-    figure, axes = _figure(3, 2, sharex=True)
+    figure, axes = _figure(3, 2)
     mask = e.valid if e.valid.any() else _any_row(e)
     _error_panels(run, axes[:, 0], name, e.t, e.velocity, e.sigma_velocity, ("north [m/s]", "east [m/s]", "down [m/s]"))
     degrees, sigma = np.rad2deg(e.attitude), np.rad2deg(e.sigma_attitude)
     labels = ("about north [deg]", "about east [deg]", "about down [deg]")
     _error_panels(run, axes[:, 1], name, e.t, degrees, sigma, labels)
-    _focus(axes[:, 0], e, e.velocity, e.sigma_velocity, mask)
-    _focus(axes[:, 1], e, degrees, sigma, mask)
+    _focus(axes[:, 0], e.velocity, e.sigma_velocity, mask)
+    _focus(axes[:, 1], degrees, sigma, mask)
     axes[0, 0].set_title("velocity", fontsize=10, loc="left")
     axes[0, 1].set_title("attitude", fontsize=10, loc="left")
     _against_time(run, axes)
@@ -405,15 +419,17 @@ def motion_errors(run: _Run, name: str) -> Figure:
 
 def attitude(run: _Run) -> Figure:
     """Roll, pitch and heading, true and estimated."""
-    figure, axes = _figure(3, sharex=True)
+    figure, axes = _figure(3)
     curves = [("truth", TRUTH, run.t, _euler_deg(run.truth("q_nb")), 1.6)]
-    curves += [(n, run.colours[n], e.t, _euler_deg(run.estimate(n, "q_nb")), 0.9) for n, e in run.aligned.items()]
+    curves += [
+        (n, run.colours[n], run.estimate(n, "time"), _euler_deg(run.estimate(n, "q_nb")), 0.9) for n in run.aligned
+    ]
     for k, (ax, label) in enumerate(zip(axes[:, 0], ("roll [deg]", "pitch [deg]", "heading [deg]"), strict=True)):
-        for name, colour, t, euler, width in curves:
+        for rank, (name, colour, t, euler, width) in enumerate(curves):  # truth below, the first estimator on top
             some = _stride(len(t))
             y = euler[some, k].copy()
             y[1:][np.abs(np.diff(y)) > 180] = np.nan  # a turn through north or south is no line across the axes
-            ax.plot(t[some], y, color=colour, lw=width, label=name)
+            ax.plot(t[some], y, color=colour, lw=width, label=name, zorder=3 - 0.1 * rank if rank else 2)
         ax.set_ylabel(label)
     axes[2, 0].set_yticks(range(0, 361, 90))
     axes[2, 0].set_ylim(-5, 365)
@@ -434,7 +450,7 @@ def _euler_deg(q: Array) -> Array:
 
 def biases(run: _Run, name: str) -> Figure:
     """Estimated biases with ±3 sigma, over what the IMU's error really was where the record tells."""
-    figure, axes = _figure(3, 2, sharex=True)
+    figure, axes = _figure(3, 2, head=0.75)
     real = _imu_error(run)
     scale = (np.rad2deg(3600.0), 1000 / earth.STANDARD_GRAVITY)
     t = run.estimate(name, "time")
@@ -453,8 +469,7 @@ def biases(run: _Run, name: str) -> Figure:
     axes[0, 0].set_title("gyro bias", fontsize=10, loc="left")
     axes[0, 1].set_title("accelerometer bias", fontsize=10, loc="left")
     _against_time(run, axes)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=4, frameon=False, fontsize=9)
+    _head_legend(run, figure, axes[0, 0].get_legend_handles_labels()[0])
     return figure
 
 
@@ -495,7 +510,9 @@ def innovations(run: _Run, name: str) -> Figure | None:
     aids = [aid for aid in scores.aids(run.dataset, name) if run.has(f"estimators/{name}/innovations/{aid}/innovation")]
     if not aids:
         return None
-    figure, axes = _figure(len(aids), sharex=True, height=1.5, gap=0.32)
+    from matplotlib.lines import Line2D
+
+    figure, axes = _figure(len(aids), height=1.5, gap=0.32, head=0.75)
     for ax, aid in zip(axes[:, 0], aids, strict=True):
         own = f"innovations/{aid}"
         t, weight = run.estimate(name, f"{own}/sample_time"), run.estimate(name, f"{own}/weight")
@@ -521,27 +538,18 @@ def innovations(run: _Run, name: str) -> Figure | None:
             ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False, fontsize=9, markerscale=5)
     figure.supylabel("innovation / its sigma", fontsize=10)
     _against_time(run, axes)
-    _key_to_innovations(run, figure)
+    gate_key = Line2D([], [], color="#444444", lw=0.8, ls="--", label="gate")
+    refused_key = Line2D(
+        [], [], color=REFUSED, marker="x", ls="", ms=5, label="refused (beyond the axes: at their edge)"
+    )
+    _head_legend(run, figure, [gate_key, refused_key])
     return figure
-
-
-def _key_to_innovations(run: _Run, figure: Figure) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Any] = [
-        Line2D([], [], color="#444444", lw=0.8, ls="--", label="gate"),
-        Line2D([], [], color=REFUSED, marker="x", ls="", ms=5, label="refused (beyond the axes: at their edge)"),
-    ]
-    if run.windows:
-        handles.append(Patch(color=SHADE, label="no GNSS fix"))
-    figure.legend(handles=handles, loc="upper right", ncols=3, frameon=False, fontsize=9)
 
 
 def consistency(run: _Run) -> Figure:
     """NEES per degree of freedom of every estimator with the 95 % bounds of a single run."""
-    figure, axes = _figure(3, sharex=True, height=2.0, gap=0.32)
-    low, high = chi2.ppf([0.025, 0.975], 3) / 3
+    figure, axes = _figure(3, height=2.0, gap=0.32)
+    low, high = (float(chi2.ppf(p, 3)) / 3 for p in (0.025, 0.975))
     for ax, what in zip(axes[:, 0], ("position", "velocity", "attitude"), strict=True):
         values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in run.aligned.items()}
         ax.axhspan(low, high, color="#009E73", alpha=0.15, lw=0, label="95 % of a consistent filter")
@@ -568,7 +576,7 @@ def wind(run: _Run) -> Figure | None:
     names = [name for name in run.aligned if run.has(f"estimators/{name}/wind")]
     if not names:
         return None
-    figure, axes = _figure(2, sharex=True, height=2.2)
+    figure, axes = _figure(2, height=2.2)
     for k, (ax, label) in enumerate(zip(axes[:, 0], ("from south [m/s]", "from west [m/s]"), strict=True)):
         ax.plot(*thin(run.t, run.truth("wind_n")[:, k]), color="#999999", lw=0.6, label="truth, turbulence included")
         for name in names:
@@ -685,7 +693,7 @@ def _html_table(metrics: Mapping[str, float]) -> str:
 def _html_events(run: _Run) -> str:
     if not run.has("events"):
         return ""
-    columns = [list(column(run.dataset, f"events/{name}")) for name in ("time", "severity", "text")]
+    columns = [np.atleast_1d(column(run.dataset, f"events/{name}")) for name in ("time", "severity", "text")]
     body = "".join(
         f"<tr><td>{when:.1f} s</td><td>{html.escape(str(how))}</td><td>{html.escape(str(what))}</td></tr>"
         for when, how, what in zip(*columns, strict=True)
