@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -62,15 +64,50 @@ class FusionHorizon:
         self._queue: list[tuple[float, str, int, Sample]] = []
         self._count = 0
 
-    def push(self, imu: ImuSamples, samples: list[Sample] | None = None) -> list[UpdateReport]:
+    def push(self, imu: ImuSamples, samples: Sequence[Sample] = ()) -> list[UpdateReport]:
         """Add consecutive increments and the samples that arrived with them; what became of the samples applied now."""
-        for sample in samples or ():
+        return self.track(imu, samples, ())[0]
+
+    def track(
+        self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]
+    ) -> tuple[list[UpdateReport], list[Estimate]]:
+        """`push`, and the estimates at ``times`` [s] on the way, ascending and within the increments.
+
+        Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``.
+        """
+        for sample in samples:
             heapq.heappush(self._queue, (sample.t, sample.sensor, self._count, sample))
             self._count += 1
         if len(imu):
             self._append(imu)
         reports: list[UpdateReport] = []
-        horizon = (float(self._imu.t[-1]) if len(self._imu) else self._t) - self.lag_s
+        estimates = []
+        for t in times:
+            self._use(t - self.lag_s, reports)
+            estimates.append(self.estimate_at(t))
+        self._use((float(self._imu.t[-1]) if len(self._imu) else self._t) - self.lag_s, reports)
+        return reports, estimates
+
+    def estimate_at(self, t: float) -> Estimate:
+        """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
+
+        Raises ValueError when ``t`` is past the newest increment or before what the estimator has already used.
+        """
+        if abs(t - self._t) <= COINCIDENT or self._t == -math.inf:
+            estimate = self.estimator.estimate()
+            return replace(estimate, t=t) if math.isnan(estimate.t) else estimate  # it may have seen nothing yet
+        if t < self._t:
+            raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
+        stop = self._row_after(t)
+        front = _cut(self._imu, self._next, stop)
+        if len(front) == 0 or front.t[-1] < t - COINCIDENT:
+            if stop == len(self._imu):
+                raise ValueError(f"no inertial samples up to {t} s")
+            front = _join(front, self._part(stop, t))
+        return self.estimator.predict(front)
+
+    def _use(self, horizon: float, reports: list[UpdateReport]) -> None:
+        """Bring the estimator to ``horizon`` with every sample up to there."""
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
             t, _, _, sample = heapq.heappop(self._queue)
             if not self.estimator.accepts(sample):
@@ -81,24 +118,6 @@ class FusionHorizon:
             self._advance(t)
             reports += self.estimator.update(sample)
         self._propagate_to(horizon)
-        return reports
-
-    def estimate_at(self, t: float) -> Estimate:
-        """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
-
-        Raises ValueError when ``t`` is past the newest increment or before what the estimator has already used.
-        """
-        if abs(t - self._t) <= COINCIDENT or self._t == -math.inf:
-            return self.estimator.estimate()
-        if t < self._t:
-            raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
-        stop = self._row_after(t)
-        front = _cut(self._imu, self._next, stop)
-        if len(front) == 0 or front.t[-1] < t - COINCIDENT:
-            if stop == len(self._imu):
-                raise ValueError(f"no inertial samples up to {t} s")
-            front = _join(front, self._part(stop, t))
-        return self.estimator.predict(front)
 
     def _append(self, imu: ImuSamples) -> None:
         if self._t == -math.inf:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,8 +55,11 @@ class Publisher(Protocol):
         samples: Mapping[str, Sample],
         imu: ImuSamples | None,
         others: Sequence[tuple[str, Estimate]],
+        reports: Sequence[UpdateReport],
     ) -> None:
-        """One row of truth, the first estimator's estimate, the newest sample of each sensor, the other estimates."""
+        """One row of truth; the first estimator's estimate and its reports since the last call; the newest sample of
+        each sensor; increments up to the row or beyond; the other estimators' estimates.
+        """
         ...
 
     def event(self, t: float, severity: str, text: str) -> None:
@@ -146,23 +150,6 @@ class _Latest:
         return arrived
 
 
-def _push(horizon, imu, samples, times):
-    import numpy as np
-
-    reports, out, a = [], [], 0
-    for t in times:
-        b = int(np.searchsorted(imu.t, t + 1e-6, side="right"))
-        reports += horizon.push(
-            ImuSamples(imu.t[a:b], imu.dt[a:b], imu.dtheta[a:b], imu.dv[a:b]), samples if a == 0 else []
-        )
-        if a == 0:
-            samples = []
-        out.append(horizon.estimate_at(t))
-        a = b
-    reports += horizon.push(ImuSamples(imu.t[a:], imu.dt[a:], imu.dtheta[a:], imu.dv[a:]), samples)
-    return reports, out
-
-
 def run(
     scenario: Scenario,
     *,
@@ -186,17 +173,20 @@ def run(
     source = motion(scenario, seed) if source is None else source
     rate_hz = source.rate_hz
     site = scenario.site()
-    inertial = {}
-    aiding = {}
+    inertial: dict[str, sensors.Imu] = {}
+    aiding: dict[str, sensors.AidingSensor] = {}
     for name, config in scenario.sensors.items():
         sensor = sensors.build(name, config, rate_hz, seed, site)
-        (inertial if isinstance(sensor, sensors.Imu) else aiding)[name] = sensor
+        if isinstance(sensor, sensors.Imu):
+            inertial[name] = sensor
+        else:
+            aiding[name] = sensor
     filters = estimators.build(scenario)
     plan = [leg.leg for leg in scenario.plan]
 
     ticks = round(scenario.duration_s * rate_hz) + 1
     record_every = round(rate_hz / scenario.record.rate_hz)
-    publish_every = round(min(link.period_s for link in links) * rate_hz) if links else 0
+    publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
     chunk = publish_every if realtime and links else round(BATCH_S * rate_hz)
     pacer = Pacer(realtime) if realtime else None
     recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
@@ -208,6 +198,8 @@ def run(
 
     watch = _EventWatch(emit)
     latest = _Latest()
+    shown = next(iter(filters), None)  # the estimator that the links show first
+    unshown: deque[UpdateReport] = deque()
     truth_s = 0.0
     try:
         tick = 0
@@ -229,10 +221,11 @@ def run(
             times = [float(block.t[k]) for k in outputs]
             estimates: dict[str, list[Estimate]] = {}
             for name, one in filters.items():
-                reports, estimates[name] = _push(
-                    one.horizon, imu[one.imu], [s for aid in one.sensors for s in samples[aid]], times
-                )
+                handed = [sample for aid in one.sensors for sample in samples[aid]]
+                reports, estimates[name] = one.horizon.track(imu[one.imu], handed, times)
                 recorder.reports(name, reports)
+                if links and name == shown:
+                    unshown.extend(reports)
                 for report in reports:
                     watch.report(name, report)
             recorder.truth(block)
@@ -249,10 +242,13 @@ def run(
                     watch.estimate(name, estimate)
                     if (tick + k) % record_every == 0:
                         recorder.estimate(name, estimate)
-                if publish_every and (tick + k) % publish_every == 0 and now:
-                    increments = next(iter(imu.values()), None)
+                if publish_every and (tick + k) % publish_every == 0 and shown is not None:
+                    increments = imu[filters[shown].imu]
+                    due = []
+                    while unshown and unshown[0].t + filters[shown].horizon.lag_s <= times[i]:
+                        due.append(unshown.popleft())
                     for link in links:
-                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, increments, now[1:])
+                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, increments, now[1:], due)
             tick += len(block)
             t = float(block.t[-1])
             if pacer is not None:
