@@ -214,17 +214,17 @@ def _dress(ax: Axes) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(run: _Run, ax: Axes, **options: Any) -> None:
+def _legend(run: _Run, ax: Axes, shade: bool = True) -> None:
     """A legend with the shading explained, above the axes so that it hides nothing."""
     from matplotlib.patches import Patch
 
     handles, labels = ax.get_legend_handles_labels()
-    if run.windows and options.pop("shade", True):
+    if run.windows and shade:
         handles, labels = [*handles, Patch(color=SHADE)], [*labels, "no GNSS fix"]
     if handles:
         ax.legend(
             handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=6, frameon=False, fontsize=9,
-            borderaxespad=0.2, handlelength=1.6, columnspacing=1.4, **options,
+            borderaxespad=0.2, handlelength=1.6, columnspacing=1.4,
         )  # fmt: skip
 
 
