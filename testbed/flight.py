@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import jsbsim
 import numpy as np
@@ -15,12 +15,11 @@ from nav.rotation import quat_conjugate, quat_from_euler, quat_rotate
 from nav.samples import Array
 from testbed.data import data_dir
 from testbed.guidance import Feedback, Guidance, Leg, min_airspeed
+from testbed.scenario import FlightTruth, Start, Wind
 from testbed.truth import TruthBlock, increments
 
-if TYPE_CHECKING:
-    from testbed.scenario import FlightTruth, Start, Wind
-
-Winds: TypeAlias = Sequence[tuple[float, float, float]]
+Winds: TypeAlias = Sequence[tuple[float, float, float]]  # altitude [m], velocity of the air north, east [m/s]
+CALM: Winds = [(0.0, 0.0, 0.0)]
 
 FOOT = 0.3048  # [m]
 POUND = 0.45359237  # [kg]
@@ -215,12 +214,17 @@ class Aircraft:
         for integrator, number in INTEGRATORS.items():
             self.fdm[f"simulation/integrator/{integrator}"] = number
         self.rate_hz = rate_hz
-        manager = self.fdm.get_property_manager()
-        self._read = [manager.get_node(name).get_double_value for name in STATE]
+        self._read = [self._node(name).get_double_value for name in STATE]
         self._command = [
-            manager.get_node(f"ap/{name}").set_double_value
+            self._node(f"ap/{name}").set_double_value
             for name in ("bank-cmd-rad", "altitude-cmd-m", "climb-cmd-mps", "airspeed-cmd-mps")
         ]
+
+    def _node(self, name: str) -> jsbsim.FGPropertyNode:
+        node = self.fdm.get_property_manager().get_node(name)
+        if node is None:
+            raise KeyError(f"the aircraft has no property {name}")
+        return node
 
     def read(self) -> list[float]:
         """One row of `STATE`, in JSBSim's units."""
@@ -296,8 +300,8 @@ class Aircraft:
         euler = (fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], math.radians(start.heading_deg))
         air_b = np.array([fdm[f"velocities/{axis}-aero-fps"] for axis in "uvw"]) * FOOT
         air_n = quat_rotate(quat_from_euler(*euler), air_b)
-        self._place(start, euler, (air_n[0] + wind[0], air_n[1] + wind[1], air_n[2]), wind)
         fdm["propulsion/tank/contents-lbs"] = fuel
+        self._place(start, euler, (air_n[0] + wind[0], air_n[1] + wind[1], air_n[2]), wind)
 
     def linearise(self) -> tuple[Array, Array]:
         """State matrices of the bare airframe about the present trim in still air, SI, body axes.
@@ -374,7 +378,7 @@ def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[M
     engine has found its speed there, so thrust is what a fixed throttle gives.
     """
     aircraft = Aircraft(name, 200.0)
-    aircraft.start(_LevelStart(alt_m, airspeed), [(0.0, 0.0, 0.0)])
+    aircraft.start(Start(lat_deg=0, lon_deg=0, alt_m=alt_m, heading_deg=0, airspeed_mps=airspeed), CALM)
     longitudinal, lateral = (np.linalg.eigvals(block) for block in aircraft.linearise())
     phugoid, _, short, _ = sorted(longitudinal, key=lambda s: (abs(s), s.imag))
     spiral, *dutch, roll = sorted(lateral, key=lambda s: (abs(s.real) if s.imag == 0 else 1.0, s.imag))
@@ -404,16 +408,6 @@ def modes_table(airspeeds: Sequence[float] = (20.0, 25.0, 30.0, 35.0), alt_m: fl
     return "\n".join(lines)
 
 
-class _LevelStart(NamedTuple):
-    """A `testbed.scenario.Start` on the equator, northwards."""
-
-    alt_m: float
-    airspeed_mps: float
-    lat_deg: float = 0.0
-    lon_deg: float = 0.0
-    heading_deg: float = 0.0
-
-
 def _mode(name: str, s: complex) -> Mode:
     period = 2 * math.pi / abs(s.imag) if s.imag else math.inf
     return Mode(name, s, -s.real / abs(s), period, 1.0 / abs(s.real))
@@ -440,7 +434,11 @@ def _v_n(speed: float, heading_deg: float) -> tuple[float, float, float]:
 def _winds(wind: Wind) -> Winds:
     """Rows of altitude [m] and velocity of the air north, east [m/s]."""
     profile = wind.profile or [(0.0, wind.from_deg, wind.speed_mps)]
-    return [(alt, *(-component for component in _v_n(speed, from_deg)[:2])) for alt, from_deg, speed in profile]
+    rows = []
+    for alt, from_deg, speed in profile:
+        north, east, _ = _v_n(speed, from_deg)
+        rows.append((alt, -north, -east))
+    return rows
 
 
 def _wind_at(winds: Winds, alt: float) -> tuple[float, float]:

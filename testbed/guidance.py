@@ -61,13 +61,13 @@ def climb_limit(airspeed: float, alt_m: float) -> float:
     Fit to the aircraft, on the safe side: near the stall by its airspeed protection, above by the engine.
     """
     eas = airspeed * math.sqrt(isa_density(alt_m) / SEA_LEVEL_DENSITY)
-    return min(4.0, 1.5 * (eas - 19.3), 5.0 - 0.0007 * alt_m - 0.2 * (eas - 23.0))
+    return min(4.0, eas - 18.8, 5.0 - 0.0007 * alt_m - 0.2 * (eas - 23.0))
 
 
 def descent_limit(airspeed: float, alt_m: float) -> float:
     """Steepest steady descent [m/s] at idle that leaves the airspeed less than 1 m/s high; fit to the aircraft."""
     to_tas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(alt_m))
-    return min(3.0, to_tas * (0.9 + 0.35 * (airspeed / to_tas - 20.5)))
+    return min(3.0, to_tas * (0.5 + 0.33 * (airspeed / to_tas - 20.5)))
 
 
 def wrap(angle: float) -> float:

@@ -244,7 +244,7 @@ def test_activity_says_leg_and_progress() -> None:
 
 
 def test_bank_never_passes_the_limit_of_the_airspeed() -> None:
-    plan = legs({"leg": "turn", "by_deg": 180}, {"leg": "loiter", "radius_m": 70, "turns": 2})
+    plan = legs({"leg": "turn", "by_deg": 180}, {"leg": "loiter", "radius_m": 75, "turns": 2})
     track = PointMass(plan, speed=21.5).fly()
     assert np.abs(track[:, 5]).max() <= bank_limit(21.5, 800.0) + 1e-9
     assert bank_limit(40.0, 0.0) == MAX_BANK
