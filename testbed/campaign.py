@@ -52,6 +52,8 @@ CONNECT_S = 3.0  # how long a scheduler may take to answer
 WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
 POLL_S = 2.0  # how often progress is told when no run finishes
 SETUP = "setup.json"
+# An interrupt from the terminal reaches the workers too, where it would end in a traceback: this process stops them.
+IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 PRESENTATION = ("__main__.py", "progress.py", "report.py", "campaign_report.py")  # change no number
 
 
@@ -357,6 +359,8 @@ def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
     import dask
     from distributed import Client, LocalCluster
 
+    # A scheduler that goes away is told of in a line; the client would add its traceback.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if scheduler is not None:
         _require_scheduler(scheduler)
         with Client(scheduler, set_as_default=False) as client, client.as_current():
@@ -380,6 +384,7 @@ def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
             dashboard_address=None,
             scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # or it would take port 8787 all the same
             memory_limit=None,
+            preload=[IGNORE_INTERRUPT],
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
