@@ -35,6 +35,7 @@ REST_SPEED = 0.5  # slower than this is standing [m/s]
 COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
 HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
+SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
 STEP = 1e-6  # of each input, relative, in the differences
 
 
@@ -96,14 +97,15 @@ class Alignment:
         self._q_0b = np.array([1.0, 0.0, 0.0, 0.0])  # body axes now to those at the first fix
         self._angle_0, self._dv_0, self._field_0 = np.zeros(3), np.zeros(3), np.zeros(3)
         self._fields = 0
-        self._omega_b = np.zeros(3)
+        self._omega_first_b, self._omega_b = np.full(3, np.nan), np.zeros(3)
 
     def propagate(self, imu: ImuSamples) -> None:
         """Add a block of increments."""
         if self._first is not None and len(imu):
             _accumulate(self._q_0b, self._angle_0, self._dv_0, imu.dtheta, imu.dv)
-            if imu.dt[-1] > 0:
-                self._omega_b = imu.dtheta[-1] / imu.dt[-1]
+            self._omega_b = imu.dtheta[-1] / imu.dt[-1]
+            if math.isnan(self._omega_first_b[0]):
+                self._omega_first_b = imu.dtheta[0] / imu.dt[0]
 
     def add_field(self, field_b: Array) -> None:
         """Add a magnetic field [T], body axes, at the current time."""
@@ -126,9 +128,11 @@ class Alignment:
         C_b0 = np.ascontiguousarray(dcm_from_quat(self._q_0b).T)
         dv_b = C_b0 @ self._dv_0
         dv_n = self._specific_force_n(first, fix, T)
+        swing_b = cross(self._omega_b, self.arm_b) - C_b0 @ cross(self._omega_first_b, self.arm_b)
         sigma_dv = math.sqrt(
             (self.imu.accel_bias_sigma**2 + self.imu.accel_drift_sigma**2) * T**2
             + float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2))
+            + float(swing_b @ swing_b)
         )
         mismatch = abs(np.linalg.norm(dv_b) - np.linalg.norm(dv_n))
         if mismatch > 5 * sigma_dv:
@@ -140,6 +144,10 @@ class Alignment:
             if np.linalg.norm(fix.v_n) > REST_SPEED:
                 self._restart(fix)
             return None
+        # The antenna swings about the IMU: the velocity change of the IMU needs the attitude it serves to find.
+        for _ in range(SWING_ROUNDS):
+            C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
+            dv_n = self._specific_force_n(first, fix, T) - C_nb @ swing_b
         self.problem = ""
         return self._state(fix, T, dv_b, dv_n, heading)
 

@@ -14,6 +14,7 @@ from nav.samples import Array, GnssSample
 
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
 TURN_ERROR = 0.6
+JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
 
 
 @dataclass(frozen=True)
@@ -97,5 +98,5 @@ class GnssMonitor:
         moved = position_difference_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
         jump = moved - 0.5 * dt * (v0_n + v_n)
         variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
-        variance += (TURN_ERROR * dt**3) ** 2
+        variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
         return float(np.sum(jump * jump / variance)) <= self.consistency_gate

@@ -58,6 +58,7 @@ FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up
 
 # Of the covariance in an estimate; and the blocks that have a place of their own there
 ESTIMATE_ORDER = np.ix_(*2 * [np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]])
+ATTITUDE = (np.arange(6, 9), np.arange(6, 9))  # the diagonal of its attitude
 REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
 
 FieldModel = Callable[[float, float, float], Array]
@@ -72,6 +73,7 @@ class InsConfig:
 
     imu: ImuModel
     aids: tuple[str, ...] = AIDS
+    mounting_sigma: float = 0.0  # between the axes of the IMU, whose attitude is found, and of the body, reported [rad]
     covariance_period: int = 10  # IMU samples per covariance step; 50 ms and less lose nothing on an aircraft
 
     # GNSS: the receiver's own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)
@@ -454,6 +456,8 @@ class Ins:
         sigma = np.sqrt(state.P.diagonal())
         gyro_bias, sigma_gyro = self._with_drift(state, "gyro")
         accel_bias, sigma_accel = self._with_drift(state, "accel")
+        covariance = state.P[ESTIMATE_ORDER]
+        covariance[ATTITUDE] += self.config.mounting_sigma**2
         aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
         return Estimate(
             t=t,
@@ -464,7 +468,7 @@ class Ins:
             q_nb=state.q_nb,
             gyro_bias=gyro_bias,
             accel_bias=accel_bias,
-            covariance=state.P[ESTIMATE_ORDER],
+            covariance=covariance,
             sigma_gyro_bias=sigma_gyro,
             sigma_accel_bias=sigma_accel,
             status=Status.ALIGNED | (Status.GNSS_FUSED if aided else Status.DEAD_RECKONING) | bad,

@@ -92,7 +92,7 @@ def gnss(truth, rng, rate_hz=1.0, sigma_p=1.5, sigma_v=0.1, arm_b=(0.0, 0.0, 0.0
         place = pymap3d.ned2geodetic(*(arm_n + noise_p), lat, lon, h, deg=False)
         velocity = v_n + C_nb @ np.cross(omega_b, arm_b) + noise_v
         samples.append(
-            GnssSample(t, t + latency_s, *place, velocity, np.full(3, sigma_p or 1e-3), np.full(3, sigma_v or 1e-3),
+            GnssSample(t, t + latency_s, *place, velocity, np.full(3, sigma_p or 0.01), np.full(3, sigma_v or 0.02),
                        FixType.FIX_3D, 12, 0.8, 1.2)
         )  # fmt: skip
     return samples

@@ -1,0 +1,127 @@
+"""The initial state from sensors: at rest, in a turn, with and without magnetometer, and how sure it says it is."""
+
+import math
+
+import numpy as np
+import pytest
+from ins_world import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
+from scipy.stats import chi2
+
+from nav.error_model import ImuModel
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.samples import ImuSamples, Status
+
+NAVIGATION = ImuModel(0.002 * DEG / 60, 1e-4, 0.003 * DEG / 3600, 3e-4)
+
+
+def align(truth, model, rng, with_field=True, arm_b=(0.0, 0.0, 0.0), seconds=60.0, sigma_v=0.1, **config):
+    """The first estimate after alignment, the Ins, and the true sensor biases then."""
+    increments_, _, accel_bias = imu(truth, model, rng)
+    settings = InsConfig(model, aids=("gnss", "magnetometer"), gnss_arm_b=arm_b, **config)
+    hard_iron = settings.magnetometer_bias_sigma * rng.normal(size=3)
+    samples = gnss(truth, rng, 4.0, arm_b=arm_b, sigma_v=sigma_v)
+    if with_field:
+        samples += magnetometer(truth, rng, hard_iron)
+    ins = Ins(settings, (lambda *_: FIELD_N) if with_field else None)
+    horizon = FusionHorizon(ins)
+    for k in range(int(seconds / 0.25)):
+        rows = slice(50 * k, 50 * k + 50)
+        block = ImuSamples(increments_.t[rows], increments_.dt[rows], increments_.dtheta[rows], increments_.dv[rows])
+        horizon.push(block, [s for s in samples if 0.25 * k - 1e-6 <= s.t < 0.25 * (k + 1) - 1e-6])
+        estimate = horizon.estimate_at(float(block.t[-1]))
+        if ins.aligned:
+            return ins, estimate, accel_bias[rows.stop - 1]
+        assert estimate.status & Status.ALIGNING
+        assert np.isnan(estimate.lat)
+        assert np.isnan(estimate.covariance).all()
+        assert ins.problem
+    return ins, None, None
+
+
+def test_in_flight_with_magnetometer():
+    truth = flight(30)
+    ins, estimate, _ = align(truth, CONSUMER, np.random.default_rng(1), arm_b=(0.5, 0.0, -0.2))
+    assert ins.problem == ""
+    assert 2.0 <= estimate.t <= 2.6
+    wrong, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+    assert (np.abs(wrong) < 3.5 * sigma).all()
+    assert (sigma[6:8] < 0.8 * DEG).all()
+    assert sigma[8] < 4 * DEG
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arm_b", [(0.0, 0.0, 0.0), (0.5, 0.1, -0.3)])
+def test_sigmas_are_honest_over_many_alignments(arm_b):
+    """Two-sided 99 % bounds of the mean NEES, and the tilt must go with the accelerometer bias that caused it."""
+    truth, runs = flight(30), 150
+    nees, joint = np.zeros(3), 0.0
+    for seed in range(runs):
+        ins, estimate, accel_bias = align(truth, CONSUMER, np.random.default_rng(seed), arm_b=arm_b)
+        wrong = error(estimate, truth)
+        for i in range(3):
+            block = slice(3 * i, 3 * i + 3)
+            nees[i] += wrong[block] @ np.linalg.solve(estimate.covariance[block, block], wrong[block]) / runs
+        state = ins._state
+        where = np.r_[0:3, ins.model.slices["accel_bias"]]
+        both = np.r_[wrong[6:9], estimate.accel_bias - accel_bias]
+        joint += both @ np.linalg.solve(state.P[np.ix_(where, where)], both) / runs
+    low, high = chi2.ppf([0.005, 0.995], 3 * runs) / runs
+    print("position, velocity, attitude", nees, "bounds", low, high, "attitude with accelerometer bias", joint)
+    assert ((low < nees) & (nees < high)).all()
+    low, high = chi2.ppf([0.005, 0.995], 6 * runs) / runs
+    assert low < joint < high
+
+
+def test_course_in_flight_without_magnetometer():
+    truth = flight(30)
+    _, estimate, _ = align(truth, CONSUMER, np.random.default_rng(2), with_field=False)
+    wrong, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+    assert 10 * DEG < sigma[8] < 40 * DEG
+    assert abs(wrong[8]) < 2 * sigma[8]
+    assert (np.abs(wrong[6:8]) < 3.5 * sigma[6:8]).all()
+
+
+def test_at_rest_with_magnetometer():
+    truth = at_rest(10)
+    _, estimate, _ = align(truth, CONSUMER, np.random.default_rng(3), sigma_v=0.03)
+    wrong, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+    assert (np.abs(wrong) < 3.5 * sigma).all()
+    assert sigma[6] < 0.3 * DEG
+
+
+def test_at_rest_consumer_gyros_cannot_find_north():
+    rng = np.random.default_rng(4)
+    ins, estimate, _ = align(at_rest(10), CONSUMER, rng, with_field=False, seconds=10, sigma_v=0.03)
+    assert estimate is None
+    assert "gyrocompassing would leave" in ins.problem
+
+
+def test_gyrocompassing_with_navigation_grade_gyros():
+    truth = at_rest(10)
+    _, estimate, _ = align(truth, NAVIGATION, np.random.default_rng(5), with_field=False, seconds=10, sigma_v=0.03)
+    wrong, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+    assert sigma[8] < 10 * DEG
+    assert abs(wrong[8]) < 3.5 * sigma[8]
+
+
+def test_accelerometers_that_contradict_gnss_are_not_believed():
+    truth = flight(30)
+    broken = flight(30).dv * 1.3
+    increments_ = ImuSamples(truth.t[1:], np.full(len(truth.t) - 1, 0.005), truth.dtheta[1:], broken[1:])
+    ins = Ins(InsConfig(CONSUMER), lambda *_: FIELD_N)
+    rng = np.random.default_rng(6)
+    feed(FusionHorizon(ins), increments_, gnss(truth, rng, 4.0) + magnetometer(truth, rng))
+    assert not ins.aligned
+    assert "disagree" in ins.problem
+
+
+def test_no_gnss_no_alignment():
+    truth = flight(30)
+    rng = np.random.default_rng(7)
+    ins = Ins(InsConfig(CONSUMER), lambda *_: FIELD_N)
+    increments_, *_ = imu(truth, CONSUMER, rng)
+    estimates, reports = feed(FusionHorizon(ins), increments_, barometer(truth, rng) + magnetometer(truth, rng))
+    assert reports == []
+    assert ins.problem == "waiting for GNSS"
+    assert all(math.isnan(e.h) for e in estimates)

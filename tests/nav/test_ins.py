@@ -1,0 +1,326 @@
+"""The inertial navigation as a whole: no noise no error, belief and disbelief, outages, broken samples."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from ins_world import (
+    CONSUMER,
+    DEG,
+    DT,
+    FIELD_N,
+    NOISELESS,
+    WIND_N,
+    airspeed,
+    barometer,
+    error,
+    feed,
+    flight,
+    gnss,
+    imu,
+    magnetometer,
+)
+
+from nav.alignment import InitialState
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.samples import AirspeedSample, BarometerSample, FixType, ImuSamples, Status
+
+ARM = (0.5, 0.1, -0.3)
+CONFIG = InsConfig(CONSUMER, gnss_arm_b=ARM, sideslip_sigma=None, gnss_use_velocity=True)
+
+
+def field(*_):
+    return FIELD_N
+
+
+def exact(truth):
+    return ImuSamples(truth.t[1:], np.full(len(truth.t) - 1, DT), truth.dtheta[1:], truth.dv[1:])
+
+
+def true_start(truth, sigma=(0.1 * DEG, 0.1, 1.0)):
+    covariance = np.diag(np.repeat(sigma, 3) ** 2)
+    return InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0], covariance)
+
+
+def everything(truth, rng, **of_gnss):
+    increments, *_ = imu(truth, CONSUMER, rng)
+    samples = gnss(truth, rng, 5.0, arm_b=ARM, **of_gnss)
+    return increments, samples, barometer(truth, rng, 40.0) + magnetometer(truth, rng) + airspeed(truth, rng)
+
+
+def test_no_noise_no_error():
+    """Every aid exact, at 10 Hz: what is left is rounding, linearisation and the covariance period."""
+    truth = flight(60)
+    rng = np.random.default_rng(0)
+    samples = (
+        gnss(truth, rng, 5.0, 0.0, 0.0, arm_b=ARM, offset_s=0.2)
+        + barometer(truth, rng, 40.0, 0.0)
+        + magnetometer(truth, rng, np.array([1e-6, -5e-7, 2e-7]), 0.0)
+        + airspeed(truth, rng, 0.0)
+    )
+    ins = Ins(dataclasses.replace(CONFIG, imu=NOISELESS), field)
+    ins.start(true_start(truth))
+    estimates, reports = feed(FusionHorizon(ins), exact(truth), samples)
+    assert all(r.weight == 1 for r in reports)
+    wrong = error(estimates[-1], truth)
+    assert np.abs(wrong[:3]).max() < 5e-3
+    assert np.abs(wrong[3:6]).max() < 2e-3
+    assert np.abs(wrong[6:]).max() < 1e-4
+    extra = estimates[-1].extra
+    np.testing.assert_allclose(extra["barometer_bias"][0], 40.0, atol=0.05)
+    np.testing.assert_allclose(extra["wind"][0], WIND_N[:2], atol=0.02)
+    np.testing.assert_allclose(extra["magnetometer_bias"][0], [1e-6, -5e-7, 2e-7], atol=2e-8)
+    assert set(extra) == {"barometer_bias", "wind", "magnetometer_bias"}
+
+
+def test_dead_reckoning_without_aids():
+    truth = flight(120)
+    rng = np.random.default_rng(1)
+    increments, fixes, others = everything(truth, rng)
+    ins = Ins(dataclasses.replace(CONFIG, aids=()), field)
+    estimates, reports = feed(FusionHorizon(ins), increments, fixes + others)
+    assert reports == []
+    assert estimates[-1].status == Status.ALIGNED | Status.DEAD_RECKONING
+    assert estimates[-1].extra == {}
+    wrong, sigma = error(estimates[-1], truth), np.sqrt(np.diag(estimates[-1].covariance))
+    assert 20 < sigma[0] < 1000
+    assert np.hypot(*wrong[:2]) > 5
+    assert (np.abs(wrong) < 4 * sigma).all()
+
+
+def test_all_aids_converge():
+    truth = flight(120)
+    rng = np.random.default_rng(2)
+    increments, fixes, others = everything(truth, rng)
+    estimates, reports = feed(FusionHorizon(Ins(CONFIG, field)), increments, fixes + others)
+    assert estimates[-1].status == Status.ALIGNED | Status.GNSS_FUSED
+    wrong, sigma = error(estimates[-1], truth), np.sqrt(np.diag(estimates[-1].covariance))
+    assert (np.abs(wrong) < 4 * sigma).all()
+    assert sigma[6] < 0.15 * DEG
+    assert sigma[8] < 0.7 * DEG
+    for aid in ("gnss_position", "gnss_velocity", "barometer", "magnetometer", "airspeed"):
+        chosen = [r for r in reports if r.aid == aid]
+        mean = np.mean([r.nis / len(r.innovation) for r in chosen])
+        assert 0.85 < mean < 1.15, aid
+        assert np.mean([r.weight for r in chosen]) > 0.99
+
+
+@pytest.mark.parametrize("period", [4, 10])
+def test_covariance_period_loses_nothing(period):
+    truth = flight(60)
+    rng = np.random.default_rng(3)
+    increments, fixes, others = everything(truth, rng)
+    finals = []
+    for samples in (1, period):
+        ins = Ins(dataclasses.replace(CONFIG, covariance_period=samples), field)
+        finals.append(feed(FusionHorizon(ins), increments, fixes + others)[0][-1])
+    sigma = np.sqrt(np.diag(finals[0].covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(finals[1].covariance)), sigma, rtol=2e-3)
+    difference = error(finals[0], truth) - error(finals[1], truth)
+    assert (np.abs(difference) < 0.02 * sigma).all()
+
+
+def moved(fix, north_m):
+    return dataclasses.replace(fix, lat=fix.lat + north_m / 6.37e6)
+
+
+def aided(samples, seconds, config=CONFIG, seed=4, duration=120):
+    truth = flight(duration)
+    increments, fixes, others = everything(truth, np.random.default_rng(seed))
+    estimates, reports = feed(FusionHorizon(Ins(config, field)), increments, samples(fixes) + others, seconds)
+    errors = {round(e.t, 3): np.hypot(*error(e, truth)[:2]) for e in estimates if e.status & Status.ALIGNED}
+    return errors, [r for r in reports if r.aid == "gnss_position"], estimates
+
+
+@pytest.mark.parametrize("length_s", [0.1, 3.0])
+def test_a_glitch_of_a_hundred_metres_is_rejected(length_s):
+    def glitch(fixes):
+        return [moved(f, 100.0) if 60 <= f.t < 60 + length_s else f for f in fixes]
+
+    errors, reports, _ = aided(glitch, 0.2)
+    assert all((r.weight == 0) == (60 <= r.t < 60 + length_s) for r in reports if 50 < r.t < 100)
+    assert max(e for t, e in errors.items() if t > 50) < 3.0
+
+
+def outage(fixes, start, stop):
+    return [
+        f if not start <= f.t < stop else dataclasses.replace(f, lat=math.nan, fix_type=FixType.NO_FIX) for f in fixes
+    ]
+
+
+def test_outage_and_reacquisition():
+    errors, reports, estimates = aided(lambda fixes: outage(fixes, 40, 90), 0.2)
+    status = {round(e.t, 3): e.status for e in estimates}
+    assert status[41.0] & Status.GNSS_FUSED
+    assert status[43.0] & Status.DEAD_RECKONING
+    assert status[92.0] & Status.GNSS_FUSED
+    assert [r.reason for r in reports if 90 <= r.t < 90.9] == ["on probation after an outage"] * 5
+    assert max(e for t, e in errors.items() if t > 100) < 3.0
+    assert not any(40 <= r.t < 90 for r in reports)
+
+
+def test_a_bad_first_fix_after_an_outage_is_not_swallowed():
+    def samples(fixes):
+        return [moved(f, 60.0) if 90 <= f.t < 90.6 else f for f in outage(fixes, 40, 90)]
+
+    errors, reports, _ = aided(samples, 0.2)
+    assert all(r.weight == 0 for r in reports if 90 <= r.t < 90.6)
+    assert all(r.weight == 1 for r in reports if 92 <= r.t < 100)
+    assert errors[91.0] < errors[90.0] + 3
+    assert max(e for t, e in errors.items() if t > 100) < 3.0
+
+
+def test_a_filter_too_sure_of_itself_gives_in_to_consistent_gnss():
+    """The filter believes in gyros and accelerometers a thousand times better than they are, and drifts off."""
+    vain = dataclasses.replace(
+        CONFIG,
+        aids=("gnss",),
+        imu=dataclasses.replace(
+            CONSUMER, accel_bias_sigma=1e-4, gyro_bias_sigma=1e-6, accel_noise=1e-5, gyro_noise=1e-6,
+            accel_bias_walk=0.0, gyro_bias_walk=0.0,
+        ),
+        magnetometer_bias_sigma=1e-8, magnetometer_sigma=1e-7,
+    )  # fmt: skip
+
+    truth = flight(120)
+    increments, fixes, _ = everything(truth, np.random.default_rng(5))
+    ins = Ins(vain, field)
+    ins.start(true_start(truth, sigma=(1e-4, 0.01, 0.5)))
+    estimates, reports = feed(FusionHorizon(ins), increments, outage(fixes, 0.5, 90), 0.2)
+    errors = {round(e.t, 3): np.hypot(*error(e, truth)[:2]) for e in estimates}
+    position = [r for r in reports if r.aid == "gnss_position" and r.t >= 90]
+    assert errors[90.0] > 30
+    assert position[0].reason == "on probation after an outage"
+    assert any("covariance reset" in r.reason for r in position)
+    assert all(r.weight == 0 for r in position if r.t < 93.9)
+    assert max(e for t, e in errors.items() if 97 < t < 100) < 5.0
+
+
+def test_a_lasting_jump_is_believed_only_after_patience():
+    def jumped(fixes):
+        return [moved(f, 100.0) if f.t >= 60 else f for f in fixes]
+
+    config = dataclasses.replace(CONFIG, patience_s=20.0)
+    _, reports, _ = aided(jumped, 0.2, config)
+    fused = [r.t for r in reports if r.t >= 60 and r.weight == 1]
+    assert 79.5 < fused[0] < 81
+    assert len(fused) > 150
+
+
+def test_correlated_gnss_errors_do_not_make_it_sure_of_itself():
+    """White 0.9 m and a Markov error of 1.2 m reported as 1.5 m: without the states it would claim half a metre."""
+    truth = flight(120)
+    rng = np.random.default_rng(8)
+    increments, fixes, others = everything(truth, rng, sigma_p=0.9)
+    wander, wandering = 1.2 * rng.normal(size=3), []
+    for fix in fixes:
+        off = wander / [6.37e6, 6.37e6 * math.cos(fix.lat), -1]
+        wandering.append(
+            dataclasses.replace(
+                fix, lat=fix.lat + off[0], lon=fix.lon + off[1], h=fix.h + off[2], sigma_position_n=np.full(3, 1.5)
+            )
+        )
+        fade = math.exp(-0.2 / 100)
+        wander = fade * wander + 1.2 * math.sqrt(1 - fade**2) * rng.normal(size=3)
+    told = dataclasses.replace(CONFIG, gnss_position_error_sigma=(1.2, 1.2, 1.2))
+    estimates, reports = feed(FusionHorizon(Ins(told, field)), increments, wandering + others)
+    plain, _ = feed(FusionHorizon(Ins(CONFIG, field)), increments, wandering + others)
+    sigma = [math.sqrt(e[-1].covariance[0, 0]) for e in (estimates, plain)]
+    assert 0.7 < sigma[0] < 1.3
+    assert sigma[1] < 0.4
+    assert (np.abs(error(estimates[-1], truth)[:3]) < 3.5 * np.sqrt(np.diag(estimates[-1].covariance))[:3]).all()
+    nis = [r.nis / 3 for r in reports if r.aid == "gnss_position"]
+    assert 0.85 < np.mean(nis) < 1.15
+    value, deviation = estimates[-1].extra["gnss_position_error"]
+    assert (np.abs(value - wander) < 4 * deviation).all()
+
+
+def test_broken_samples_are_reported_and_not_fused():
+    truth = flight(30)
+    increments, fixes, others = everything(truth, np.random.default_rng(6))
+    ins = Ins(CONFIG, field)
+    horizon = FusionHorizon(ins)
+    feed(horizon, increments, fixes + others)
+    before = ins.estimate()
+    t = ins.t
+    broken = [
+        dataclasses.replace(fixes[-1], t=t, lat=math.nan),
+        dataclasses.replace(fixes[-1], t=t, v_n=np.array([math.nan, 0.0, 0.0])),
+        dataclasses.replace(fixes[-1], t=t, sigma_position_n=np.zeros(3)),
+        BarometerSample(t, t, math.nan),
+        BarometerSample(t, t, -5.0),
+        AirspeedSample(t, t, math.inf),
+    ]
+    for sample in broken:
+        (report,) = ins.update(sample)
+        assert report.weight == 0
+        assert report.reason
+    after = ins.estimate()
+    assert after.status & Status.BAD_SAMPLE
+    assert not ins.estimate().status & Status.BAD_SAMPLE
+    np.testing.assert_array_equal(after.covariance, before.covariance)
+    assert after.lat == before.lat
+
+
+def test_broken_increments_are_bridged():
+    truth = flight(60)
+    increments, fixes, others = everything(truth, np.random.default_rng(7))
+    increments.dtheta[4000:4004] = math.nan
+    increments.dv[6000] = 1e6
+    estimates, _ = feed(FusionHorizon(Ins(CONFIG, field)), increments, fixes + others)
+    flagged = [e.t for e in estimates if e.status & Status.BAD_SAMPLE]
+    assert flagged == pytest.approx([21.0, 31.0])
+    assert np.hypot(*error(estimates[-1], truth)[:2]) < 3
+
+
+def test_slow_air_is_not_fused():
+    ins = Ins(dataclasses.replace(CONFIG, sideslip_sigma=1.0), field)
+    ins.start(true_start(flight(30)))
+    reports = ins.update(AirspeedSample(0.0, 0.0, 2.0))
+    assert [(r.aid, r.weight, r.reason) for r in reports] == [
+        ("airspeed", 0.0, "too slow for the pitot tube"),
+        ("sideslip", 0.0, "too slow for the pitot tube"),
+    ]
+    assert [r.weight for r in ins.update(AirspeedSample(0.0, 0.0, 25.0))] == [1.0, 1.0]
+
+
+def test_sideslip_observes_the_wind_across():
+    truth = flight(30)
+    sigma = []
+    for sideslip in (None, 1.0):
+        ins = Ins(dataclasses.replace(CONFIG, sideslip_sigma=sideslip), field)
+        ins.start(true_start(truth))
+        for _ in range(20):
+            ins.update(AirspeedSample(0.0, 0.0, float(np.linalg.norm(truth.v_n[0]))))
+        across = truth.C_nb[0][:2, 1]
+        where = ins.model.slices["wind"]
+        sigma.append(math.sqrt(across @ ins._state.P[where, where] @ across))
+    assert sigma[0] > 4
+    assert sigma[1] < 1
+
+
+def test_a_sample_at_another_time_is_a_mistake_of_the_caller():
+    ins = Ins(CONFIG, field)
+    ins.start(true_start(flight(30)))
+    with pytest.raises(ValueError, match="the filter is at"):
+        ins.update(BarometerSample(0.02, 0.02, 95_000.0))
+
+
+def test_unknown_aid():
+    with pytest.raises(ValueError, match=r"unknown aids \['sonar'\]"):
+        InsConfig(CONSUMER, aids=("gnss", "sonar"))
+
+
+def test_the_reference_field_is_looked_up_rarely():
+    calls = []
+
+    def counted(*place):
+        calls.append(place)
+        return FIELD_N
+
+    truth = flight(60)
+    increments, fixes, others = everything(truth, np.random.default_rng(9))
+    feed(FusionHorizon(Ins(CONFIG, counted)), increments, fixes + others)
+    assert 1 <= len(calls) < 10
