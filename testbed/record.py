@@ -51,7 +51,7 @@ FORMAT = "navigation-testbed run 1"
 FLUSH_WALL_S = 0.5  # a killed run loses at most this much work
 SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 
-# What the components of a vector mean; coordinates of the file's root, shared by all groups.
+# What the components of a vector mean: the labels of its dimension.
 AXES: dict[str, tuple[str, ...]] = {
     "ned": ("north", "east", "down"),
     "body": ("forward", "right", "down"),
@@ -627,13 +627,8 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
     with h5py.File(path, "w", libver=("earliest", "v110"), track_order=True) as file:
         for name, value in attributes.items():
             file.attrs[name] = value
-        scales: dict[str, Any] = {}
-        for axis, labels in AXES.items():
-            dataset = file.create_dataset(axis, data=list(labels), dtype=h5py.string_dtype())
-            dataset.make_scale(axis)
-            scales[axis] = dataset.id
         for group_path, table in tables.items():
-            group = _group(file, group_path).id
+            group = _group(file, group_path)
             local: dict[str, Any] = {}
             for name, column in table.columns.items():
                 dtype = column.dtype
@@ -647,7 +642,7 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
                     layout.set_fill_time(h5d.FILL_TIME_NEVER)  # room costs nothing until it is written
                 shape = (table.capacity, *column.shape, *((dtype.itemsize,) if text else ()))
                 stored = h5t.py_create(np.dtype("S1") if text else dtype)
-                dataset = h5d.create(group, name.encode(), stored, h5s.create_simple(shape), layout)
+                dataset = h5d.create(group.id, name.encode(), stored, h5s.create_simple(shape), layout)
                 dims = (*column.variable.dims, *((f"characters_{dtype.itemsize}",) if text else ()))
                 if name == table.time_name:
                     h5ds.set_scale(dataset, name.encode())
@@ -657,9 +652,9 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
                 else:
                     h5ds.attach_scale(dataset, local[table.time_name], 0)
                 for k, dim in enumerate(dims, start=1):
-                    if dim not in scales and dim not in local:
-                        local[dim] = _bare_dimension(group, dim, shape[k])
-                    h5ds.attach_scale(dataset, scales[dim] if dim in scales else local[dim], k)
+                    if dim not in local:
+                        local[dim] = _labels(group, dim) if dim in AXES else _bare_dimension(group, dim, shape[k])
+                    h5ds.attach_scale(dataset, local[dim], k)
                 for key, value in _attributes(column.variable).items():
                     note.text(dataset, key, value)
                 if text:
@@ -676,13 +671,22 @@ def _group(file: h5py.File, path: str) -> h5py.Group:
     return group
 
 
-def _bare_dimension(group: Any, name: str, size: int) -> Any:
+def _labels(group: h5py.Group, name: str) -> Any:
+    """A dimension whose components have names."""
+    import h5py
+
+    labels = group.create_dataset(name, data=list(AXES[name]), dtype=h5py.string_dtype())
+    labels.make_scale(name)
+    return labels.id
+
+
+def _bare_dimension(group: h5py.Group, name: str, size: int) -> Any:
     """A netCDF-4 dimension without coordinate values."""
     from h5py import h5d, h5ds, h5p, h5s, h5t
 
     layout = h5p.create(h5p.DATASET_CREATE)
     layout.set_obj_track_times(False)
-    scale = h5d.create(group, name.encode(), h5t.IEEE_F32BE, h5s.create_simple((size,)), layout)
+    scale = h5d.create(group.id, name.encode(), h5t.IEEE_F32BE, h5s.create_simple((size,)), layout)
     h5ds.set_scale(scale, f"This is a netCDF dimension but not a netCDF variable.{size:10d}".encode())
     return scale
 
@@ -760,7 +764,7 @@ def _tree(
 ) -> xarray.DataTree:
     import xarray
 
-    nodes = {"/": xarray.Dataset(coords={axis: list(labels) for axis, labels in AXES.items()}, attrs=dict(attributes))}
+    nodes = {"/": xarray.Dataset(attrs=dict(attributes))}
     for path, group in columns.items():
         time_name = "sample_time" if "sample_time" in group else "time"
         nodes[path] = xarray.Dataset(
@@ -773,4 +777,6 @@ def _tree(
                 for name, (variable, values) in group.items()
             }
         ).set_coords(time_name)
+        labels = {str(dim): list(AXES[str(dim)]) for dim in nodes[path].dims if dim in AXES}
+        nodes[path] = nodes[path].assign_coords(labels)
     return xarray.DataTree.from_dict(nodes)
