@@ -251,6 +251,7 @@ def _number(value: float) -> str:
 # --- figures
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_LINEAR_UP_TO = 30.0  # times the smallest error; a wider distribution gets a logarithmic axis
 _MOST_COLUMNS = 3  # more combinations than this share a panel
 
 
@@ -349,72 +350,55 @@ def _nees_figure(result: CampaignResult) -> Figure:
             mean, _ = nees_mean(own, estimator.name)
             axes.plot(_longest(own)["time"], mean, color=colour, linewidth=1.0, label=label or "mean")
         axes.set_ylabel("NEES / dof")
-        _logarithmic(axes)
+        _logarithmic(axes, 0.1, 10.0)
     panels[0, 0].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
-def _logarithmic(axes: Axes) -> None:
-    """A logarithmic axis with plain numbers, those between the powers of ten only where there is room for them."""
-    from matplotlib.ticker import NullFormatter
+def _logarithmic(axes: Axes, least: float = math.inf, most: float = 0.0) -> None:
+    """A logarithmic axis from ``least`` to ``most`` at the least, with plain numbers.
+
+    The numbers between the powers of ten are there only where they have room.
+    """
+    from matplotlib.ticker import FuncFormatter, NullFormatter
 
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}" if high < 6.0 * low else NullFormatter())
+    axes.set_ylim(min(low, least), max(high, most))
+    plain = FuncFormatter(lambda x, _: f"{x:,.0f}" if x >= 1.0 else f"{x:g}")
+    axes.yaxis.set_major_formatter(plain)
+    axes.yaxis.set_minor_formatter(plain if high < 6.0 * low else NullFormatter())
 
 
 def _distribution_figure(result: CampaignResult, key: str, value_of: Callable[[Combination], str]) -> Figure:
-    """A box of one metric per value and estimator, with every run as a dot."""
+    """A panel for each estimator: a box of one metric per value, with every run as a dot."""
     from matplotlib.figure import Figure
 
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
-    metric = next(
-        m
-        for m in ("outage_position_horizontal_max_m", "position_horizontal_max_m")
-        if m == "position_horizontal_max_m" or any(f"{e}.{m}" in o.metrics for o in result.outcomes for e in estimators)
-    )
+    denied = any("outage_position_horizontal_max_m" in key for o in result.outcomes for key in o.metrics)
+    metric = "outage_position_horizontal_max_m" if denied else "position_horizontal_max_m"
     values = list(dict.fromkeys(value_of(c) for c in result.combinations))
-    figure = Figure(figsize=(max(5.0, 2.0 + 1.2 * len(values)), 4.5), layout="constrained")
-    axes = figure.subplots()
-    width = 0.7 / len(estimators)
-    for e, estimator in enumerate(estimators):
-        for v, value in enumerate(values):
-            errors = [
-                o.metrics[f"{estimator}.{metric}"]
-                for o in result.outcomes
-                if value_of(result.combinations[o.combination]) == value and f"{estimator}.{metric}" in o.metrics
-            ]
-            if not errors:
-                continue
-            x = v + (e - 0.5 * (len(estimators) - 1)) * width
-            colour = _COLOURS[e % len(_COLOURS)]
-            axes.boxplot(
-                errors,
-                positions=[x],
-                widths=0.8 * width,
-                whis=(5, 95),
-                showfliers=False,
-                medianprops={"color": colour, "linewidth": 2},
-                manage_ticks=False,
-            )
-            spread = np.linspace(-0.25, 0.25, len(errors)) * width if len(errors) > 1 else [0.0]
-            axes.plot(
-                x + np.asarray(spread),
-                errors,
-                "o",
-                color=colour,
-                markersize=3,
-                alpha=0.6,
-                label=estimator if v == 0 else None,
-            )
-    axes.set_xticks(range(len(values)), values)
-    axes.set_xlim(-0.6, len(values) - 0.4)
-    _logarithmic(axes)
-    axes.set_xlabel(key)
-    axes.set_ylabel(QUANTITIES[metric])
-    axes.set_title("Largest error of each run\nbox: quartiles, whiskers: 5 and 95 %", fontsize="medium")
-    axes.grid(alpha=0.3, axis="y")
-    if axes.lines:  # none when no estimator ever aligned
-        axes.legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure = Figure(figsize=(3.0 + 1.5 * len(values), 1.4 + 2.8 * len(estimators)), layout="constrained")
+    figure.suptitle("Largest error of each run\n(box: quartiles, whiskers: 5 and 95 %)", fontsize="medium")
+    panels = figure.subplots(len(estimators), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, estimator in zip(panels, estimators, strict=True):
+        found: dict[str, list[float]] = {value: [] for value in values}
+        for o in result.outcomes:
+            if f"{estimator}.{metric}" in o.metrics:
+                found[value_of(result.combinations[o.combination])].append(o.metrics[f"{estimator}.{metric}"])
+        for x, errors in enumerate(found.values()):
+            line = {"color": _COLOURS[0], "linewidth": 2}
+            axes.boxplot(errors, positions=[x], widths=0.5, whis=(5, 95), showfliers=False, medianprops=line)
+            axes.plot(x + np.linspace(-0.15, 0.15, len(errors)), errors, "o", color="0.3", markersize=3, alpha=0.6)
+        axes.set_title(estimator, loc="left", fontsize="medium")
+        axes.set_ylabel(QUANTITIES[metric])
+        axes.grid(alpha=0.3, axis="y")
+        known = [error for errors in found.values() for error in errors]
+        if known and max(known) > _LINEAR_UP_TO * min(known):
+            _logarithmic(axes)
+        else:
+            axes.set_ylim(bottom=0.0)
+    panels[-1].set_xticks(range(len(values)), values)
+    panels[-1].set_xlim(-0.6, len(values) - 0.4)
+    panels[-1].set_xlabel(key)
     return figure
