@@ -336,9 +336,9 @@ def test_killed_worker_loses_nothing(at_rest: Path, tmp_path: Path) -> None:
         for process in (*workers, scheduler):
             process.terminate()
             process.wait()
+    assert not result.failures
     assert workers[0].returncode == -signal.SIGKILL
     assert told[-1].done == 8
-    assert not result.failures
     assert [outcome.seed for outcome in result.outcomes] == list(range(11, 19))
     for outcome in result.outcomes:
         assert same(outcome, flown_here(at_rest, outcome.seed, tuple(overrides)))
