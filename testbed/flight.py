@@ -35,7 +35,7 @@ SETTLING_S = 90.0  # of straight and level flight before the run starts
 INTEGRATORS = {"rate/rotational": 3, "rate/translational": 3, "position/rotational": 7, "position/translational": 4}
 
 # MIL-F-8785C: wind at 20 ft for the low-altitude model [ft/s] (15, 30 and 45 knots, fig. 8) and the probability of
-# exceedance curve of the high-altitude model (fig. 7: light 1e-1 to 1e-2, moderate 1e-3, severe 1e-5).
+# exceedance curve of the high-altitude model (fig. 7: light 1e-2, moderate 1e-3, severe 1e-5; JSBSim counts them).
 TURBULENCE = {"light": (25.3, 3), "moderate": (50.6, 4), "severe": (76.0, 6)}
 
 # Electrical load [A] on a 6 V bus, aircraft/SOURCES.md: avionics and payload, a servo at rest, at full rate.
@@ -82,6 +82,8 @@ LINEAR_STATE: Mapping[str, str] = {
     "theta-rad": "velocities/thetadot-rad_sec",
 }
 ENGINE_SETTLING_S = 3.0
+
+MAX_ROLL, MAX_PITCH = math.radians(80.0), math.radians(60.0)  # beyond these control is lost
 WIDTH = len(STATE)
 UNITS = np.array(list(STATE.values()))
 
@@ -242,8 +244,11 @@ class Aircraft:
 
     def command(self, bank: float, altitude: float, climb: float, airspeed: float) -> None:
         """Set what the inner loops follow."""
-        for node, value in zip(self._command, (bank, altitude, climb, airspeed), strict=True):
-            node(value)
+        set_bank, set_altitude, set_climb, set_airspeed = self._command
+        set_bank(bank)
+        set_altitude(altitude)
+        set_climb(climb)
+        set_airspeed(airspeed)
 
     def feed_back(self, state: Feedback | None) -> None:
         """Switch what the inner loops read: ``state``, or JSBSim's own states."""
@@ -449,11 +454,10 @@ def _wind_at(winds: Winds, alt: float) -> tuple[float, float]:
 
 def _loss_of_control(state: Feedback) -> str:
     """What went wrong, empty when nothing did."""
-    if not all(map(math.isfinite, (state.lat, state.lon, state.h, state.airspeed, state.roll, state.pitch))):
+    if state.h > 1.0 and abs(state.roll) < MAX_ROLL and abs(state.pitch) < MAX_PITCH:  # false for NaN
+        return ""
+    if not all(map(math.isfinite, state)):
         return "control lost: the simulation diverged"
-    if state.h < 1.0:
+    if state.h <= 1.0:
         return "the aircraft hit the ground"
-    if abs(state.roll) > math.radians(80) or abs(state.pitch) > math.radians(60):
-        roll, pitch = math.degrees(state.roll), math.degrees(state.pitch)
-        return f"control lost: bank {roll:.0f} deg, pitch {pitch:.0f} deg"
-    return ""
+    return f"control lost: bank {math.degrees(state.roll):.0f} deg, pitch {math.degrees(state.pitch):.0f} deg"
