@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 Data: TypeAlias = npt.NDArray[Any]
 
 FORMAT = "navigation-testbed run 1"
-FLUSH_WALL_S = 0.5  # a killed run loses at most this much work
+FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
 SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 
 # What the components of a vector mean: the labels of its dimension.
@@ -214,10 +214,10 @@ class _Column:
     variable: Variable
     shape: tuple[int, ...]
     offset: int = 0  # of row 0 in the file [bytes]
+    dtype: np.dtype[Any] = field(init=False)
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype(self.variable.dtype)
+    def __post_init__(self) -> None:
+        self.dtype = np.dtype(self.variable.dtype)
 
     @property
     def row_bytes(self) -> int:
