@@ -147,16 +147,32 @@ def barometer(lla: Array, x: Array, barometer_bias: int, pressure_altitude: floa
 
 
 @njit
-def magnetometer(q_nb: Array, x: Array, magnetometer_bias: int, field_n: Array, field_b: Array) -> tuple[Array, Array]:
-    """Magnetic field [T] in body axes: C_nb' field_n + bias, ``field_n`` being the reference field at the place."""
-    C_bn = np.ascontiguousarray(dcm_from_quat(q_nb).T)
-    nu = field_b - C_bn @ field_n
+def magnetometer(
+    q_nb: Array, x: Array, bias: int, error: int, anomaly: int, field_n: Array, field_b: Array
+) -> tuple[Array, Array]:
+    """Magnetic field [T] in body axes: C_nb' (field_n + anomaly) + bias + error, ``field_n`` the reference field there.
+
+    ``bias`` and ``error`` are fixed to the body, ``anomaly`` to n; each is where its states begin, -1 for none.
+    """
+    C_nb = dcm_from_quat(q_nb)
     H = np.zeros((3, len(x)))
-    H[:, PHI : PHI + 3] = -(C_bn @ skew(field_n))
-    if magnetometer_bias >= 0:
-        for i in range(3):
-            H[i, magnetometer_bias + i] = 1.0
-            nu[i] -= x[magnetometer_bias + i]
+    nu = np.zeros(3)
+    m0, m1, m2 = field_n[0], field_n[1], field_n[2]
+    if anomaly >= 0:
+        m0, m1, m2 = m0 + x[anomaly], m1 + x[anomaly + 1], m2 + x[anomaly + 2]
+    for i in range(3):
+        c0, c1, c2 = C_nb[0, i], C_nb[1, i], C_nb[2, i]
+        nu[i] = field_b[i] - (c0 * m0 + c1 * m1 + c2 * m2)
+        # -C_nb' [field x]
+        H[i, PHI] = c2 * m1 - c1 * m2
+        H[i, PHI + 1] = c0 * m2 - c2 * m0
+        H[i, PHI + 2] = c1 * m0 - c0 * m1
+        if anomaly >= 0:
+            H[i, anomaly], H[i, anomaly + 1], H[i, anomaly + 2] = c0, c1, c2
+        for start in (bias, error):
+            if start >= 0:
+                H[i, start + i] = 1.0
+                nu[i] -= x[start + i]
     return nu, H
 
 

@@ -92,7 +92,9 @@ class InsConfig:
     # Magnetometer, three axes
     magnetometer_sigma: float = 0.5e-6  # [T]
     magnetometer_bias_sigma: float = 1.0e-6  # hard iron left after calibration [T]
-    magnetometer_bias_walk: float = 0.0  # [T/sqrt(s)]
+    magnetometer_anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
+    magnetometer_error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
+    magnetometer_error_correlation_s: float = 30.0
 
     # Airspeed along body x, and the constraint of no sideslip (None leaves it out)
     airspeed_sigma: float = 0.5  # [m/s]
@@ -130,7 +132,12 @@ class InsConfig:
         if "barometer" in self.aids:
             blocks.append(Block("barometer_bias", 1, self.barometer_bias_sigma, self.barometer_bias_walk))
         if "magnetometer" in self.aids:
-            blocks.append(Block("magnetometer_bias", 3, self.magnetometer_bias_sigma, self.magnetometer_bias_walk))
+            error, correlation_s = self.magnetometer_error_sigma, self.magnetometer_error_correlation_s
+            blocks += [
+                Block("magnetometer_bias", 3, self.magnetometer_bias_sigma),
+                Block("magnetometer_anomaly", 3, self.magnetometer_anomaly_sigma),
+                markov("magnetometer_error", 3, error, correlation_s),
+            ]
         if "airspeed" in self.aids:
             blocks += [
                 Block("wind", 2, self.wind_sigma, self.wind_walk),
@@ -225,7 +232,9 @@ class Ins:
         start = model.start
         self._gnss_position_error = start("gnss_position_error")
         self._gnss_velocity_error = start("gnss_velocity_error")
-        self._barometer_bias, self._magnetometer_bias = start("barometer_bias"), start("magnetometer_bias")
+        self._barometer_bias = start("barometer_bias")
+        self._magnetometer_bias, self._magnetometer_error = start("magnetometer_bias"), start("magnetometer_error")
+        self._magnetometer_anomaly = start("magnetometer_anomaly")
         self._wind, self._gust, self._airspeed_scale = start("wind"), start("gust"), start("airspeed_scale")
 
     @property
@@ -406,8 +415,9 @@ class Ins:
         if self._field_model is None:
             return []
         nu, H = aiding.magnetometer(
-            state.q_nb, state.x, self._magnetometer_bias, self._field_n(state.lla), sample.field_b
-        )
+            state.q_nb, state.x, self._magnetometer_bias, self._magnetometer_error, self._magnetometer_anomaly,
+            self._field_n(state.lla), sample.field_b,
+        )  # fmt: skip
         return [self._fuse(state, sample, "magnetometer", nu, H, self._magnetometer_R)]
 
     def _update_airspeed(self, state: _State, sample: AirspeedSample) -> list[UpdateReport]:

@@ -26,7 +26,9 @@ from testbed.sensors.imu import ImuConfig, ImuErrors
 from testbed.sensors.magnetometer import MagnetometerConfig
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
-TURN_RATE = 0.05  # of a standard turn of this aircraft [rad/s]: scale and misalignment act on it
+TURN_RATE = 0.06  # of a usual turn of this aircraft [rad/s]
+LOAD_CHANGE = 0.1  # and the change of its load factor
+MANOEUVRE_S = 30.0  # between changes of these
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
@@ -50,26 +52,33 @@ def imu_model(errors: ImuErrors) -> ImuModel:
     """The datasheet as the filter's error model.
 
     In-run instability (Gauss-Markov, sigma and tau) becomes a random walk of the same driving noise,
-    q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two cannot be told apart.
+    q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two cannot be told apart. Scale factor,
+    misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk too.
     """
-    walk = np.hypot
-    tilt = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, errors.accel_scale)
-    turn = math.hypot(errors.gyro_misalignment, errors.gyro_nonorthogonality, errors.gyro_scale) * TURN_RATE
+    level = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, errors.accel_scale)
+    turn = math.hypot(errors.gyro_misalignment, errors.gyro_nonorthogonality, errors.gyro_scale)
+    pull = errors.gyro_g_sensitivity * STANDARD_GRAVITY
+    changes = math.sqrt(1 / MANOEUVRE_S)
     return ImuModel(
         gyro_noise=errors.gyro_noise,
         accel_noise=errors.accel_noise,
         gyro_bias_sigma=math.hypot(
-            errors.gyro_turn_on,
-            errors.gyro_in_run,
-            errors.gyro_g_sensitivity * STANDARD_GRAVITY,
-            errors.gyro_temperature * WARM_UP_K,
-            turn,
+            errors.gyro_turn_on, errors.gyro_in_run, errors.gyro_temperature * WARM_UP_K, pull, turn * TURN_RATE
         ),
         accel_bias_sigma=math.hypot(
-            errors.accel_turn_on, errors.accel_in_run, errors.accel_temperature * WARM_UP_K, tilt * STANDARD_GRAVITY
+            errors.accel_turn_on, errors.accel_in_run, errors.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
         ),
-        gyro_bias_walk=float(walk(errors.gyro_random_walk, _drive(errors.gyro_in_run, errors.gyro_in_run_tau))),
-        accel_bias_walk=float(walk(errors.accel_random_walk, _drive(errors.accel_in_run, errors.accel_in_run_tau))),
+        gyro_bias_walk=math.hypot(
+            errors.gyro_random_walk,
+            _drive(errors.gyro_in_run, errors.gyro_in_run_tau),
+            turn * TURN_RATE * changes,
+            pull * LOAD_CHANGE * changes,
+        ),
+        accel_bias_walk=math.hypot(
+            errors.accel_random_walk,
+            _drive(errors.accel_in_run, errors.accel_in_run_tau),
+            level * STANDARD_GRAVITY * LOAD_CHANGE * changes,
+        ),
     )
 
 
@@ -106,7 +115,9 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     if isinstance(magnetometer, MagnetometerConfig):
         m = magnetometer.errors()
         told |= {
-            "magnetometer_sigma": math.hypot(m.noise, m.soft_iron * FIELD_SIZE),
+            "magnetometer_sigma": m.noise,
+            "magnetometer_error_sigma": m.soft_iron * FIELD_SIZE,
+            "magnetometer_anomaly_sigma": m.soft_iron * FIELD_SIZE,
             "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * PAYLOAD_CURRENT),
         }
     airspeed = kinds.get("airspeed")
@@ -120,7 +131,12 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
             "sideslip_sigma": 0.5,
         }
     ins = Ins(
-        InsConfig(imu=imu_model(errors), aids=tuple(kinds), **told),  # type: ignore[arg-type]
+        InsConfig(
+            imu=imu_model(errors),
+            mounting_sigma=math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality),
+            aids=tuple(kinds),
+            **told,
+        ),  # type: ignore[arg-type]
         partial(geomagnetic_field_n, date=scenario.date),
     )
     # Every sensor is offered: what is no aid still serves the alignment.

@@ -159,14 +159,15 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_bandwidth_hz": 300.0,
     },
     # Turn-on 40 deg/h and 2 mg: the unit of Jiang et al. 2021 (attitude of a loitering vehicle without GNSS), after
-    # calibration. Noise: Bosch BMI088 datasheet BST-BMI088-DS001, 0.014 deg/s/sqrt(Hz) and 175 ug/sqrt(Hz); 16 bit on
-    # +-500 deg/s and +-12 g. Rest assumed, for a calibrated part.
+    # calibration. Its noise is not given; 0.3 deg/sqrt(h) and 100 ug/sqrt(Hz) lie between the TDK ICM-42688-P datasheet
+    # DS-000347 (2.8 mdps/sqrt(Hz) = 0.17 deg/sqrt(h), 70 ug/sqrt(Hz)) and the Bosch BMI088 (0.84 deg/sqrt(h),
+    # 175 ug/sqrt(Hz)). 16 bit on +-500 deg/s and +-12 g. Rest assumed, for a calibrated part.
     "mems-consumer": {
         **INSTALLATION,
         "gyro_turn_on_degph": 40.0,
         "gyro_instability_degph": 5.0,
         "gyro_instability_tau_s": 200.0,
-        "angle_random_walk_degprth": 0.84,
+        "angle_random_walk_degprth": 0.3,
         "gyro_rate_random_walk_degphprth": 2.0,
         "gyro_scale_ppm": 1000.0,
         "gyro_scale_asymmetry_ppm": 200.0,
@@ -180,7 +181,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_turn_on_mg": 2.0,
         "accel_instability_mg": 0.03,
         "accel_instability_tau_s": 200.0,
-        "velocity_random_walk_mpsprth": 0.103,
+        "velocity_random_walk_mpsprth": 0.06,
         "accel_random_walk_mgprth": 0.02,
         "accel_scale_ppm": 1000.0,
         "accel_scale_asymmetry_ppm": 200.0,

@@ -20,12 +20,15 @@ CONFIG = InsConfig(
     gnss_velocity_error_sigma=(0.1, 0.1, 0.1),
     gust_sigma=1.0,
     airspeed_scale_sigma=0.02,
+    magnetometer_anomaly_sigma=1e-7,
+    magnetometer_error_sigma=1e-7,
 )
 MODEL = ErrorModel(IMU, CONFIG.aid_blocks())
 ARM = np.array([0.7, -0.3, -1.2])
 FIELD_N = np.array([28e-6, -2e-6, 40e-6])
 STEPS = {"phi": 1e-5, "dv": 1e-2, "dp": 1.0, "gyro_bias": 1e-3, "gyro_drift": 1e-3, "gyro_scale": 1e-3,
          "accel_bias": 1e-2, "accel_drift": 1e-2, "accel_scale": 1e-2, "magnetometer_bias": 1e-7,
+         "magnetometer_anomaly": 1e-7, "magnetometer_error": 1e-7,
          "airspeed_scale": 1e-3}  # fmt: skip
 
 
@@ -69,7 +72,8 @@ def barometer(at):
 
 
 def magnetometer(at):
-    return aiding.magnetometer(at[0], at[3], MODEL.start("magnetometer_bias"), FIELD_N, np.array([1e-5, 2e-5, 3e-5]))
+    states = [MODEL.start(f"magnetometer_{name}") for name in ("bias", "error", "anomaly")]
+    return aiding.magnetometer(at[0], at[3], *states, FIELD_N, np.array([1e-5, 2e-5, 3e-5]))
 
 
 def airspeed(at):
