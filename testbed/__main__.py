@@ -107,7 +107,7 @@ def run(
     ] = None,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write figures and report.html.")] = True,
 ) -> None:
-    """Fly one scenario: record, metrics, report."""
+    """Fly one scenario: record, metrics, report. Exit code 1 if control was lost on the way."""
     if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
         raise UserError(f"--realtime {realtime:g}: the factor must be above 0, such as 1 for wall-clock time")
     loaded = _load(scenario, overrides)
@@ -115,6 +115,8 @@ def run(
     with _output_folder(folder):
         result = _fly(loaded, folder, seed=seed, links=_connect(mavlink or [], loaded), realtime=realtime)
         _conclude(result, folder, report)
+    if _lost(result):
+        raise typer.Exit(EXIT_FAILED)
 
 
 @app.command()
@@ -133,7 +135,7 @@ def check(
             result = _fly(one, folder)
         verdicts = judge(one.expect, result.metrics)
         _show_verdicts(name, one.expect, result.metrics, verdicts)
-        if not all(verdicts.values()):
+        if _lost(result) or not all(verdicts.values()):
             failed = True
             print(f"{name}: failed; the record is kept in {folder}")
     if failed:
@@ -168,6 +170,7 @@ def campaign(
     vary: Annotated[
         list[str] | None, typer.Option(metavar="KEY=A,B,C", help="Repeat for each of these values; repeatable.")
     ] = None,
+    overrides: Overrides = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="An existing Dask cluster.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
 ) -> None:
@@ -186,6 +189,7 @@ def campaign(
             scenario,
             runs,
             vary=varied,
+            overrides=overrides or (),
             scheduler=scheduler,
             out=folder,
             progress=lambda now: tell((now.done + now.failed) / now.total, str(now)),
@@ -340,6 +344,16 @@ def _conclude(result: RunResult, folder: Path, report: bool) -> None:
     if report:
         print(f"report: {reports.write_report(result.dataset, result.metrics, folder)}")
     print(f"record: {folder / 'run.nc'}")
+
+
+def _lost(result: RunResult) -> bool:
+    """Whether the flight got out of control; if so, it is said."""
+    if result.failure:
+        from testbed.metrics import column
+
+        t = column(result.dataset, "truth/time")[-1]
+        print(f"testbed: the flight ended after {t:.0f} s: {result.failure}", file=sys.stderr)
+    return bool(result.failure)
 
 
 def _show_verdicts(

@@ -331,9 +331,8 @@ def _share_truth(folder: Path, combinations: Sequence[Combination]) -> Path | No
 
 def _require_control(source: MotionSource) -> None:
     """A flight that got out of control says nothing about navigation: don't let its numbers in among the others."""
-    failure = getattr(source, "failure", "")
-    if failure:
-        raise UserError(f"the flight ended early: {failure}")
+    if source.failure:
+        raise UserError(f"the flight ended early: {source.failure}")
 
 
 def _same_motion(one: Scenario, other: Scenario) -> bool:
@@ -347,7 +346,7 @@ def _seed_leaves_motion(scenario: Scenario) -> bool:
     if not isinstance(scenario.truth, FlightTruth):
         return True
     wind = scenario.truth.wind
-    return wind.turbulence == "none" or getattr(wind, "turbulence_seed", None) is not None
+    return wind.turbulence == "none" or wind.turbulence_seed is not None
 
 
 # --- the workers

@@ -104,7 +104,8 @@ class Flight:
         self._aircraft = Aircraft(truth.aircraft, truth.rate_hz)
         self._winds = _winds(truth.wind)
         self._aircraft.start(truth.start, self._winds)
-        self._aircraft.turbulence(truth.wind.turbulence, seed)
+        wind_seed = truth.wind.turbulence_seed
+        self._aircraft.turbulence(truth.wind.turbulence, seed if wind_seed is None else wind_seed)
         self._row = self._aircraft.read()
         self._last = self._row  # the last row handed out, for its increments
         self._feedback: Feedback | None = None
@@ -273,7 +274,7 @@ class Aircraft:
         self.fdm["atmosphere/wind-east-fps"] = east / FOOT
 
     def turbulence(self, level: str, seed: int) -> None:
-        """Dryden turbulence of MIL-F-8785C, its random numbers a child of the run's seed."""
+        """Dryden turbulence of MIL-F-8785C, its random numbers a child of ``seed``."""
         if level == "none":
             return
         child = np.random.SeedSequence([seed, *b"turbulence"])

@@ -31,6 +31,7 @@ class Kinematic:
 
     def __init__(self, config: Placement, rate_hz: float) -> None:
         self.rate_hz = rate_hz
+        self.failure = ""
         self._tick = 0
         self._lat = math.radians(config.lat_deg)
         self._lon = float(wrap_longitude(math.radians(config.lon_deg)))

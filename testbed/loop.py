@@ -36,11 +36,15 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """What `run` gives back: the recorded dataset, its metrics, and the folder written (None when in memory)."""
+    """What `run` gives back: the recorded dataset, its metrics, and the folder written (None when in memory).
+
+    ``failure`` is empty unless the motion ended early because control was lost; then it says how.
+    """
 
     dataset: xarray.DataTree
     metrics: dict[str, float]
     path: Path | None
+    failure: str = ""
 
 
 class Publisher(Protocol):
@@ -257,6 +261,8 @@ def run(
                 activity = "GNSS denied" if watch.denied else source.activity()
                 factor = t / max(time.perf_counter() - started, 1e-9)
                 progress(Progress(t, scenario.duration_s, factor, activity))
+        if source.failure:
+            emit((tick - 1) / rate_hz, "error", source.failure)
     finally:
         recorder.close()
         for link in links:
@@ -271,4 +277,4 @@ def run(
     }
     if out is not None:
         metrics.save(results, out / "metrics.json")
-    return RunResult(dataset, results, out)
+    return RunResult(dataset, results, out, source.failure)

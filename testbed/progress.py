@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from testbed import loop
 
-PLAIN_EVERY = 0.1  # of the whole
+PLAIN_LINES = 10  # for the whole
 PLAIN_EVERY_S = 5.0  # wall time
 
 Tell: TypeAlias = Callable[[float, str], None]
@@ -37,14 +37,15 @@ def shown(console: Console, title: str) -> Iterator[Tell]:
 
 
 def _plain(console: Console) -> Tell:
-    next_fraction = PLAIN_EVERY
+    shown = 0
     last_line = time.monotonic()
 
     def tell(fraction: float, text: str) -> None:
-        nonlocal next_fraction, last_line
-        if fraction < next_fraction and time.monotonic() - last_line < PLAIN_EVERY_S:
+        nonlocal shown, last_line
+        reached = int(fraction * PLAIN_LINES + 1e-9)  # a tenth of the whole is none in binary
+        if reached <= shown and time.monotonic() - last_line < PLAIN_EVERY_S:
             return
-        next_fraction = (fraction // PLAIN_EVERY + 1.0) * PLAIN_EVERY
+        shown = reached
         last_line = time.monotonic()
         console.print(f"{100.0 * fraction:3.0f} %  {text}", markup=False, highlight=False, soft_wrap=True)
 

@@ -64,11 +64,15 @@ class Start(Section):
 
 
 class Wind(Section):
-    """Wind over ground: one vector, or a profile of rows [alt_m, from_deg, speed_mps]; and turbulence on top."""
+    """Wind over ground: one vector, or a profile of rows [alt_m, from_deg, speed_mps]; and turbulence on top.
+
+    The gusts follow the run's seed, or ``turbulence_seed`` where runs of different seeds shall meet the same ones.
+    """
 
     from_deg: Heading = 0.0
     speed_mps: WindSpeed = 0.0
     turbulence: Literal["none", "light", "moderate", "severe"] = "none"
+    turbulence_seed: int | None = Field(default=None, ge=0, lt=2**63)
     profile: tuple[tuple[Altitude, Heading, WindSpeed], ...] = ()
 
     @model_validator(mode="after")

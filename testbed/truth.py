@@ -108,9 +108,13 @@ class TruthBlock:
 
 
 class MotionSource(Protocol):
-    """Whatever moves the body: a flight, a kinematic curve, a log."""
+    """Whatever moves the body: a flight, a kinematic curve, a log.
+
+    ``failure`` is empty unless the motion ended because control was lost; then it says how.
+    """
 
     rate_hz: float
+    failure: str
 
     def advance(self, ticks: int) -> TruthBlock:
         """The next ``ticks`` rows, fewer when the motion ends, none when it has ended. Starts at tick 0."""
@@ -181,6 +185,8 @@ class Replay:
     def __init__(self, folder: Path) -> None:
         stored = json.loads((folder / "motion.json").read_bytes())
         self.rate_hz = float(stored["rate_hz"])
+        self.failure = ""
+        self._failure = str(stored["failure"])
         self._rows = int(stored["rows"])
         self._columns = {name: np.load(folder / f"{name}.npy", mmap_mode="r") for name in COLUMNS}
         self._tick = 0
@@ -190,6 +196,8 @@ class Replay:
         rows = slice(self._tick, min(self._tick + ticks, self._rows))
         block = TruthBlock(self._tick, **{name: np.array(column[rows]) for name, column in self._columns.items()})
         self._tick += len(block)
+        if len(block) < ticks:
+            self.failure = self._failure
         return block
 
     def activity(self) -> str:
@@ -214,7 +222,9 @@ def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
             for name, column in columns.items():
                 column[rows : rows + len(block)] = getattr(block, name)
             rows += len(block)
-        (part / "motion.json").write_text(json.dumps({"rate_hz": source.rate_hz, "rows": rows}))
+        (part / "motion.json").write_text(
+            json.dumps({"rate_hz": source.rate_hz, "rows": rows, "failure": source.failure})
+        )
         part.rename(folder)
     except OSError as error:
         raise UserError(f"{folder}: can't store the flight: {error.strerror}") from None

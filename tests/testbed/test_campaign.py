@@ -139,6 +139,7 @@ def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
 
         def __init__(self) -> None:
             self.left = 30
+            self.failure = "control lost"
 
         def advance(self, ticks: int) -> TruthBlock:
             n = min(ticks, self.left)
@@ -149,7 +150,9 @@ def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
             return ""
 
     save_motion(Ends(), 100, tmp_path / "truth")
-    assert len(Replay(tmp_path / "truth").advance(100)) == 30
+    replay = Replay(tmp_path / "truth")
+    assert (len(replay.advance(30)), replay.failure) == (30, "")
+    assert (len(replay.advance(70)), replay.failure) == (0, "control lost")
 
 
 def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
@@ -284,13 +287,22 @@ def test_failing_run_is_reported_and_stops_no_other(
 
 def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Falls(Kinematic):
-        failure = "control lost: bank -90 deg"
+        def __init__(self) -> None:
+            start = {
+                "lat_deg": 10.0,
+                "lon_deg": 9.0,
+                "alt_m": 5.0,
+                "heading_deg": 1.0,
+                "pitch_deg": 2.0,
+                "roll_deg": 3.0,
+            }
+            super().__init__(SimpleNamespace(**start), 200.0)
+            self.failure = "control lost: bank -90 deg"
 
         def advance(self, ticks: int) -> TruthBlock:
             return super().advance(ticks if self._tick < 200 else 0)
 
-    start = SimpleNamespace(lat_deg=10.0, lon_deg=9.0, alt_m=5.0, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0)
-    monkeypatch.setattr(loop, "motion", lambda scenario, seed: Falls(start, 200.0))
+    monkeypatch.setattr(loop, "motion", lambda scenario, seed: Falls())
     result = campaign("u_turn", 2, scheduler=threads, out=tmp_path / "gusty")
     assert not result.outcomes
     assert [f.message for f in result.failures] == ["the flight ended early: control lost: bank -90 deg"] * 2

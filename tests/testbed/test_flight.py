@@ -265,6 +265,12 @@ def test_seeds_make_the_turbulence_and_flights_do_not_share_it() -> None:
     assert rms(blocks[0].wind_n - blocks[2].wind_n) > 0.5
 
 
+def test_turbulence_of_its_own_seed() -> None:
+    wind = {**GUSTY, "turbulence_seed": 3}
+    fixed, same, own = (flight(MANOEUVRES, seed, wind=w).advance(200) for seed, w in ((1, wind), (2, wind), (3, GUSTY)))
+    assert bits(fixed) == bits(same) == bits(own)
+
+
 def test_the_same_bits_in_another_process() -> None:
     here = bits(fly(flight(MANOEUVRES, 9, wind=GUSTY), 10.0))
     program = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, UpdateReport
-from testbed import Scenario, loop, record, run
+from testbed import Scenario, flight, loop, record, run
 from testbed.truth import MotionSource, TruthBlock
 
 SHORT = ["duration_s=40", "sensors.gnss.denied=[[20, 26]]"]
@@ -106,6 +107,7 @@ def test_crash_leaves_a_readable_record(tmp_path: Path) -> None:
         def __init__(self, inner: MotionSource) -> None:
             self.inner = inner
             self.rate_hz = inner.rate_hz
+            self.failure = ""
             self.ticks = 0
 
         def advance(self, ticks: int) -> TruthBlock:
@@ -124,6 +126,16 @@ def test_crash_leaves_a_readable_record(tmp_path: Path) -> None:
     assert t[0] == 0.0
     assert 24.0 <= t[-1] <= 25.0
     assert np.isfinite(dataset["estimators/ins"]["lat"].values[-1])
+
+
+def test_lost_control_is_an_event_and_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "MAX_ROLL", math.radians(20.0))  # which the U-turn exceeds
+    watcher = Watcher()
+    result = run(Scenario.load("u_turn", ["duration_s=60", "plan[0].length_m=500"]), links=[watcher])
+    end = result.dataset["truth"]["time"].values[-1]
+    assert 10.0 < end < 59.0
+    assert result.failure.startswith("control lost: bank")
+    assert watcher.events[-1] == (pytest.approx(end, abs=0.1), "error", result.failure)
 
 
 def test_metrics_and_record_are_written(tmp_path: Path) -> None:
