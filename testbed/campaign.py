@@ -18,7 +18,6 @@ import itertools
 import json
 import logging
 import math
-import os
 import shutil
 import time
 import traceback
@@ -36,7 +35,7 @@ import numpy as np
 import nav
 from nav.samples import Array
 from testbed import metrics
-from testbed.data import data_dir
+from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.scenario import FlightTruth, Scenario
 from testbed.truth import MotionSource, Replay, save_motion
@@ -268,17 +267,6 @@ def _claim(folder: Path, setup: Mapping[str, Any]) -> None:
         raise UserError(f"{folder}: can't write here ({error.strerror}): choose another folder with --out") from None
     except (ValueError, AttributeError):
         raise UserError(f"{file}: is damaged: {advice}") from None
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all. Raises UserError when it can't be written."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UserError(f"{path}: can't be written: {error.strerror}") from None
 
 
 def _stem(folder: Path, combination: int, seed: int) -> Path:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nav.samples import Array
+from testbed.data import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -164,8 +165,6 @@ def _longest(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
 
 def save(result: CampaignResult) -> None:
     """Write campaign.csv (one line per run), campaign.json (statistics and failures) and the figures."""
-    from testbed.campaign import write_file
-
     write_file(result.path / "campaign.csv", _csv(result).encode())
     write_file(result.path / "campaign.json", json.dumps(_json(result), indent=1).encode())
     for name, figure in figures(result).items():

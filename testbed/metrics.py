@@ -9,7 +9,7 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
 * NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident.
-* A quantity that could not be formed (no outage, never aligned) has no key. Nothing is ever NaN.
+* A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
 
 from __future__ import annotations
@@ -279,10 +279,10 @@ def _outage_marks(e: Errors, windows: list[Window]) -> dict[str, float]:
 def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
     """Seconds from reacquisition until the horizontal error is below `RECOVERED_M` for `RECOVERED_HOLD_S`.
 
-    The worst of all outages. Where it never is, the time to the next outage or the end of the run, whichever is
-    first. Non-finite rows count as bad.
+    The worst of all outages. Outages after which it never is, before the next one or the end of the run, are counted
+    instead, and there is no such time. Non-finite rows count as bad.
     """
-    found = []
+    found, never = [], 0
     for k, (start, end) in enumerate(windows):
         until = windows[k + 1][0] if k + 1 < len(windows) else np.inf
         rows = np.flatnonzero((e.t >= end) & (e.t < until))
@@ -294,8 +294,13 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
         bad_at = np.where(good, np.inf, t)
         next_bad = np.minimum.accumulate(bad_at[::-1])[::-1]
         held = good & ((next_bad - t >= RECOVERED_HOLD_S) | np.isinf(next_bad))
-        found.append(float(t[np.argmax(held)] - end if held.any() else t[-1] - end))
-    return {"recovery_s": max(found)} if found else {}
+        if held.any():
+            found.append(float(t[np.argmax(held)] - end))
+        else:
+            never += 1
+    if never:
+        return {"unrecovered_outages": never}
+    return {"recovery_s": max(found), "unrecovered_outages": 0} if found else {}
 
 
 def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:

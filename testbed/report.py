@@ -56,6 +56,7 @@ OUTAGE_ROWS = tuple(
 )
 RUN_ROWS = (
     ("recovery_s", "back below 5 m after [s]"),
+    ("unrecovered_outages", "outages it did not recover from"),
     ("aligned_s", "aligned at [s]"),
     ("nonfinite_samples", "estimates that are not finite"),
 )

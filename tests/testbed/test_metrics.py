@@ -171,19 +171,27 @@ def recovering(path: Path, bad_until: float, relapse: float | None = None) -> di
 
 @pytest.mark.parametrize(
     ("bad_until", "relapse", "expected"),
-    [(95.0, None, 0.0), (107.0, None, 7.0), (107.0, 120.0, 21.0), (107.0, 170.0, 7.0), (300.0, None, 100.0)],
+    [(95.0, None, 0.0), (107.0, None, 7.0), (107.0, 120.0, 21.0), (107.0, 170.0, 7.0)],
 )
 def test_recovery_is_when_it_stays_good(
     tmp_path: Path, bad_until: float, relapse: float | None, expected: float
 ) -> None:
-    assert recovering(tmp_path, bad_until, relapse)["ins.recovery_s"] == pytest.approx(expected, abs=0.11)
+    found = recovering(tmp_path, bad_until, relapse)
+    assert found["ins.recovery_s"] == pytest.approx(expected, abs=0.11)
+    assert found["ins.unrecovered_outages"] == 0
+
+
+def test_no_recovery_is_no_time(tmp_path: Path) -> None:
+    found = recovering(tmp_path, 300.0)
+    assert "ins.recovery_s" not in found
+    assert found["ins.unrecovered_outages"] == 1
 
 
 def test_no_outage_no_outage_keys() -> None:
     for gnss in (True, False):
         found = metrics.compute(synthetic_run.dataset(100.0, gnss=gnss))
         assert "ins.position_horizontal_rms_m" in found
-        assert not [key for key in found if "outage" in key or "recovery" in key]
+        assert not [key for key in found if "outage" in key or "recover" in key]
 
 
 def test_outages_need_every_receiver_to_be_without_fix() -> None:
