@@ -11,15 +11,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from testbed.scenario import EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
-from testbed.sensors.airspeed import AirspeedConfig
+from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
 from testbed.sensors.gnss import GnssConfig
 from testbed.sensors.imu import ImuConfig, ImuErrors
@@ -28,10 +26,15 @@ from testbed.sensors.magnetometer import MagnetometerConfig
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 TURN_RATE = 0.06  # of a usual turn of this aircraft [rad/s]
 LOAD_CHANGE = 0.1  # and the change of its load factor
-MANOEUVRE_S = 30.0  # between changes of these
+MANOEUVRE_S = 120.0  # between changes of these
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
+SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
+GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
+SHORT_GUSTS = 0.3  # what is faster than that, and the vertical gust that no state takes [m/s]
+WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
+SIDESLIP = 0.5  # of a coordinated flight [m/s]
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,27 +119,23 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
         m = magnetometer.errors()
         told |= {
             "magnetometer_sigma": m.noise,
-            "magnetometer_error_sigma": m.soft_iron * FIELD_SIZE,
-            "magnetometer_anomaly_sigma": m.soft_iron * FIELD_SIZE,
+            "magnetometer_error_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
+            "magnetometer_anomaly_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
             "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * PAYLOAD_CURRENT),
         }
     airspeed = kinds.get("airspeed")
     if isinstance(airspeed, AirspeedConfig):
         a = airspeed.errors()
         told |= {
-            "airspeed_sigma": math.hypot(a.noise, 0.3),
-            "airspeed_scale_sigma": math.hypot(a.scale, a.bias / 25.0),
-            "gust_sigma": 1.0,
-            "gust_correlation_s": 8.0,
-            "sideslip_sigma": 0.5,
+            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS),
+            "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
+            "gust_sigma": config.gust_mps,
+            "gust_correlation_s": GUST_TIME_S,
+            "wind_walk": WIND_WALK,
+            "sideslip_sigma": SIDESLIP,
         }
     ins = Ins(
-        InsConfig(
-            imu=imu_model(errors),
-            mounting_sigma=math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality),
-            aids=tuple(kinds),
-            **told,
-        ),  # type: ignore[arg-type]
+        InsConfig(imu_model(errors), tuple(kinds), mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
         partial(geomagnetic_field_n, date=scenario.date),
     )
     # Every sensor is offered: what is no aid still serves the alignment.

@@ -132,6 +132,7 @@ class EstimatorConfig(Section):
     kind: Literal["ins"] = "ins"
     imu: str = "imu"
     aids: tuple[str, ...]
+    gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
 
 
 class AutopilotConfig(Section):
