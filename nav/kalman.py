@@ -54,30 +54,31 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
 
 @njit
 def innovate(P: Array, H: Array, R: Array, nu: Array) -> tuple[Array, Array, Array, float]:
-    """(S, S^-1, P H', nis) of an innovation ``nu`` (m,): S = H P H' + diag(R), nis = nu' S^-1 nu.
+    """(S, S^-1, H P, nis) of an innovation ``nu`` (m,): S = H P H' + diag(R), nis = nu' S^-1 nu.
 
     ``H`` (m, n), variances ``R`` (m,). When rounding has left S not positive definite, nis is NaN.
     """
     m, n = H.shape
-    S, PHt = np.zeros((m, m)), np.zeros((n, m))
+    S, HP = np.zeros((m, m)), np.zeros((m, n))
     for i in range(m):
         for k in range(n):
             a = H[i, k]
             if a != 0.0:
                 for j in range(n):
-                    PHt[j, i] += a * P[k, j]
+                    HP[i, j] += a * P[k, j]
     for i in range(m):
         for j in range(i, m):
             total = R[i] if i == j else 0.0
             for k in range(n):
-                total += H[i, k] * PHt[k, j]
+                if H[i, k] != 0.0:
+                    total += H[i, k] * HP[j, k]
             S[i, j] = S[j, i] = total
     S_inverse, definite = invert(S)
     nis = 0.0 if definite else math.nan
     for i in range(m):
         for j in range(m):
             nis += nu[i] * S_inverse[i, j] * nu[j]
-    return S, S_inverse, PHt, nis
+    return S, S_inverse, HP, nis
 
 
 @njit
@@ -112,7 +113,7 @@ def invert(S: Array) -> tuple[Array, bool]:
 
 
 @njit
-def correct(P: Array, H: Array, R: Array, PHt: Array, S_inverse: Array, nu: Array) -> Array:
+def correct(P: Array, H: Array, R: Array, HP: Array, S_inverse: Array, nu: Array) -> Array:
     """Update ``P`` in place and return K nu (n,), what to add to the estimate; K = P H' S^-1, in Joseph's form:
 
     P <- (I - K H) P (I - K H)' + K R K'
@@ -120,26 +121,33 @@ def correct(P: Array, H: Array, R: Array, PHt: Array, S_inverse: Array, nu: Arra
     It stays symmetric and positive for any gain, whatever rounding did to K. The other arguments as in `innovate`.
     """
     m, n = H.shape
-    K, correction = np.zeros((n, m)), np.zeros(n)
-    for i in range(n):
-        for j in range(m):
-            for k in range(m):
-                K[i, j] += PHt[i, k] * S_inverse[k, j]
-            correction[i] += K[i, j] * nu[j]
-    # left = (I - K H) P, then P = left (I - K H)' + K R K'
-    left_Ht = np.zeros((n, m))
+    KT, correction = np.zeros((m, n)), np.zeros(n)  # K', so that every inner loop runs along a row
+    for j in range(m):
+        for k in range(m):
+            for i in range(n):
+                KT[j, i] += S_inverse[k, j] * HP[k, i]
+        for i in range(n):
+            correction[i] += KT[j, i] * nu[j]
+    # left = (I - K H) P in place, then P = left (I - K H)' + K R K' = left + (K R - left H') K'
     for i in range(n):
         for k in range(m):
-            a = K[i, k]
+            a = KT[k, i]
             for j in range(n):
-                P[i, j] -= a * PHt[j, k]
-        for k in range(m):
-            for j in range(n):
-                left_Ht[i, k] += P[i, j] * H[k, j]
+                P[i, j] -= a * HP[k, j]
+    factor = np.zeros((m, n))
+    for k in range(m):
+        for i in range(n):
+            factor[k, i] = KT[k, i] * R[k]
+        for j in range(n):
+            h = H[k, j]
+            if h != 0.0:
+                for i in range(n):
+                    factor[k, i] -= P[i, j] * h
     for i in range(n):
-        for j in range(i, n):
-            total = P[i, j]
-            for k in range(m):
-                total += (K[i, k] * R[k] - left_Ht[i, k]) * K[j, k]
-            P[i, j] = P[j, i] = total
+        for k in range(m):
+            a = factor[k, i]
+            for j in range(i, n):
+                P[i, j] += a * KT[k, j]
+        for j in range(i + 1, n):
+            P[j, i] = P[i, j]
     return correction

@@ -38,10 +38,10 @@ def test_update_is_the_dense_equation(m):
     left = np.eye(n) - K @ H
     expected = left @ P @ left.T + K @ np.diag(R) @ K.T
 
-    S, S_inverse, PHt, nis = innovate(P, H, R, nu)
+    S, S_inverse, HP, nis = innovate(P, H, R, nu)
     np.testing.assert_allclose(S, S_dense, rtol=1e-12)
     np.testing.assert_allclose(nis, nu @ solve(S_dense, nu), rtol=1e-10)
-    np.testing.assert_allclose(correct(P, H, R, PHt, S_inverse, nu), K @ nu, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(correct(P, H, R, HP, S_inverse, nu), K @ nu, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(P, expected, rtol=1e-9, atol=1e-10)
     assert (P == P.T).all()
 
@@ -73,7 +73,7 @@ def test_positive_after_ten_thousand_sharp_updates():
         H = rng.normal(size=(3, n)) / scale
         R = np.full(3, 1e-6)
         nu = rng.normal(size=3)
-        _, S_inverse, PHt, _ = innovate(P, H, R, nu)
-        correct(P, H, R, PHt, S_inverse, nu)
+        _, S_inverse, HP, _ = innovate(P, H, R, nu)
+        correct(P, H, R, HP, S_inverse, nu)
     assert (P == P.T).all()
     assert np.linalg.eigvalsh(P / np.outer(scale, scale)).min() > 0
