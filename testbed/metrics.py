@@ -6,6 +6,7 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Keys without prefix: while GNSS has a fix (or all the time, in a run without GNSS receiver), but not the first
   `RECOVERY_WINDOW_S` after an outage, which ``recovery_s`` judges by itself.
 * Keys with ``outage_`` in front: while no receiver has a fix, up to the arrival of the next fix.
+* An estimate is of the point where its IMU sits, and is compared with the true position and velocity of that point.
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
 * NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident.
@@ -107,6 +108,10 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         estimated("lat"), estimated("lon"), estimated("h"), true("lat"), true("lon"), true("h")
     )
     velocity = estimated("v_n") - true("v_n")
+    # Truth is of the centre of gravity, the estimate of the IMU. (The Earth's own rate does 1e-4 m/s per metre.)
+    arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator])
+    position -= _rotate(true("q_nb"), np.broadcast_to(arm_b, position.shape))
+    velocity -= _rotate(true("q_nb"), np.cross(true("omega_b"), arm_b))
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
     aligned = (column(dataset, f"{own}/status")[rows] & Status.ALIGNED) != 0
@@ -138,6 +143,13 @@ def _common(t: Array, t_true: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[
     at = np.clip(np.searchsorted(t_true, t - SAME_TIME_S), 0, len(t_true) - 1)
     rows = np.flatnonzero(np.abs(t_true[at] - t) <= SAME_TIME_S)
     return rows, at[rows]
+
+
+def _rotate(q: Array, v: Array) -> Array:
+    """Vectors (N, 3) in the axes that quaternions (N, 4) take them to."""
+    twice = 2 * np.cross(q[:, 1:], v)
+    turned: Array = v + q[:, :1] * twice + np.cross(q[:, 1:], twice)
+    return turned
 
 
 def attitude_error(q: Array, q_true: Array) -> Array:

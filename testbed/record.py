@@ -399,6 +399,7 @@ class Recorder:
             "duration_s": float(scenario.duration_s),
             "record_rate_hz": float(scenario.record.rate_hz),
             "versions": json.dumps(_versions()),
+            "estimated_point_b_m": json.dumps({e.name: scenario.sensors[e.imu].lever_arm_m for e in scenario.estimator}),
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }
