@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -59,6 +60,7 @@ class FusionHorizon:
         self.coning = coning
         self._raw: ImuSamples | None = None  # last raw increment, for the compensation of the next
         self._imu = ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+        self._ends: list[float] = []  # its times
         self._next = 0  # first row of _imu that the estimator has not used
         self._t = -math.inf  # up to where the estimator has come
         self._queue: list[tuple[float, str, int, Sample]] = []
@@ -85,7 +87,7 @@ class FusionHorizon:
         for t in times:
             self._use(t - self.lag_s, reports)
             estimates.append(self.estimate_at(t))
-        self._use((float(self._imu.t[-1]) if len(self._imu) else self._t) - self.lag_s, reports)
+        self._use((self._ends[-1] if self._ends else self._t) - self.lag_s, reports)
         return reports, estimates
 
     def estimate_at(self, t: float) -> Estimate:
@@ -100,8 +102,8 @@ class FusionHorizon:
             raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
         stop = self._row_after(t)
         front = _cut(self._imu, self._next, stop)
-        if len(front) == 0 or front.t[-1] < t - COINCIDENT:
-            if stop == len(self._imu):
+        if stop == self._next or self._ends[stop - 1] < t - COINCIDENT:
+            if stop == len(self._ends):
                 raise ValueError(f"no inertial samples up to {t} s")
             front = _join(front, self._part(stop, t))
         return self.estimator.predict(front)
@@ -125,12 +127,13 @@ class FusionHorizon:
         ready = compensate(imu, self._raw) if self.coning else imu
         self._raw = _cut(imu, len(imu) - 1, len(imu))
         self._imu = _join(_cut(self._imu, self._next, len(self._imu)), ready)
+        self._ends = self._imu.t.tolist()
         self._next = 0
 
     def _advance(self, t: float) -> None:
         """Bring the estimator to ``t``, splitting an increment in which it falls."""
         self._propagate_to(t)
-        if t > self._t + COINCIDENT and self._next < len(self._imu):
+        if t > self._t + COINCIDENT and self._next < len(self._ends):
             part = self._part(self._next, t)
             for rest, used in ((self._imu.dt, part.dt), (self._imu.dtheta, part.dtheta), (self._imu.dv, part.dv)):
                 rest[self._next] -= used[0]
@@ -142,11 +145,11 @@ class FusionHorizon:
         stop = self._row_after(t)
         if stop > self._next:
             self.estimator.propagate(_cut(self._imu, self._next, stop))
-            self._t = float(self._imu.t[stop - 1])
+            self._t = self._ends[stop - 1]
             self._next = stop
 
     def _row_after(self, t: float) -> int:
-        return max(self._next, int(np.searchsorted(self._imu.t, t + COINCIDENT, side="right")))
+        return bisect_right(self._ends, t + COINCIDENT, self._next)
 
     def _part(self, row: int, t: float) -> ImuSamples:
         """The part of one increment up to ``t``: rate and force are constant over an increment."""
