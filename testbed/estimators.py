@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.samples import Array, ImuSamples
 from testbed.scenario import EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
@@ -32,18 +33,32 @@ FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
 GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
-SHORT_GUSTS = 0.3  # what is faster than that, and the vertical gust that no state takes [m/s]
+SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
-SIDESLIP = 0.5  # of a coordinated flight [m/s]
+SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """An estimator behind its fusion horizon: the IMU it integrates, the sensors whose samples it is handed."""
+    """An estimator behind its fusion horizon: the IMU it integrates, the sensors whose samples it is handed.
+
+    ``C_sb`` (3, 3) is how the IMU is mounted. The estimate is of the point where the IMU sits.
+    """
 
     horizon: FusionHorizon
     imu: str
+    C_sb: Array
     sensors: tuple[str, ...]
+
+    def in_body_axes(self, imu: ImuSamples) -> ImuSamples:
+        """The increments of the IMU, turned back by its mounting."""
+        return replace(imu, dtheta=_turned_back(self.C_sb, imu.dtheta), dv=_turned_back(self.C_sb, imu.dv))
+
+
+def _turned_back(C_sb: Array, x_s: Array) -> Array:
+    """C_sb' x of each row; written out, since the sums of a matrix product depend on the number of rows."""
+    x_b: Array = x_s[:, 0:1] * C_sb[0] + x_s[:, 1:2] * C_sb[1] + x_s[:, 2:3] * C_sb[2]
+    return x_b
 
 
 def build(scenario: Scenario) -> dict[str, Running]:
@@ -127,12 +142,12 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     if isinstance(airspeed, AirspeedConfig):
         a = airspeed.errors()
         told |= {
-            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS),
+            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * config.gust_mps),
             "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
             "gust_sigma": config.gust_mps,
             "gust_correlation_s": GUST_TIME_S,
             "wind_walk": WIND_WALK,
-            "sideslip_sigma": SIDESLIP,
+            "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * config.gust_mps),
         }
     ins = Ins(
         InsConfig(imu_model(errors), tuple(kinds), mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
@@ -141,4 +156,6 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     # Every sensor is offered: what is no aid still serves the alignment.
     offered = tuple(name for name, section in scenario.sensors.items() if not isinstance(section, ImuConfig))
     lag_s = max((scenario.sensors[name].latency_s for name in offered), default=0.0)  # type: ignore[union-attr]
-    return Running(FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz), config.imu, offered)
+    return Running(
+        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz), config.imu, errors.C_sb, offered
+    )
