@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import xarray
 
 BATCH_S = 1.0  # simulated time per turn of the loop when nobody is watching
+EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
 
@@ -154,6 +155,14 @@ class _Latest:
         return arrived
 
 
+def _take(reports: deque[UpdateReport], until: float) -> list[UpdateReport]:
+    """Remove and give the reports on samples up to a time."""
+    taken = []
+    while reports and reports[0].t <= until:
+        taken.append(reports.popleft())
+    return taken
+
+
 def run(
     scenario: Scenario,
     *,
@@ -190,6 +199,7 @@ def run(
 
     ticks = round(scenario.duration_s * rate_hz) + 1
     record_every = round(rate_hz / scenario.record.rate_hz)
+    events_every = max(1, round(EVENTS_S * rate_hz))
     publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
     chunk = publish_every if realtime and links else round(BATCH_S * rate_hz)
     pacer = Pacer(realtime) if realtime else None
@@ -203,7 +213,9 @@ def run(
     watch = _EventWatch(emit)
     latest = _Latest()
     shown = next(iter(filters), None)  # the estimator that the links show first
-    unshown: deque[UpdateReport] = deque()
+    unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
+    unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
+    arrived: list[Sample] = []  # nor these
     truth_s = 0.0
     try:
         tick = 0
@@ -220,39 +232,45 @@ def run(
             outputs = [
                 k
                 for k in range(len(block))
-                if (tick + k) % record_every == 0 or (publish_every and (tick + k) % publish_every == 0)
+                if (tick + k) % record_every == 0
+                or (tick + k) % events_every == 0
+                or (publish_every and (tick + k) % publish_every == 0)
             ]
             times = [float(block.t[k]) for k in outputs]
             estimates: dict[str, list[Estimate]] = {}
+            integrated: dict[str, ImuSamples] = {}
             for name, one in filters.items():
                 handed = [sample for aid in one.sensors for sample in samples[aid]]
-                reports, estimates[name] = one.horizon.track(imu[one.imu], handed, times)
+                integrated[name] = one.in_body_axes(imu[one.imu])
+                reports, estimates[name] = one.horizon.track(integrated[name], handed, times)
                 recorder.reports(name, reports)
+                unread[name].extend(reports)
                 if links and name == shown:
                     unshown.extend(reports)
-                for report in reports:
-                    watch.report(name, report)
             recorder.truth(block)
             for name, increments in imu.items():
                 recorder.imu(name, increments)
             for name, own in samples.items():
                 recorder.samples(name, own)
             for i, k in enumerate(outputs):
-                for sample in latest.until(times[i]):
-                    watch.sample(sample)
-                watch.row(times[i], block.leg[k], plan)
+                arrived += latest.until(times[i])
                 now = [(name, values[i]) for name, values in estimates.items()]
-                for name, estimate in now:
-                    watch.estimate(name, estimate)
-                    if (tick + k) % record_every == 0:
+                if (tick + k) % events_every == 0:
+                    for sample in arrived:
+                        watch.sample(sample)
+                    arrived.clear()
+                    watch.row(times[i], block.leg[k], plan)
+                    for name, estimate in now:
+                        watch.estimate(name, estimate)
+                        for report in _take(unread[name], times[i] - filters[name].horizon.lag_s):
+                            watch.report(name, report)
+                if (tick + k) % record_every == 0:
+                    for name, estimate in now:
                         recorder.estimate(name, estimate)
                 if publish_every and (tick + k) % publish_every == 0 and shown is not None:
-                    increments = imu[filters[shown].imu]
-                    due = []
-                    while unshown and unshown[0].t + filters[shown].horizon.lag_s <= times[i]:
-                        due.append(unshown.popleft())
+                    due = _take(unshown, times[i] - filters[shown].horizon.lag_s)
                     for link in links:
-                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, increments, now[1:], due)
+                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, integrated[shown], now[1:], due)
             tick += len(block)
             t = float(block.t[-1])
             if pacer is not None:

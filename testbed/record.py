@@ -30,7 +30,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     import xarray
 
     from testbed.scenario import Scenario
+    from testbed.sensors.imu import ImuConfig
 
 Data: TypeAlias = npt.NDArray[Any]
 
@@ -399,7 +400,9 @@ class Recorder:
             "duration_s": float(scenario.duration_s),
             "record_rate_hz": float(scenario.record.rate_hz),
             "versions": json.dumps(_versions()),
-            "estimated_point_b_m": json.dumps({e.name: scenario.sensors[e.imu].lever_arm_m for e in scenario.estimator}),
+            "estimated_point_b_m": json.dumps(
+                {own.name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m for own in scenario.estimator}
+            ),
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }

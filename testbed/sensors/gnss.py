@@ -41,6 +41,7 @@ COLUMNS: dict[str, Column] = {
 }
 
 NO_FIX_DOP = 99.99  # what receivers report when they have none
+REPORTED_AT_LEAST = 1e-3  # accuracy is reported in whole millimetres, never as none at all [m], [m/s]
 SATELLITES_SIGMA = 1.0  # how the number in view comes and goes
 SATELLITES_TAU = 300.0  # [s]
 MIN_SATELLITES = 5  # below which this receiver would not call it a 3D fix
@@ -220,8 +221,8 @@ class Gnss:
             dt,
         )
         self._sky = Process.gauss_markov(stream(seed, name, "sky"), [SATELLITES_SIGMA], SATELLITES_TAU, dt)
-        self._sigma_position_n = np.hypot(e.position_white_n, e.position_correlated_n)
-        self._sigma_velocity_n = np.hypot(e.velocity_white_n, e.velocity_correlated_n)
+        self._sigma_position_n = np.maximum(np.hypot(e.position_white_n, e.position_correlated_n), REPORTED_AT_LEAST)
+        self._sigma_velocity_n = np.maximum(np.hypot(e.velocity_white_n, e.velocity_correlated_n), REPORTED_AT_LEAST)
         self._jammers = [
             (ecef_from_geodetic(j.lat_deg * DEG, j.lon_deg * DEG, 0.0), j.radius_m) for j in config.jammers
         ]

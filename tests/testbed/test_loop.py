@@ -78,6 +78,16 @@ def test_live_and_batch_give_the_same_bits() -> None:
     assert not same(batch.dataset, run(scenario, seed=4).dataset)
 
 
+def test_a_known_mounting_is_undone_and_truth_is_taken_at_the_imu() -> None:
+    quiet = ["sensors.imu.grade=perfect", "sensors.gnss.grade=rtk", "estimator[0].aids=['gnss']", "duration_s=100"]
+    mounted = ["sensors.imu.mounting_deg=[20,-40,135]", "sensors.imu.lever_arm_m=[2,-1,0.5]"]
+    found = run(Scenario.load("u_turn", [*quiet, *mounted])).metrics
+    assert found["ins.position_horizontal_max_m"] < 0.05
+    assert found["ins.velocity_rms_mps"] < 0.002
+    assert found["ins.roll_pitch_max_deg"] < 0.001
+    assert found["ins.heading_max_deg"] < 0.01
+
+
 @pytest.mark.parametrize("batch_s", [0.065, 0.25, 7.0])
 def test_result_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch, batch_s: float) -> None:
     scenario = Scenario.load("u_turn", [*SHORT, "sensors.gnss.latency_s=0.13"])
