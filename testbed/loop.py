@@ -7,11 +7,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
 from testbed import estimators, metrics, sensors
+from testbed.ahead import Ahead
 from testbed.pacer import Pacer
 from testbed.record import Recorder
 from testbed.scenario import FlightTruth, Scenario
@@ -20,7 +22,8 @@ from testbed.truth import MotionSource, TruthBlock
 if TYPE_CHECKING:
     import xarray
 
-BATCH_S = 1.0  # simulated time per turn of the loop when nobody is watching
+BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
+PACED_S = 1.0  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
@@ -183,8 +186,7 @@ def run(
     """
     seed = scenario.seed if seed is None else seed
     started = time.perf_counter()
-    source = motion(scenario, seed) if source is None else source
-    rate_hz = source.rate_hz
+    rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
     site = scenario.site()
     inertial: dict[str, sensors.Imu] = {}
     aiding: dict[str, sensors.AidingSensor] = {}
@@ -201,9 +203,14 @@ def run(
     record_every = round(rate_hz / scenario.record.rate_hz)
     events_every = max(1, round(EVENTS_S * rate_hz))
     publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
-    chunk = publish_every if realtime and links else round(BATCH_S * rate_hz)
+    chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
     pacer = Pacer(realtime) if realtime else None
     recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
+    ahead = None
+    if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
+        source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
+    elif source is None:
+        source = motion(scenario, seed)
 
     def emit(t: float, severity: str, text: str) -> None:
         recorder.event(t, severity, text)
@@ -282,6 +289,8 @@ def run(
         if source.failure:
             emit((tick - 1) / rate_hz, "error", source.failure)
     finally:
+        if ahead is not None:
+            ahead.close()
         recorder.close()
         for link in links:
             link.close()
