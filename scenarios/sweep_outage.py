@@ -1,14 +1,15 @@
 """How the position error grows with the length of the outage: a sweep from Python.
 
-python scenarios/sweep_outage.py [--seeds 5] [--out runs/sweep_outage]
+python scenarios/sweep_outage.py [--lengths 30 60 120 …] [--seeds 5] [--out runs/sweep_outage]
 
-Flies `loiter_gnss_outage` with outages of 30 s to 10 min, several seeds each, and plots the largest horizontal error
-in the outage against its length.
+Flies `loiter_gnss_outage` with outages of several lengths and several seeds each, and plots the largest horizontal
+error in the outage against its length.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -20,7 +21,7 @@ START_S = 600
 LENGTHS_S = (30, 60, 120, 240, 420, 600)
 
 
-def sweep(lengths_s: tuple[int, ...], seeds: int) -> dict[int, list[float]]:
+def sweep(lengths_s: Sequence[int], seeds: int) -> dict[int, list[float]]:
     """Largest horizontal error in the outage [m] by outage length [s], one value per seed."""
     errors: dict[int, list[float]] = {}
     for length in lengths_s:
@@ -38,13 +39,19 @@ def sweep(lengths_s: tuple[int, ...], seeds: int) -> dict[int, list[float]]:
     return errors
 
 
+def parser() -> argparse.ArgumentParser:
+    """What can be given on the command line."""
+    arguments = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    arguments.add_argument("--lengths", type=int, nargs="+", default=LENGTHS_S, metavar="S", help="of the outages")
+    arguments.add_argument("--seeds", type=int, default=5, metavar="N", help="flights per length")
+    arguments.add_argument("--out", type=Path, default=Path("runs/sweep_outage"), metavar="DIR")
+    return arguments
+
+
 def main() -> None:
     """Sweep, print, plot."""
-    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--seeds", type=int, default=5)
-    arguments.add_argument("--out", type=Path, default=Path("runs/sweep_outage"))
-    options = arguments.parse_args()
-    errors = sweep(LENGTHS_S, options.seeds)
+    options = parser().parse_args()
+    errors = sweep(options.lengths, options.seeds)
 
     options.out.mkdir(parents=True, exist_ok=True)
     figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")

@@ -100,7 +100,7 @@ def run(
     overrides: Overrides = None,
     mavlink: Annotated[
         list[str] | None,
-        typer.Option(metavar="URL", help="Stream to udpout:HOST:PORT, tcp:HOST:PORT or tlog:FILE; repeatable."),
+        typer.Option(metavar="URL", help="Stream to udpout, tcp or tcpin:HOST:PORT, or to tlog:FILE; repeatable."),
     ] = None,
     realtime: Annotated[
         float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
