@@ -77,8 +77,8 @@ def test_one_run_of_the_consumer_unit_gives_back_its_random_walk():
     gyro, accel = gyro[:, :30_000], accel[:, :30_000]
     arw = np.sqrt(np.mean([allan_variance(axis, 1.0) for axis in gyro])) / DEG_PER_ROOT_H
     vrw = np.sqrt(np.mean([allan_variance(axis, 1.0) for axis in accel])) * 60
-    assert arw == pytest.approx(0.84, rel=0.05)
-    assert vrw == pytest.approx(0.103, rel=0.05)
+    assert arw == pytest.approx(config.angle_random_walk_degprth, rel=0.05)
+    assert vrw == pytest.approx(config.velocity_random_walk_mpsprth, rel=0.05)
 
 
 @pytest.mark.slow

@@ -33,7 +33,8 @@ def test_perfect_receiver_is_truth_bit_for_bit():
         assert [getattr(s, name) for s in samples] == getattr(truth, name)[rows].tolist()
     np.testing.assert_array_equal([s.v_n for s in samples], truth.v_n[rows])
     assert all(s.fix_type == FixType.FIX_3D and s.sensor == "gnss" for s in samples)
-    assert not any(s.sigma_position_n.any() or s.sigma_velocity_n.any() for s in samples)
+    # A receiver reports millimetres; an accuracy of nothing at all would be refused as unsound.
+    assert all((s.sigma_position_n == 1e-3).all() and (s.sigma_velocity_n == 1e-3).all() for s in samples)
 
 
 def test_timing():
