@@ -51,6 +51,7 @@ from nav.strapdown import step
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
 RECENT_S = 2.0  # a position this fresh counts as aided (`Status.GNSS_FUSED`)
+BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
@@ -198,7 +199,7 @@ class Ins:
         self._monitor = GnssMonitor(
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
-        self._bad_sample = False
+        self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: _State | None = None
         self._alignment = Alignment(
             config.imu,
@@ -277,8 +278,8 @@ class Ins:
             return
         if self._state is None:
             self._alignment.propagate(imu)
-        elif self._run(self._state, imu):
-            self._bad_sample = True
+        else:
+            self._last_bad = max(self._last_bad, self._run(self._state, imu))
         self.t = float(imu.t[-1])
 
     def accepts(self, sample: Sample) -> bool:
@@ -297,7 +298,7 @@ class Ins:
             return []
         trouble = aiding.problem(sample)
         if trouble:
-            self._bad_sample = True
+            self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
             return [_refused(sample, trouble)]
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
@@ -322,22 +323,25 @@ class Ins:
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
-        return self._estimate(self._state.copy() if self._state is not None else None, self.t)
+        return self._estimate(self._state.copy() if self._state is not None else None, self.t, self._last_bad)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments, the filter itself staying where it is."""
         state = self._state.copy() if self._state is not None else None
-        if state is not None and len(imu) and self._run(state, imu):
-            self._bad_sample = True
-        return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t)
+        last_bad = self._last_bad
+        if state is not None and len(imu):
+            last_bad = max(last_bad, self._run(state, imu))
+        return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _run(self, state: _State, imu: ImuSamples) -> int:
+    def _run(self, state: _State, imu: ImuSamples) -> float:
+        """Propagate a state; the time of the last increment that was not usable, -inf when all were."""
         s, c = state, self._constants
-        return _propagate(
+        bad = _propagate(
             s.q_nb, s.v_n, s.lla, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
             c.driven, c.decay_rate, c.variance_rate, c.Phi, c.FT, c.decay, c.half_noise, c.work,
             self.config.covariance_period, imu.dtheta, imu.dv, imu.dt,
         )  # fmt: skip
+        return float(imu.t[bad]) if bad >= 0 else -math.inf
 
     def _settle(self, state: _State) -> None:
         """Bring the covariance up to the time of the motion."""
@@ -452,10 +456,9 @@ class Ins:
             self._field_value = np.array(self._field_model(lla[0], lla[1], lla[2]), dtype=float)
         return self._field_value
 
-    def _estimate(self, state: _State | None, t: float) -> Estimate:
+    def _estimate(self, state: _State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` of its own."""
-        bad = Status.BAD_SAMPLE if self._bad_sample else Status(0)
-        self._bad_sample = False
+        bad = Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status(0)
         if state is None:
             nothing = np.full(3, np.nan)
             return Estimate(
@@ -571,8 +574,8 @@ def _propagate(
     driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
     work: Array, period: int, dtheta: Array, dv: Array, dt: Array,
 ) -> int:  # fmt: skip
-    """Strapdown and covariance over N increments in place; how many increments were not usable."""
-    bad = 0
+    """Strapdown and covariance over N increments in place; the last of them that was not usable, -1 for none."""
+    bad = -1
     angle, push = np.empty(3), np.empty(3)
     C_old = dcm_from_quat(q_nb)
     for k in range(len(dt)):
@@ -587,7 +590,7 @@ def _propagate(
             for i in range(3):
                 rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
         else:
-            bad += 1
+            bad = k
         for i in range(3):
             angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
             push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])

@@ -33,7 +33,7 @@ class Status(IntFlag):
     ALIGNED = 2
     GNSS_FUSED = 4  # a GNSS sample was fused within the last two seconds
     DEAD_RECKONING = 8  # aligned, and no position aid is being fused
-    BAD_SAMPLE = 16  # a non-finite or out-of-range sample was refused since the last estimate
+    BAD_SAMPLE = 16  # a non-finite or out-of-range sample was refused within the last second
 
 
 @dataclass(frozen=True, slots=True)
