@@ -29,6 +29,11 @@ class Estimator(Protocol):
         """Advance by a block of increments; how the increments are cut into blocks makes no difference."""
         ...
 
+    @property
+    def listening(self) -> bool:
+        """Whether a sample of some kind would still be used."""
+        ...
+
     def accepts(self, sample: Sample) -> bool:
         """Whether `update` would use the sample now, for aiding or for alignment."""
         ...
@@ -85,9 +90,9 @@ class FusionHorizon:
         reports: list[UpdateReport] = []
         estimates = []
         for t in times:
-            self._use(t - self.lag_s, reports)
+            self._use(t, reports)
             estimates.append(self.estimate_at(t))
-        self._use((self._ends[-1] if self._ends else self._t) - self.lag_s, reports)
+        self._use(self._ends[-1] if self._ends else self._t, reports)
         return reports, estimates
 
     def estimate_at(self, t: float) -> Estimate:
@@ -108,8 +113,12 @@ class FusionHorizon:
             front = _join(front, self._part(stop, t))
         return self.estimator.predict(front)
 
-    def _use(self, horizon: float, reports: list[UpdateReport]) -> None:
-        """Bring the estimator to ``horizon`` with every sample up to there."""
+    def _use(self, now: float, reports: list[UpdateReport]) -> None:
+        """Bring the estimator to ``lag_s`` before ``now`` with every sample up to there.
+
+        An estimator that listens to no sample any more need not wait for any.
+        """
+        horizon = now - self.lag_s if self.estimator.listening else now
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
             t, _, _, sample = heapq.heappop(self._queue)
             if not self.estimator.accepts(sample):

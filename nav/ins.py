@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from nav.error_model import (
     transition,
 )
 from nav.kalman import correct, innovate, predict
-from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
+from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -50,17 +50,26 @@ from nav.samples import (
 from nav.strapdown import step
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
-RECENT_S = 2.0  # a position this fresh counts as aided (`Status.GNSS_FUSED`)
+RECENT_S = 2.0  # a position this fresh counts as aided
+FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
 
-# Of the covariance in an estimate; and the blocks that have a place of their own there
-ESTIMATE_ORDER = np.ix_(*2 * [np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]])
-ATTITUDE = (np.arange(6, 9), np.arange(6, 9))  # the diagonal of its attitude
+PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
+
+# Order of the covariance in an estimate; and the blocks that have a place of their own there
+ESTIMATE_ORDER = np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]
 REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
+
+KINDS = {
+    GnssSample: "gnss",
+    BarometerSample: "barometer",
+    MagnetometerSample: "magnetometer",
+    AirspeedSample: "airspeed",
+}
 
 FieldModel = Callable[[float, float, float], Array]
 
@@ -163,7 +172,17 @@ class _State:
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
 
     def copy(self) -> _State:
-        return _State(*(getattr(self, f.name).copy() for f in fields(self)))
+        return _State(
+            self.q_nb.copy(),
+            self.v_n.copy(),
+            self.lla.copy(),
+            self.x.copy(),
+            self.P.copy(),
+            self.errors.copy(),
+            self.sums.copy(),
+            self.elapsed.copy(),
+            self.rates.copy(),
+        )
 
 
 @dataclass(frozen=True)
@@ -192,7 +211,7 @@ class Ins:
         self.model = ErrorModel(config.imu, config.aid_blocks())
         self.t = math.nan
         self._field_model = field_n
-        self._field_at = np.full(3, np.nan)
+        self._field_at = (math.nan, math.nan, math.nan)
         self._field_value = np.zeros(3)
         self._arm_b = np.array(config.gnss_arm_b, dtype=float)
         self._gate = ChiSquareGate(config.false_rejection)
@@ -230,6 +249,7 @@ class Ins:
         self._magnetometer_R = np.full(3, config.magnetometer_sigma**2)
         self._airspeed_R = np.array([config.airspeed_sigma**2])
         self._sideslip_R = np.array([(config.sideslip_sigma or 0.0) ** 2])
+        self._extra = [(name, where) for name, where in model.slices.items() if name not in REPORTED]
         start = model.start
         self._gnss_position_error = start("gnss_position_error")
         self._gnss_velocity_error = start("gnss_velocity_error")
@@ -242,6 +262,11 @@ class Ins:
     def aligned(self) -> bool:
         """Whether there is an attitude, a velocity and a position."""
         return self._state is not None
+
+    @property
+    def listening(self) -> bool:
+        """Whether a sample of some kind would still be used."""
+        return self._state is None or bool(self.config.aids)
 
     @property
     def problem(self) -> str:
@@ -279,14 +304,14 @@ class Ins:
         if self._state is None:
             self._alignment.propagate(imu)
         else:
-            self._last_bad = max(self._last_bad, self._run(self._state, imu))
+            self._last_bad = max(self._last_bad, self._run(self._state, imu, self.config.covariance_period))
         self.t = float(imu.t[-1])
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample's kind is an aid, or it can still serve the alignment."""
         if self._state is None:
             return isinstance(sample, (GnssSample, MagnetometerSample))
-        return _kind(sample) in self.config.aids
+        return KINDS[type(sample)] in self.config.aids
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
@@ -306,7 +331,7 @@ class Ins:
         if state is None:
             self._align(sample)
             return []
-        if _kind(sample) not in self.config.aids:
+        if KINDS[type(sample)] not in self.config.aids:
             return []
         self._settle(state)
         match sample:
@@ -330,16 +355,17 @@ class Ins:
         state = self._state.copy() if self._state is not None else None
         last_bad = self._last_bad
         if state is not None and len(imu):
-            last_bad = max(last_bad, self._run(state, imu))
+            period = self.config.covariance_period * PREDICTED_PERIODS
+            last_bad = max(last_bad, self._run(state, imu, period))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _run(self, state: _State, imu: ImuSamples) -> float:
+    def _run(self, state: _State, imu: ImuSamples, period: int) -> float:
         """Propagate a state; the time of the last increment that was not usable, -inf when all were."""
         s, c = state, self._constants
         bad = _propagate(
             s.q_nb, s.v_n, s.lla, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
             c.driven, c.decay_rate, c.variance_rate, c.Phi, c.FT, c.decay, c.half_noise, c.work,
-            self.config.covariance_period, imu.dtheta, imu.dv, imu.dt,
+            period, imu.dtheta, imu.dv, imu.dt,
         )  # fmt: skip
         return float(imu.t[bad]) if bad >= 0 else -math.inf
 
@@ -364,7 +390,7 @@ class Ins:
     def _update_gnss(self, state: _State, sample: GnssSample) -> list[UpdateReport]:
         nu, H = self._gnss_position(state, sample)
         R = _white(sample.sigma_position_n, self._gnss_position_R)
-        S, S_inverse, PHt, nis = innovate(state.P, H, R, nu)
+        S, _, _, nis = innovate(state.P, H, R, nu)
         with_velocity = aiding.has_velocity(sample)
         v_n, sigma_v = (
             (sample.v_n, sample.sigma_velocity_n)
@@ -376,11 +402,9 @@ class Ins:
         use_velocity = with_velocity and self.config.gnss_use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, nu, S, use_velocity)
-            S, S_inverse, PHt, nis = innovate(state.P, H, R, nu)
-        if verdict in (Verdict.FUSE, Verdict.RECOVER):
-            _inject(state.q_nb, state.v_n, state.lla, state.x, correct(state.P, H, R, PHt, S_inverse, nu))
-            sensor_errors(state.errors, state.x, self.model.driven)
         weight = 1.0 if verdict in (Verdict.FUSE, Verdict.RECOVER) else 0.0
+        if weight:
+            S, nis = self._absorb(state, nu, H, R, math.inf)
         reports = [UpdateReport(sample.t, sample.sensor, "gnss_position", nu, S, nis, threshold, weight, verdict.value)]
         if use_velocity:
             nu, H = self._gnss_velocity(state, sample)
@@ -439,44 +463,50 @@ class Ins:
         self, state: _State, sample: Sample, aid: str, nu: Array, H: Array, R: Array, withheld: str = ""
     ) -> UpdateReport:
         """Gate and correct; ``withheld`` says why the measurement must not be used whatever the gate says."""
-        S, S_inverse, PHt, nis = innovate(state.P, H, R, nu)
         threshold = self._gate.threshold(len(nu))
+        S, nis = self._absorb(state, nu, H, R, -math.inf if withheld else threshold)
         reason = withheld or ("" if nis <= threshold else "outside the gate")
-        if not reason:
-            _inject(state.q_nb, state.v_n, state.lla, state.x, correct(state.P, H, R, PHt, S_inverse, nu))
-            sensor_errors(state.errors, state.x, self.model.driven)
         return UpdateReport(sample.t, sample.sensor, aid, nu, S, nis, threshold, 0.0 if reason else 1.0, reason)
+
+    def _absorb(self, state: _State, nu: Array, H: Array, R: Array, threshold: float) -> tuple[Array, float]:
+        """Correct the state if nis is at most ``threshold``; (S, nis)."""
+        return _update(
+            state.q_nb, state.v_n, state.lla, state.x, state.P, state.errors, self.model.driven, nu, H, R, threshold
+        )
 
     def _field_n(self, lla: Array) -> Array:
         """The reference field, looked up again only after the place has changed."""
         assert self._field_model is not None
-        moved = np.abs(lla - self._field_at)
-        if not (moved[0] < FIELD_PATCH_RAD and moved[1] < FIELD_PATCH_RAD and moved[2] < FIELD_PATCH_M):
-            self._field_at = lla.copy()
-            self._field_value = np.array(self._field_model(lla[0], lla[1], lla[2]), dtype=float)
+        (lat, lon, h), (lat0, lon0, h0) = lla.tolist(), self._field_at
+        if not (
+            abs(lat - lat0) < FIELD_PATCH_RAD and abs(lon - lon0) < FIELD_PATCH_RAD and abs(h - h0) < FIELD_PATCH_M
+        ):
+            self._field_at = (lat, lon, h)
+            self._field_value = np.array(self._field_model(lat, lon, h), dtype=float)
         return self._field_value
 
     def _estimate(self, state: _State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` of its own."""
-        bad = Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status(0)
+        aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
+        status = Status.ALIGNING if state is None else FUSED if aided else UNAIDED
+        if t - last_bad <= BAD_SAMPLE_S:
+            status |= Status.BAD_SAMPLE
         if state is None:
             nothing = np.full(3, np.nan)
             return Estimate(
                 t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, np.full((9, 9), np.nan),
-                nothing, nothing, Status.ALIGNING | bad,
+                nothing, nothing, status,
             )  # fmt: skip
         self._settle(state)
-        sigma = np.sqrt(state.P.diagonal())
-        gyro_bias, sigma_gyro = self._with_drift(state, "gyro")
-        accel_bias, sigma_accel = self._with_drift(state, "accel")
-        covariance = state.P[ESTIMATE_ORDER]
-        covariance[ATTITUDE] += self.config.mounting_sigma**2
-        aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
+        covariance, sigma = _spread(state.P, self.config.mounting_sigma**2)
+        gyro_bias, sigma_gyro = self._with_drift(state, sigma, "gyro")
+        accel_bias, sigma_accel = self._with_drift(state, sigma, "accel")
+        lat, lon, h = state.lla.tolist()
         return Estimate(
             t=t,
-            lat=float(state.lla[0]),
-            lon=float(state.lla[1]),
-            h=float(state.lla[2]),
+            lat=lat,
+            lon=lon,
+            h=h,
             v_n=state.v_n,
             q_nb=state.q_nb,
             gyro_bias=gyro_bias,
@@ -484,35 +514,18 @@ class Ins:
             covariance=covariance,
             sigma_gyro_bias=sigma_gyro,
             sigma_accel_bias=sigma_accel,
-            status=Status.ALIGNED | (Status.GNSS_FUSED if aided else Status.DEAD_RECKONING) | bad,
-            extra={
-                name: (state.x[where], sigma[where])
-                for name, where in self.model.slices.items()
-                if name not in REPORTED
-            },
+            status=status,
+            extra={name: (state.x[where], sigma[where]) for name, where in self._extra},
         )
 
-    def _with_drift(self, state: _State, sensor: str) -> tuple[Array, Array]:
+    def _with_drift(self, state: _State, sigma: Array, sensor: str) -> tuple[Array, Array]:
         """Bias of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
         bias = self.model.slices[f"{sensor}_bias"]
-        value, variance = state.x[bias], state.P.diagonal()[bias]
         drift = self.model.slices.get(f"{sensor}_drift")
-        if drift is not None:
-            value = value + state.x[drift]
-            variance = variance + state.P.diagonal()[drift] + 2 * state.P[bias, drift].diagonal()
-        return value, np.sqrt(variance)
-
-
-def _kind(sample: Sample) -> str:
-    match sample:
-        case GnssSample():
-            return "gnss"
-        case BarometerSample():
-            return "barometer"
-        case MagnetometerSample():
-            return "magnetometer"
-        case AirspeedSample():
-            return "airspeed"
+        if drift is None:
+            return state.x[bias], sigma[bias]
+        variance = sigma[bias] ** 2 + sigma[drift] ** 2 + 2 * state.P[bias, drift].diagonal()
+        return state.x[bias] + state.x[drift], np.sqrt(variance)
 
 
 def _white(sigma: Array, correlated_variance: Array) -> Array:
@@ -531,8 +544,35 @@ def _forget(P: Array, start: int, variance: Array) -> None:
 
 def _refused(sample: Sample, reason: str) -> UpdateReport:
     return UpdateReport(
-        sample.t, sample.sensor, _kind(sample), np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason
+        sample.t, sample.sensor, KINDS[type(sample)], np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason
     )
+
+
+@njit
+def _spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
+    """Covariance (9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (n,) of every state."""
+    covariance, sigma = np.empty((MOTION, MOTION)), np.empty(len(P))
+    for i in range(MOTION):
+        for j in range(MOTION):
+            covariance[i, j] = P[ESTIMATE_ORDER[i], ESTIMATE_ORDER[j]]
+        if ESTIMATE_ORDER[i] < PHI + 3:
+            covariance[i, i] += mounting_variance
+    for i in range(len(P)):
+        sigma[i] = math.sqrt(P[i, i])
+    return covariance, sigma
+
+
+@njit
+def _update(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, P: Array, errors: Array, driven: Indices,
+    nu: Array, H: Array, R: Array, threshold: float,
+) -> tuple[Array, float]:  # fmt: skip
+    """One measurement into the state if its nis is at most ``threshold``; (S, nis), see `kalman.innovate`."""
+    S, S_inverse, HP, nis = innovate(P, H, R, nu)
+    if nis <= threshold:
+        _inject(q_nb, v_n, lla, x, correct(P, H, R, HP, S_inverse, nu))
+        sensor_errors(errors, x, driven)
+    return S, nis
 
 
 @njit
@@ -576,8 +616,7 @@ def _propagate(
 ) -> int:  # fmt: skip
     """Strapdown and covariance over N increments in place; the last of them that was not usable, -1 for none."""
     bad = -1
-    angle, push = np.empty(3), np.empty(3)
-    C_old = dcm_from_quat(q_nb)
+    angle, push, before = np.empty(3), np.empty(3), np.empty(4)
     for k in range(len(dt)):
         T = dt[k]
         if not T > 0.0:
@@ -594,15 +633,9 @@ def _propagate(
         for i in range(3):
             angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
             push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
+        before[:] = q_nb
         step(q_nb, v_n, lla, angle, push, T)
-        C_new = dcm_from_quat(q_nb)
-        for i in range(3):
-            for j in range(3):
-                middle = 0.5 * (C_old[i, j] + C_new[i, j])
-                sums[0, i, j] += middle * T
-                sums[1, i, j] += middle * angle[j]
-                sums[2, i, j] += middle * push[j]
-        C_old = C_new
+        _integrate(sums, before, q_nb, angle, push, T)
         elapsed[0] += T
         elapsed[1] += 1.0
         if elapsed[1] >= period:
@@ -611,3 +644,23 @@ def _propagate(
                 driven, decay_rate, variance_rate, Phi, FT, decay, half_noise, work,
             )  # fmt: skip
     return bad
+
+
+@njit
+def _integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
+    """Add one interval to the integrals of `error_model.transition`, with C_nb in its middle: of the mean quaternion.
+
+    Written out in scalars: a matrix made for every increment would take as long as the strapdown.
+    """
+    w, x, y, z = before[0] + after[0], before[1] + after[1], before[2] + after[2], before[3] + after[3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    C_nb = (
+        (1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
+        (s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)),
+        (s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)),
+    )
+    for i in range(3):
+        for j in range(3):
+            sums[0, i, j] += C_nb[i][j] * T
+            sums[1, i, j] += C_nb[i][j] * angle[j]
+            sums[2, i, j] += C_nb[i][j] * push[j]

@@ -33,6 +33,8 @@ ARM = (0.5, 0.1, -0.3)
 class Logbook:
     """An estimator that writes down what it is given."""
 
+    listening = True
+
     def __init__(self):
         self.t, self.seen, self.angle = 0.0, [], np.zeros(3)
 
