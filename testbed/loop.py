@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
 PACED_S = 1.0  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
+REFUSALS = 5  # of an aid in a row, before it is worth an event
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
 
@@ -97,7 +99,8 @@ class _EventWatch:
     emit: Callable[[float, str, str], None]
     fix: dict[str, bool] = field(default_factory=dict)
     aligned: dict[str, bool] = field(default_factory=dict)
-    refused: dict[tuple[str, str], float] = field(default_factory=dict)
+    refusals: dict[tuple[str, str], int] = field(default_factory=dict)  # in a row
+    unsound: dict[tuple[str, str], float] = field(default_factory=dict)  # when last reported
     leg: float = -2.0
 
     @property
@@ -116,12 +119,20 @@ class _EventWatch:
         self.fix[sample.sensor] = has_fix
 
     def report(self, estimator: str, report: UpdateReport) -> None:
-        if not report.reason or report.weight > 0.0:
-            return
+        """An unsound sample is an event; the gate turns a sound one away now and then, so only a run of those is."""
         key = (estimator, report.aid)
-        if report.t - self.refused.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
-            self.emit(report.t, "warning", f"{estimator}: {report.aid} refused, {report.reason}")
-            self.refused[key] = report.t
+        if report.weight > 0.0:
+            if self.refusals.pop(key, 0) >= REFUSALS:
+                self.emit(report.t, "info", f"{estimator}: {report.aid} accepted again")
+        elif math.isnan(report.nis):
+            if report.t - self.unsound.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
+                self.emit(report.t, "warning", f"{estimator}: {report.aid} refused, {report.reason}")
+                self.unsound[key] = report.t
+        else:
+            self.refusals[key] = self.refusals.get(key, 0) + 1
+            if self.refusals[key] == REFUSALS:
+                text = f"{estimator}: {report.aid} refused {REFUSALS} times in a row, {report.reason}"
+                self.emit(report.t, "warning", text)
 
     def estimate(self, estimator: str, estimate: Estimate) -> None:
         aligned = Status.ALIGNED in estimate.status
