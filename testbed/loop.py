@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
 PACED_S = 1.0  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
-REFUSALS = 5  # of an aid in a row, before it is worth an event
+REFUSALS = 10  # of an aid in a row, before it is worth an event
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
 
