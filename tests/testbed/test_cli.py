@@ -133,6 +133,7 @@ def test_start_up_is_quick(arguments: list[str]) -> None:
         (["export", "none.nc", "--format", "xls"], "'xls'"),
         (["campaign", "u_turn", "--runs", "0"], "--runs"),
         (["campaign", "u_turn", "--runs", "2", "--vary", "seed"], "testbed: --vary seed: give it as key=a,b,c"),
+        (["campaign", "u_turn", "--runs", "2", "--set", "sed=3"], "(--set sed=3): sed: unknown key"),
         (["campaign", "uturn", "--runs", "2"], "testbed: uturn: no such file"),
         (["fly"], "No such command"),
     ],
