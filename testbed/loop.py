@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import heapq
 import math
 import time
@@ -235,6 +236,7 @@ def run(
     unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
     arrived: list[Sample] = []  # nor these
     truth_s = 0.0
+    gc.freeze()  # samples come by the million, and the collector would walk all that was there before again and again
     try:
         tick = 0
         while tick < ticks:
@@ -300,6 +302,7 @@ def run(
         if source.failure:
             emit((tick - 1) / rate_hz, "error", source.failure)
     finally:
+        gc.unfreeze()
         if ahead is not None:
             ahead.close()
         recorder.close()

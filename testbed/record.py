@@ -50,6 +50,7 @@ Data: TypeAlias = npt.NDArray[Any]
 
 FORMAT = "navigation-testbed run 1"
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
+PACK_ROWS = 400  # objects that a table keeps before it makes columns of them: while they are in the cache
 SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 
 # What the components of a vector mean: the labels of its dimension.
@@ -422,6 +423,9 @@ class Recorder:
         if len(block):
             self._record_truth(block)
             self._t = float(block.t[-1])
+        for table in self._tables.values():
+            if len(table.objects) >= PACK_ROWS:
+                table.pack()
         if time.monotonic() - self._last_flush >= FLUSH_WALL_S:
             self.flush()
 
