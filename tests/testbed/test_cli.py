@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -252,7 +253,9 @@ def test_an_interrupted_run_says_what_it_leaves(testbed: Testbed, monkeypatch: p
 
 def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "testbed", "run", "static_bench", "--realtime", "50", "--no-report"]
-    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as running:
+    # Tests that run in the background of a shell inherit that interrupts are ignored.
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as running:
         assert running.stderr is not None
         percent = int(running.stderr.readline().split("%")[0])  # under load a line comes before the first 10 %
         running.send_signal(signal.SIGINT)
