@@ -107,9 +107,13 @@ def _drive(sigma: float, tau: float) -> float:
 def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     imu = scenario.sensors[config.imu]
     assert isinstance(imu, ImuConfig)  # the scenario was checked
-    kinds: Mapping[str, SensorConfig] = {
-        section.kind: section for section in (scenario.sensors[name] for name in config.aids)
-    }
+    # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
+    offered = {scenario.sensors[name].kind: name for name in config.aids}
+    aids = tuple(offered)
+    for name, section in scenario.sensors.items():
+        if not isinstance(section, ImuConfig):
+            offered.setdefault(section.kind, name)
+    kinds: Mapping[str, SensorConfig] = {kind: scenario.sensors[name] for kind, name in offered.items()}
     told: dict[str, object] = {}
     errors = imu.errors()
     gnss = kinds.get("gnss")
@@ -150,12 +154,13 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
             "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * config.gust_mps),
         }
     ins = Ins(
-        InsConfig(imu_model(errors), tuple(kinds), mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
+        InsConfig(imu_model(errors), aids, mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
         partial(geomagnetic_field_n, date=scenario.date),
     )
-    # Every sensor is offered: what is no aid still serves the alignment.
-    offered = tuple(name for name, section in scenario.sensors.items() if not isinstance(section, ImuConfig))
-    lag_s = max((scenario.sensors[name].latency_s for name in offered), default=0.0)  # type: ignore[union-attr]
+    lag_s = max((section.latency_s for section in kinds.values() if not isinstance(section, ImuConfig)), default=0.0)
     return Running(
-        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz), config.imu, errors.C_sb, offered
+        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        config.imu,
+        errors.C_sb,
+        tuple(offered.values()),
     )
