@@ -34,6 +34,7 @@ class Status(IntFlag):
     GNSS_FUSED = 4  # a GNSS sample was fused within the last two seconds
     DEAD_RECKONING = 8  # aligned, and no position aid is being fused
     BAD_SAMPLE = 16  # a non-finite or out-of-range sample was refused within the last second
+    ATTITUDE_ONLY = 32  # no position and no velocity are estimated: they are NaN, and so is their covariance
 
 
 @dataclass(frozen=True, slots=True)

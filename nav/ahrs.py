@@ -1,0 +1,549 @@
+"""Attitude and heading without position: gyros, levelled by the accelerometers while nothing else accelerates them.
+
+Six error states, attitude error phi and gyro bias error, both estimate - truth in the conventions of `nav`:
+
+    phi' = -[w_ie x] phi + C_nb b_g,    b_g a random walk
+
+Once per ``period_s`` the mean specific force in computed n axes is looked at. Without acceleration its horizontal part
+is tilt, f_N = g phi_E, f_E = -g phi_N, and `nav.motion.LowDynamics` says whether there is none. With an airspeed sensor
+the acceleration in a steady wind is known (`nav.motion.acceleration_n`) and is taken off first, so that slow turns do
+no harm and a loiter can be levelled in too. The correction reaches the attitude in steps of at most ``phi_limit`` per
+period, so that an autopilot on it feels no jump; the filter keeps in mind what is still outstanding. Heading is the
+gyro's alone, unless there is a magnetometer.
+
+Source: Jiang et al. 2021, attitude of a low-grade inertial system without satellite navigation, equations 5 to 11,
+turned from north-up-east to north-east-down.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from nav import aiding
+from nav._jit import njit
+from nav.earth import earth_rate_n, gravity
+from nav.error_model import ImuModel
+from nav.kalman import correct, innovate, predict
+from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
+from nav.rotation import (
+    dcm_from_quat,
+    quat_from_euler,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_normalise,
+    quat_rotate,
+    rotation_coefficients,
+)
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    Estimate,
+    ImuSamples,
+    MagnetometerSample,
+    Sample,
+    Status,
+    UpdateReport,
+)
+
+PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
+KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
+BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
+TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
+COINCIDENT = 1e-6  # two times this close are the same [s]
+RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
+REPORTS_KEPT = 1000  # of levelling, until the next sample takes them along
+DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class AhrsConfig:
+    """What the filter is told: SI, radians. ``lat`` and ``h`` are of the area of operation, good to 100 km and 1 km.
+
+    Without magnetometer ``heading`` is where the body's nose points when the first increment begins: nothing on board
+    tells it (a gyro of 40 deg/h does not feel the Earth's 15).
+    """
+
+    imu: ImuModel
+    lat: float
+    h: float = 0.0
+    aids: tuple[str, ...] = ()  # of airspeed, barometer, magnetometer
+    period_s: float = 1.0
+    tilt_sigma: float = 5 * DEG  # after levelling
+    heading: float = 0.0
+    heading_sigma: float = 15 * DEG
+    levelling_s: float = 2.0  # time over which the first roll and pitch are found
+
+    force_sigma: float = 0.1  # of the mean horizontal specific force over a period, as a sign of tilt [m/s^2]
+    motion: LowDynamics = field(default_factory=LowDynamics)  # when level, by specific force as it is
+    # and by specific force less the acceleration that airspeed tells: then turns need not be shut out
+    compensated_motion: LowDynamics = field(default_factory=lambda: LowDynamics(0.5, 10 * DEG, 10 * DEG))
+    phi_limit: float = 0.2 * DEG  # largest correction of each level axis per period
+    correction_sigma: float = 1 * DEG  # the attitude is corrected when both level axes are known this well
+    gyro_bias_feedback: bool = False  # estimated biases are taken off the gyros
+
+    airspeed_sigma: float = 1.0  # what gusts, sideslip and angle of attack make of it in a turn [m/s]
+    airspeed_smoothing_s: float = 5.0
+    airspeed_min: float = 10.0  # equivalent; below it the tube tells nothing [m/s]
+    magnetometer_sigma: float = 3 * DEG  # of the heading from one sample [rad]
+
+    literal: bool = False  # equation 10 as it is printed: the east axis corrected by the north axis' error
+
+    def __post_init__(self) -> None:
+        unknown = set(self.aids) - set(KINDS.values())
+        if unknown:
+            raise ValueError(f"unknown aids {sorted(unknown)}, choose from {sorted(KINDS.values())}")
+
+
+@dataclass
+class _State:
+    """Everything that moves. While levelling, n stands for the body axes at the first increment."""
+
+    levelled: bool
+    period_end: float  # [s]
+    mode_counter: int  # periods of low dynamics without a break
+    correction_counter: int  # corrections among them
+    q_nb: Array
+    x: Array  # (6,) estimated errors still in the attitude and the gyros
+    P: Array  # (6, 6)
+    gyro_bias: Array  # (3,) taken off the gyros
+    air_velocity_n: Array  # (3,) at the start of the period, NaN when unknown
+    field_n: Array  # (3,) sum of magnetic fields while levelling
+    rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
+    turned: Array  # (3, 3) integral of C_nb since the last covariance step
+    angle: Array  # (3,) integral of angular rate over the period, body axes
+    force: Array  # (3,) integral of specific force over the period, n
+    elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
+
+    def copy(self) -> _State:
+        values = (getattr(self, f.name) for f in fields(self))
+        return _State(*(value.copy() if isinstance(value, np.ndarray) else value for value in values))
+
+
+class Ahrs:
+    """Attitude filter behind the estimator protocol of `nav.horizon`; position and velocity are NaN throughout.
+
+    ``field_n`` (3,) [T] is the reference magnetic field, NED; without it the magnetometer is not used. The filter levels
+    itself from the first increments, or `start` sets it at a known attitude. ``autopilot_level`` is for the host to set
+    when an autopilot knows better than the sensors that the body manoeuvres.
+    """
+
+    def __init__(self, config: AhrsConfig, field_n: Array | None = None) -> None:
+        self.config = config
+        self.autopilot_level = True
+        self.t = math.nan
+        self._state: _State | None = None
+        self._airspeed = TrueAirspeed(config.h, config.airspeed_smoothing_s)
+        self._aids = tuple(kind for kind in config.aids if kind != "magnetometer" or field_n is not None)
+        self._field_n = field_n
+        self._g = float(gravity(config.lat, config.h))
+        self._earth_n = earth_rate_n(config.lat)
+        imu = config.imu
+        self._variance_rate = np.repeat([imu.gyro_noise, imu.gyro_bias_walk], 3) ** 2
+        self._H_level = np.zeros((2, STATES))
+        self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
+        self._last_bad = -math.inf
+        self._reports: deque[UpdateReport] = deque(maxlen=REPORTS_KEPT)
+
+    @property
+    def aligned(self) -> bool:
+        """Whether there is an attitude."""
+        return self._state is not None and self._state.levelled
+
+    @property
+    def listening(self) -> bool:
+        """Whether a sample of some kind would still be used."""
+        return bool(self._aids)
+
+    @property
+    def problem(self) -> str:
+        """What the levelling is waiting for, empty once there is an attitude."""
+        return "" if self.aligned else "levelling: waiting for unaccelerated flight"
+
+    def start(self, t: float, q_nb: Array) -> None:
+        """Begin at a given attitude, known as well as the configuration's sigmas say, instead of levelling."""
+        self._state = state = _fresh(t + self.config.period_s)
+        state.levelled = True
+        state.q_nb = np.array(q_nb, dtype=float)
+        state.P = self._initial_covariance()
+        state.air_velocity_n = self._air_velocity_n(state, t)
+        self.t = t
+
+    def propagate(self, imu: ImuSamples) -> None:
+        """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
+        if len(imu) == 0:
+            return
+        if self._state is None:
+            start = float(imu.t[0] - imu.dt[0])
+            self._state = _fresh(start + self.config.levelling_s)
+            self._state.air_velocity_n = self._air_velocity_n(self._state, start)
+        self._last_bad = max(self._last_bad, self._run(self._state, imu, self._reports))
+        self.t = float(imu.t[-1])
+
+    def accepts(self, sample: Sample) -> bool:
+        """Whether the sample's kind is an aid."""
+        return KINDS.get(type(sample)) in self._aids
+
+    def update(self, sample: Sample) -> list[UpdateReport]:
+        """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
+
+        The reports of the levellings since the last sample come along, then the sample's own when it is a magnetometer's
+        or unsound; airspeed and pressure leave none.
+        """
+        if not self.accepts(sample):
+            return []
+        reports = list(self._reports)
+        self._reports.clear()
+        trouble = aiding.problem(sample)
+        if trouble:
+            self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
+            return [*reports, _refused(sample, trouble)]
+        if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
+            raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
+        match sample:
+            case AirspeedSample():
+                if sample.eas >= self.config.airspeed_min:
+                    self._airspeed.add_eas(sample.t, sample.eas)
+                else:
+                    self._airspeed.lose()
+            case BarometerSample():
+                self._airspeed.add_pressure(sample.pressure)
+            case MagnetometerSample():
+                reports += self._update_magnetometer(sample)
+        return reports
+
+    def estimate(self) -> Estimate:
+        """The state at the filter's own time."""
+        return self._estimate(self._state.copy() if self._state is not None else None, self.t, self._last_bad)
+
+    def predict(self, imu: ImuSamples) -> Estimate:
+        """The state after further increments, the filter itself staying where it is."""
+        state = self._state.copy() if self._state is not None else None
+        last_bad = self._last_bad
+        if state is not None and len(imu):
+            last_bad = max(last_bad, self._run(state, imu, deque(maxlen=0)))
+        return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
+
+    def _run(self, s: _State, imu: ImuSamples, reports: deque[UpdateReport]) -> float:
+        """Propagate a state; the time of the last increment that was not usable, -inf when all were.
+
+        Periods end at times of their own, whatever the blocks.
+        """
+        last_bad = -math.inf
+        start, n = 0, len(imu)
+        while start < n:
+            end = int(np.searchsorted(imu.t, s.period_end - COINCIDENT)) + 1
+            rows = slice(start, min(end, n))
+            bad = _propagate(
+                s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,
+                s.elapsed, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
+            )  # fmt: skip
+            if bad >= 0:
+                last_bad = float(imu.t[start + bad])
+            start = rows.stop
+            if end <= n:
+                self._end_period(s, float(imu.t[end - 1]), reports)
+        return last_bad
+
+    def _end_period(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
+        """Level by what the period has shown, and begin the next."""
+        if s.levelled:
+            self._settle(s)
+            self._level(s, t, reports)
+        else:
+            self._find_level(s, t)
+        s.angle[:] = 0.0
+        s.force[:] = 0.0
+        s.elapsed[1] = 0.0
+        s.air_velocity_n = self._air_velocity_n(s, t)
+        period = self.config.period_s if s.levelled else self.config.levelling_s
+        while s.period_end <= t + COINCIDENT:
+            s.period_end += period
+
+    def _air_velocity_n(self, s: _State, t: float) -> Array:
+        return quat_rotate(s.q_nb, np.array([self._airspeed.at(t), 0.0, 0.0]))
+
+    def _free_fall(self, s: _State, t: float) -> tuple[Array, LowDynamics]:
+        """Mean specific force over the period, known acceleration taken off, and the limits that then hold."""
+        T = float(s.elapsed[1])
+        f_n = s.force / T
+        acceleration = acceleration_n(s.air_velocity_n, self._air_velocity_n(s, t), T)
+        if math.isnan(acceleration[0]):
+            return f_n, self.config.motion
+        return f_n - acceleration, self.config.compensated_motion
+
+    def _find_level(self, s: _State, t: float) -> None:
+        """Roll and pitch from specific force, heading from the magnetic field or from outside (equations 1 to 3)."""
+        config = self.config
+        f_0, _ = self._free_fall(s, t)
+        no_field = "magnetometer" in self._aids and not s.field_n.any()
+        if no_field or not abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit:
+            s.q_nb = np.array([1.0, 0.0, 0.0, 0.0])
+            s.field_n[:] = 0.0
+            return
+        roll, pitch = math.atan2(-f_0[1], -f_0[2]), math.atan2(f_0[0], math.hypot(f_0[1], f_0[2]))
+        heading = config.heading
+        if self._field_n is not None and "magnetometer" in self._aids:
+            level = quat_rotate(quat_from_euler(roll, pitch, 0.0), s.field_n)
+            heading = _azimuth(self._field_n) - _azimuth(level)
+        s.levelled = True
+        s.q_nb = quat_multiply(quat_from_euler(roll, pitch, heading), s.q_nb)
+        s.P = self._initial_covariance()
+        s.turned[:] = 0.0
+        s.elapsed[0] = 0.0
+
+    def _initial_covariance(self) -> Array:
+        config = self.config
+        sigma = np.repeat([config.tilt_sigma, config.imu.gyro_bias_sigma], 3)
+        sigma[PHI + 2] = config.heading_sigma
+        return np.diag(sigma**2)
+
+    def _level(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
+        """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
+        config = self.config
+        f_n, limits = self._free_fall(s, t)
+        omega_b = s.angle / s.elapsed[1] - s.gyro_bias
+        if not limits.judge(f_n, omega_b, self._g, self.autopilot_level).low:
+            s.mode_counter = s.correction_counter = 0
+            return
+        s.mode_counter += 1
+        variance = config.force_sigma**2
+        if limits is config.compensated_motion:
+            variance += config.airspeed_sigma**2 * float(omega_b @ omega_b)
+        report = _fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level")
+        reports.append(report)
+        self._feed_back(s)
+
+    def _feed_back(self, s: _State) -> None:
+        """Move estimated errors into attitude and gyro bias, in small steps (equations 10, 11)."""
+        config = self.config
+        if max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) >= config.correction_sigma**2:
+            return
+        source = s.x[[PHI, PHI, PHI + 2]] if config.literal else s.x[PHI : PHI + 3]
+        step = np.clip(source, -config.phi_limit, config.phi_limit)
+        bias = s.x[BIAS:].copy() if config.gyro_bias_feedback else np.zeros(3)
+        if "magnetometer" not in self._aids:
+            # Nothing sees the heading: what the filter thinks of it, and of the rate about the vertical, is a guess.
+            step[2] = 0.0
+            down_b = dcm_from_quat(s.q_nb)[2]
+            bias -= down_b * (down_b @ bias)
+        s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(step), s.q_nb))  # C = (I + [phi x]) C_hat
+        s.x[PHI : PHI + 3] -= step
+        s.correction_counter += 1
+        s.gyro_bias -= bias
+        s.x[BIAS:] -= bias
+
+    def _update_magnetometer(self, sample: MagnetometerSample) -> list[UpdateReport]:
+        """Take the direction of the levelled field for heading; while levelling, collect it.
+
+        Azimuth of C_nb_hat m_b less that of the reference m_n: -phi_D + m_D (m_N phi_N + m_E phi_E) / (m_N^2 + m_E^2).
+        """
+        s, m_n = self._state, self._field_n
+        if s is None or m_n is None:
+            return []
+        levelled = quat_rotate(s.q_nb, sample.field_b)
+        if not s.levelled:
+            s.field_n += levelled
+            return []
+        self._settle(s)
+        z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
+        H = np.zeros((1, STATES))
+        H[0, PHI : PHI + 2] = m_n[:2] * m_n[2] / (m_n[0] ** 2 + m_n[1] ** 2)
+        H[0, PHI + 2] = -1.0
+        R = np.array([self.config.magnetometer_sigma**2])
+        return [_fuse(s, H, R, np.array([z]), sample.t, sample.sensor, "magnetometer")]
+
+    def _settle(self, s: _State) -> None:
+        """Bring error states and covariance up to the time of the attitude."""
+        if s.elapsed[0] > 0:
+            _covariance_step(s.x, s.P, s.turned, s.elapsed, self._earth_n, self._variance_rate)
+
+    def _estimate(self, s: _State | None, t: float, last_bad: float) -> Estimate:
+        """The estimate at ``t`` from a state of its own.
+
+        The attitude is what it is before the corrections still outstanding, so they are part of its error; so is the
+        tilt of accelerometers that are biased, which no state stands for.
+        """
+        bad = Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status(0)
+        nothing, covariance = np.full(3, np.nan), np.full((9, 9), np.nan)
+        if s is None or not s.levelled:
+            return Estimate(
+                t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, covariance, nothing,
+                nothing, Status.ALIGNING | bad,
+            )  # fmt: skip
+        self._settle(s)
+        imu = self.config.imu
+        phi = s.x[PHI : PHI + 3]
+        floor = imu.accel_bias_sigma / self._g
+        covariance[6:, 6:] = s.P[PHI : PHI + 3, PHI : PHI + 3] + np.outer(phi, phi) + np.diag([floor**2, floor**2, 0.0])
+        zero = np.zeros(1)
+        return Estimate(
+            t=t,
+            lat=math.nan,
+            lon=math.nan,
+            h=math.nan,
+            v_n=nothing,
+            q_nb=s.q_nb,
+            gyro_bias=s.gyro_bias - s.x[BIAS:],
+            accel_bias=np.zeros(3),
+            covariance=covariance,
+            sigma_gyro_bias=np.sqrt(s.P.diagonal()[BIAS:]),
+            sigma_accel_bias=np.full(3, imu.accel_bias_sigma),
+            status=Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY | bad,
+            extra={
+                "mode_counter": (np.array([float(s.mode_counter)]), zero),
+                "correction_counter": (np.array([float(s.correction_counter)]), zero),
+            },
+        )
+
+
+def _fresh(period_end: float) -> _State:
+    """Nothing is known but when the levelling ends."""
+    return _State(
+        levelled=False,
+        period_end=period_end,
+        mode_counter=0,
+        correction_counter=0,
+        q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
+        x=np.zeros(STATES),
+        P=np.zeros((STATES, STATES)),
+        gyro_bias=np.zeros(3),
+        air_velocity_n=np.full(3, np.nan),
+        field_n=np.zeros(3),
+        rates=np.zeros((2, 3)),
+        turned=np.zeros((3, 3)),
+        angle=np.zeros(3),
+        force=np.zeros(3),
+        elapsed=np.zeros(2),
+    )
+
+
+def _fuse(s: _State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:
+    """Update the error states with ``z`` = H x + noise."""
+    nu = z - H @ s.x
+    S, S_inverse, HP, nis = innovate(s.P, H, R, nu)
+    s.x += correct(s.P, H, R, HP, S_inverse, nu)
+    return UpdateReport(t, sensor, aid, nu, S, nis, math.inf, 1.0)
+
+
+def _refused(sample: Sample, reason: str) -> UpdateReport:
+    return UpdateReport(
+        sample.t, sample.sensor, KINDS[type(sample)], np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason
+    )
+
+
+def _azimuth(x_n: Array) -> float:
+    return math.atan2(x_n[1], x_n[0])
+
+
+@njit
+def transition(turned: Array, earth_n: Array, T: float) -> Array:
+    """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
+    Phi = np.zeros((3, STATES))
+    for i in range(3):
+        Phi[i, PHI + i] = 1.0
+        for j in range(3):
+            Phi[i, BIAS + j] = turned[i, j]
+    Phi[0, PHI + 1], Phi[0, PHI + 2] = earth_n[2] * T, -earth_n[1] * T
+    Phi[1, PHI], Phi[1, PHI + 2] = -earth_n[2] * T, earth_n[0] * T
+    Phi[2, PHI], Phi[2, PHI + 1] = earth_n[1] * T, -earth_n[0] * T
+    return Phi
+
+
+@njit
+def _covariance_step(
+    x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array
+) -> None:
+    """Take error states and covariance over the time in ``elapsed``, and empty the integral."""
+    T = elapsed[0]
+    Phi = transition(turned, earth_n, T)
+    x[PHI : PHI + 3] = Phi @ x
+    predict(P, Phi, np.ones(STATES), 0.5 * T * variance_rate, np.empty((3, STATES)))
+    turned[:] = 0.0
+    elapsed[0] = 0.0
+
+
+@njit
+def _propagate(
+    q_nb: Array, gyro_bias: Array, earth_n: Array, rates: Array, turned: Array, angle: Array, force: Array,
+    elapsed: Array, dtheta: Array, dv: Array, dt: Array,
+) -> int:  # fmt: skip
+    """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
+
+    q+ = exp(-w_ie dt / 2) q exp(dtheta / 2), and C_nb dv by the attitude half-way through the turn.
+    """
+    bad = -1
+    w, x, y, z = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
+    b0, b1, b2 = gyro_bias[0], gyro_bias[1], gyro_bias[2]
+    e0, e1, e2 = -0.5 * earth_n[0], -0.5 * earth_n[1], -0.5 * earth_n[2]
+    for k in range(len(dt)):
+        T = dt[k]
+        if not T > 0.0:
+            continue
+        p0, p1, p2 = dtheta[k, 0], dtheta[k, 1], dtheta[k, 2]
+        u0, u1, u2 = dv[k, 0], dv[k, 1], dv[k, 2]
+        most, strongest = RATE_LIMIT * T, FORCE_LIMIT * T
+        if (
+            abs(p0) <= most and abs(p1) <= most and abs(p2) <= most
+            and abs(u0) <= strongest and abs(u1) <= strongest and abs(u2) <= strongest
+        ):  # fmt: skip
+            rates[0, 0], rates[0, 1], rates[0, 2] = p0 / T, p1 / T, p2 / T
+            rates[1, 0], rates[1, 1], rates[1, 2] = u0 / T, u1 / T, u2 / T
+        else:
+            bad = k
+            p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T
+            u0, u1, u2 = rates[1, 0] * T, rates[1, 1] * T, rates[1, 2] * T
+        angle[0] += p0
+        angle[1] += p1
+        angle[2] += p2
+        p0, p1, p2 = p0 - b0 * T, p1 - b1 * T, p2 - b2 * T
+
+        # half the turn, twice
+        sinc, versine, _ = rotation_coefficients(0.0625 * (p0 * p0 + p1 * p1 + p2 * p2))
+        dw, k4 = 1 - 0.0625 * (p0 * p0 + p1 * p1 + p2 * p2) * versine, 0.25 * sinc
+        dx, dy, dz = k4 * p0, k4 * p1, k4 * p2
+        w, x, y, z = (
+            w * dw - x * dx - y * dy - z * dz,
+            w * dx + x * dw + y * dz - z * dy,
+            w * dy - x * dz + y * dw + z * dx,
+            w * dz + x * dy - y * dx + z * dw,
+        )
+        c00, c01, c02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        c10, c11, c12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        c20, c21, c22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        w, x, y, z = (
+            w * dw - x * dx - y * dy - z * dz,
+            w * dx + x * dw + y * dz - z * dy,
+            w * dy - x * dz + y * dw + z * dx,
+            w * dz + x * dy - y * dx + z * dw,
+        )
+        dx, dy, dz = e0 * T, e1 * T, e2 * T
+        w, x, y, z = (
+            w - dx * x - dy * y - dz * z,
+            x + dx * w + dy * z - dz * y,
+            y - dx * z + dy * w + dz * x,
+            z + dx * y - dy * x + dz * w,
+        )
+        scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one Newton step to unit norm: it left it by rounding only
+        w, x, y, z = scale * w, scale * x, scale * y, scale * z
+
+        turned[0, 0] += c00 * T
+        turned[0, 1] += c01 * T
+        turned[0, 2] += c02 * T
+        turned[1, 0] += c10 * T
+        turned[1, 1] += c11 * T
+        turned[1, 2] += c12 * T
+        turned[2, 0] += c20 * T
+        turned[2, 1] += c21 * T
+        turned[2, 2] += c22 * T
+        force[0] += c00 * u0 + c01 * u1 + c02 * u2
+        force[1] += c10 * u0 + c11 * u1 + c12 * u2
+        force[2] += c20 * u0 + c21 * u1 + c22 * u2
+        elapsed[0] += T
+        elapsed[1] += T
+    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = w, x, y, z
+    return bad

@@ -1,0 +1,146 @@
+"""How the body moves, judged from the inertial sensors: low dynamics, turns, and the acceleration that airspeed tells.
+
+In low dynamics the accelerometers feel gravity alone, and what they show horizontally is tilt (Jiang et al. 2021). In a
+turn course and heading part (Cheng et al. 2020). Between the two lies flight in a steady wind with an airspeed sensor:
+its acceleration is that of the velocity through the air, which turns with the body, and can be taken off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from nav.aiding import SEA_LEVEL_DENSITY
+from nav.earth import isa_density, pressure_altitude
+from nav.samples import Array, ImuSamples
+
+AIRSPEED_VALID_S = 2.0  # an airspeed is good for as long
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What `LowDynamics` measured: ``acceleration`` [m/s^2], ``yaw_rate``, ``roll_rate`` [rad/s]; which tests failed."""
+
+    acceleration: float
+    yaw_rate: float
+    roll_rate: float
+    failed: tuple[str, ...]
+
+    @property
+    def low(self) -> bool:
+        """Whether all tests passed."""
+        return not self.failed
+
+
+@dataclass(frozen=True, slots=True)
+class LowDynamics:
+    """Whether the body is as good as unaccelerated: three tests on means over a second, and the autopilot's word.
+
+    ``acceleration_limit`` [m/s^2] on what specific force shows beyond gravity, ``yaw_rate_limit`` and
+    ``roll_rate_limit`` [rad/s] on the rates about body z and x. The ``norm`` test takes ``| |f| - g |``, which no
+    attitude error can deceive, but which sees of a horizontal acceleration a only a^2 / 2g. The ``vector`` test takes
+    ``|f_n - [0, 0, -g]|``, which sees all of it and its own tilt as well: tilted by more than asin(limit / g), 1.17 deg
+    with the paper's limit, it never passes again, and a filter that waits for it never levels.
+
+    Source: Jiang et al. 2021, section on the low-dynamics criterion; limits are the paper's.
+    """
+
+    acceleration_limit: float = 0.2
+    yaw_rate_limit: float = math.radians(0.5)
+    roll_rate_limit: float = math.radians(2.0)
+    test: Literal["norm", "vector"] = "norm"
+
+    def judge(self, f_n: Array, omega_b: Array, g: float, autopilot_level: bool = True) -> Motion:
+        """Judge mean specific force ``f_n`` (3,) [m/s^2], known accelerations taken off, and angular rate ``omega_b``
+        (3,) [rad/s]; ``g`` [m/s^2] is gravity. Values that are not finite fail.
+        """
+        north, east, down = f_n.tolist()
+        roll_rate, _, yaw_rate = omega_b.tolist()
+        if self.test == "norm":
+            acceleration = abs(math.sqrt(north * north + east * east + down * down) - g)
+        else:
+            acceleration = math.sqrt(north * north + east * east + (down + g) ** 2)
+        roll_rate, yaw_rate = abs(roll_rate), abs(yaw_rate)
+        failed = []
+        if not acceleration <= self.acceleration_limit:
+            failed.append("acceleration")
+        if not yaw_rate <= self.yaw_rate_limit:
+            failed.append("yaw rate")
+        if not roll_rate <= self.roll_rate_limit:
+            failed.append("roll rate")
+        if not autopilot_level:
+            failed.append("autopilot")
+        return Motion(acceleration, yaw_rate, roll_rate, tuple(failed))
+
+
+class TurnDetector:
+    """Straight is when |omega_z| stayed below ``rate_limit`` [rad/s] during the whole last ``quiet_s`` [s].
+
+    Source: Cheng et al. 2020, equation 24 (kappa and T0; values are not given there: the limit must exceed gyro bias and
+    noise).
+    """
+
+    def __init__(self, rate_limit: float = math.radians(2.0), quiet_s: float = 2.0) -> None:
+        self.rate_limit = rate_limit
+        self.quiet_s = quiet_s
+        self._quiet_since = math.nan
+
+    def push(self, imu: ImuSamples) -> None:
+        """Add consecutive increments."""
+        if len(imu) == 0:
+            return
+        if math.isnan(self._quiet_since):
+            self._quiet_since = float(imu.t[0] - imu.dt[0])
+        turning = ~(np.abs(imu.dtheta[:, 2]) < self.rate_limit * imu.dt)
+        if turning.any():
+            self._quiet_since = float(imu.t[np.flatnonzero(turning)[-1]])
+
+    def straight(self, t: float) -> bool:
+        """Whether the motion up to ``t`` [s], the end of the newest increment, was straight for long enough."""
+        return t - self._quiet_since >= self.quiet_s
+
+
+class TrueAirspeed:
+    """True airspeed [m/s] from samples of equivalent airspeed, smoothed over gusts.
+
+    A gust changes airspeed at once and the body's velocity hardly: what is shorter than ``smoothing_s`` [s] says
+    nothing of acceleration. Density is that of the standard atmosphere at ``h`` [m], or, once there is a barometer, at
+    the static pressure it shows.
+    """
+
+    def __init__(self, h: float, smoothing_s: float) -> None:
+        self.smoothing_s = smoothing_s
+        self._per_eas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(h))
+        self._eas = math.nan
+        self._t = -math.inf
+
+    def add_eas(self, t: float, eas: float) -> None:
+        """Add an equivalent airspeed [m/s] at ``t`` [s]."""
+        dt = t - self._t
+        self._eas = eas if dt > AIRSPEED_VALID_S else self._eas + (eas - self._eas) * -math.expm1(-dt / self.smoothing_s)
+        self._t = t
+
+    def add_pressure(self, pressure: float) -> None:
+        """Add a static pressure [Pa]."""
+        self._per_eas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(pressure_altitude(pressure)))
+
+    def lose(self) -> None:
+        """Forget the speed: the sensor says nothing that can be used."""
+        self._t = -math.inf
+
+    def at(self, t: float) -> float:
+        """The speed at ``t`` [s], NaN when the newest sample is too old."""
+        return self._per_eas * self._eas if t - self._t <= AIRSPEED_VALID_S else math.nan
+
+
+def acceleration_n(air_velocity_before_n: Array, air_velocity_n: Array, T: float) -> Array:
+    """Mean acceleration (3,) [m/s^2] over ``T`` [s] from the velocity through the air [m/s], which points forward.
+
+    In a steady wind it is the body's acceleration: the mean of C_nb (omega x [V, 0, 0] + [dV/dt, 0, 0]), integrated
+    without error. NaN where a velocity is unknown.
+    """
+    mean: Array = (air_velocity_n - air_velocity_before_n) / T
+    return mean
