@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, fields
+from copy import copy
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,7 +31,6 @@ from nav.error_model import ImuModel
 from nav.kalman import correct, innovate, predict
 from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
 from nav.rotation import (
-    dcm_from_quat,
     quat_from_euler,
     quat_from_rotvec,
     quat_multiply,
@@ -81,7 +81,7 @@ class AhrsConfig:
     force_sigma: float = 0.1  # of the mean horizontal specific force over a period, as a sign of tilt [m/s^2]
     motion: LowDynamics = field(default_factory=LowDynamics)  # when level, by specific force as it is
     # and by specific force less the acceleration that airspeed tells: then turns need not be shut out
-    compensated_motion: LowDynamics = field(default_factory=lambda: LowDynamics(0.5, 10 * DEG, 10 * DEG))
+    compensated_motion: LowDynamics = field(default_factory=lambda: LowDynamics(1.0, 10 * DEG, 10 * DEG))
     phi_limit: float = 0.2 * DEG  # largest correction of each level axis per period
     correction_sigma: float = 1 * DEG  # the attitude is corrected when both level axes are known this well
     gyro_bias_feedback: bool = False  # estimated biases are taken off the gyros
@@ -120,16 +120,19 @@ class _State:
     elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
 
     def copy(self) -> _State:
-        values = (getattr(self, f.name) for f in fields(self))
-        return _State(*(value.copy() if isinstance(value, np.ndarray) else value for value in values))
+        twin = copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray):
+                setattr(twin, name, value.copy())
+        return twin
 
 
 class Ahrs:
     """Attitude filter behind the estimator protocol of `nav.horizon`; position and velocity are NaN throughout.
 
-    ``field_n`` (3,) [T] is the reference magnetic field, NED; without it the magnetometer is not used. The filter levels
-    itself from the first increments, or `start` sets it at a known attitude. ``autopilot_level`` is for the host to set
-    when an autopilot knows better than the sensors that the body manoeuvres.
+    ``field_n`` (3,) [T] is the reference magnetic field, NED; without it the magnetometer is not used. The filter
+    levels itself from the first increments, or `start` sets it at a known attitude. ``autopilot_level`` is for the host
+    to set when an autopilot knows better than the sensors that the body manoeuvres.
     """
 
     def __init__(self, config: AhrsConfig, field_n: Array | None = None) -> None:
@@ -191,8 +194,8 @@ class Ahrs:
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
 
-        The reports of the levellings since the last sample come along, then the sample's own when it is a magnetometer's
-        or unsound; airspeed and pressure leave none.
+        The reports of the levellings since the last sample come along, then the sample's own when it is a
+        magnetometer's or unsound; airspeed and pressure leave none.
         """
         if not self.accepts(sample):
             return []
@@ -215,6 +218,10 @@ class Ahrs:
             case MagnetometerSample():
                 reports += self._update_magnetometer(sample)
         return reports
+
+    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+        """The report on a sample that is not used."""
+        return [_refused(sample, reason)]
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
@@ -327,10 +334,7 @@ class Ahrs:
         step = np.clip(source, -config.phi_limit, config.phi_limit)
         bias = s.x[BIAS:].copy() if config.gyro_bias_feedback else np.zeros(3)
         if "magnetometer" not in self._aids:
-            # Nothing sees the heading: what the filter thinks of it, and of the rate about the vertical, is a guess.
-            step[2] = 0.0
-            down_b = dcm_from_quat(s.q_nb)[2]
-            bias -= down_b * (down_b @ bias)
+            step[2] = bias[2] = 0.0  # nothing sees the heading: what the filter thinks of it and of its gyro is a guess
         s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(step), s.q_nb))  # C = (I + [phi x]) C_hat
         s.x[PHI : PHI + 3] -= step
         s.correction_counter += 1
@@ -455,9 +459,7 @@ def transition(turned: Array, earth_n: Array, T: float) -> Array:
 
 
 @njit
-def _covariance_step(
-    x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array
-) -> None:
+def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
     """Take error states and covariance over the time in ``elapsed``, and empty the integral."""
     T = elapsed[0]
     Phi = transition(turned, earth_n, T)

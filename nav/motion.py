@@ -22,7 +22,7 @@ AIRSPEED_VALID_S = 2.0  # an airspeed is good for as long
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What `LowDynamics` measured: ``acceleration`` [m/s^2], ``yaw_rate``, ``roll_rate`` [rad/s]; which tests failed."""
+    """What `LowDynamics` measured, ``acceleration`` [m/s^2], ``yaw_rate``, ``roll_rate`` [rad/s]; the tests failed."""
 
     acceleration: float
     yaw_rate: float
@@ -79,8 +79,8 @@ class LowDynamics:
 class TurnDetector:
     """Straight is when |omega_z| stayed below ``rate_limit`` [rad/s] during the whole last ``quiet_s`` [s].
 
-    Source: Cheng et al. 2020, equation 24 (kappa and T0; values are not given there: the limit must exceed gyro bias and
-    noise).
+    Source: Cheng et al. 2020, equation 24, kappa and T0. The paper gives no values: the limit must exceed gyro bias and
+    noise.
     """
 
     def __init__(self, rate_limit: float = math.radians(2.0), quiet_s: float = 2.0) -> None:
@@ -120,7 +120,9 @@ class TrueAirspeed:
     def add_eas(self, t: float, eas: float) -> None:
         """Add an equivalent airspeed [m/s] at ``t`` [s]."""
         dt = t - self._t
-        self._eas = eas if dt > AIRSPEED_VALID_S else self._eas + (eas - self._eas) * -math.expm1(-dt / self.smoothing_s)
+        self._eas = (
+            eas if dt > AIRSPEED_VALID_S else self._eas + (eas - self._eas) * -math.expm1(-dt / self.smoothing_s)
+        )
         self._t = t
 
     def add_pressure(self, pressure: float) -> None:

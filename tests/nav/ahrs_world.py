@@ -67,9 +67,7 @@ def level_flight(turn_degps=3.0, turn=TURN, duration_s=DURATION_S, speed=SPEED):
     lat = LAT + travelled[:, 0] / R
     lon = 1.0 + travelled[:, 1] / (R * math.cos(LAT))
     roll = np.arctan(speed * course_rate / 9.8)
-    q_nb = Rotation.from_euler("ZYX", np.column_stack([course, np.full_like(t, 0.03), roll])).as_quat(
-        scalar_first=True
-    )
+    q_nb = Rotation.from_euler("ZYX", np.column_stack([course, np.full_like(t, 0.03), roll])).as_quat(scalar_first=True)
     return Truth(t, q_nb, *increments(t, lat, lon, np.full_like(t, H), v_n, q_nb))
 
 
