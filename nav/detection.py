@@ -164,15 +164,15 @@ class ChiSquare:
         """What is compared with the quantile, from the squared distance ``gamma2``."""
         return math.sqrt(gamma2) if self.literal else gamma2
 
-    def sound(self, gamma2: float, m: int) -> bool:
-        """Whether the squared distance ``gamma2`` of ``m`` axes passes; a NaN does not."""
+    def passes(self, gamma2: float, m: int) -> bool:
+        """Whether the squared distance ``gamma2`` of ``m`` axes is small enough; a NaN is not."""
         return self.statistic(gamma2) <= chi_square_threshold(self.false_alarm, m)
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
         """Judge one look; see `Detector`."""
         m = len(nu)
         gamma2 = whiten(nu, S)[1]
-        sound = None if self.sound(gamma2, m) else np.full(m, False)
+        sound = None if self.passes(gamma2, m) else np.full(m, False)
         return self._alarm.decide(self.statistic(gamma2), chi_square_threshold(self.false_alarm, m), m, sound)
 
 
@@ -354,7 +354,7 @@ class Sprt:
     estimated, not Wald's test. ``signed`` form: ``E <- decay E + mean' r - |mean|^2 / 2`` with the mean *before* r; it
     can fall below zero, and as exp(E) has expectation of at most one, ``-ln(false_alarm)`` bounds the alarms per look.
 
-    ``sound`` is the test that must pass for a reset (default: `ChiSquare` of the same rate). ``axis_mask`` takes out
+    ``end_test`` is what the look alone must pass for a reset. ``axis_mask`` takes out
     the axes whose own mean is beyond its limit, or all if none is.
 
     ``literal`` is Zhou et al. as printed: n |mean|^2 / 2 whatever the weights (Eq 17), the signed form with the mean
@@ -365,14 +365,10 @@ class Sprt:
     mean: Mean
     reset: Reset = Reset.NONE
     signed: bool = False
-    sound: ChiSquare | None = None
+    end_test: ChiSquare = field(default_factory=lambda: ChiSquare(1e-3))
     literal: bool = False
     _evidence: float = field(default=0.0, init=False)
     _alarm: _Alarm = field(default_factory=_Alarm, init=False)
-
-    def __post_init__(self) -> None:
-        if self.sound is None:
-            self.sound = ChiSquare(self.false_alarm)
 
     def threshold(self, m: int) -> float:
         """The limit of the evidence for ``m`` axes [nats]."""
@@ -382,7 +378,6 @@ class Sprt:
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
         """Judge one look; see `Detector`."""
-        assert self.sound is not None
         m = len(nu)
         r, gamma2 = whiten(nu, S)
         threshold = self.threshold(m)
@@ -390,7 +385,7 @@ class Sprt:
             return self._alarm.decide(math.nan, threshold, m, np.full(m, False))
         before, self._evidence = self._evidence, self._gather(r, t)
         over = self._evidence > threshold
-        if over and self._evidence < before and self.reset is not Reset.NONE and self.sound.sound(gamma2, m):
+        if over and self._evidence < before and self.reset is not Reset.NONE and self.end_test.passes(gamma2, m):
             over = False
             if self.reset is Reset.COMPLETE:
                 self.mean.restart(r, t)
@@ -462,7 +457,8 @@ class Glr:
     the fault is over and everything starts again from that look.
     (Basseville and Nikiforov, Detection of Abrupt Changes, 1993, chapter 2.)
 
-    ``axis_mask`` takes out the axes whose own mean is beyond the chi-square limit, until the alarm ends.
+    ``axis_mask`` takes out the axes whose own mean is beyond the chi-square limit; when none is any more, those that
+    were last.
     """
 
     false_alarm: float
@@ -470,6 +466,7 @@ class Glr:
     end_evidence: float = 7.0
     _window: _Window = field(init=False)
     _fault: Array | None = field(default=None, init=False)  # mean of the residuals (2, m) while the alarm lasts
+    _variance: float = field(default=1.0, init=False)  # of each of its components when its axis is sound
     _end: float = field(default=0.0, init=False)
     _sound: Mask = field(init=False)
     _alarm: _Alarm = field(default_factory=_Alarm, init=False)
@@ -494,18 +491,21 @@ class Glr:
                 self._window.push(r, t)
                 statistic, threshold = 0.5 * gamma2, glr_threshold(self.false_alarm, m, 1)
         elif statistic > threshold:
-            self._fault = rows[-length:].mean(axis=0)
+            self._fault, self._variance = rows[-length:].mean(axis=0), 1.0 / length
             self._end = 0.0
-            self._sound = _sound_axes(self._fault[1], 1.0 / length, self.false_alarm)
-        return self._alarm.decide(statistic, threshold, m, None if self._fault is None else self._sound.copy())
+            self._sound = _sound_axes(self._fault[1], self._variance, self.false_alarm)
+        return self._alarm.decide(statistic, threshold, m, None if self._fault is None else self._sound)
 
     def _follow(self, fault: Array, r: Array) -> None:
-        """Evidence for the end of the ``fault``; without any, its mean follows ``r`` and may lay hold of more axes."""
+        """Evidence for the end of the ``fault``; without any, its mean follows ``r`` and names the axes anew."""
         mu = fault[0]
         self._end = max(0.0, self._end + float(mu.dot(0.5 * mu - r[0])))
         if self._end == 0.0:
             fault += FAULT_MEAN_GAIN * (r - fault)
-            self._sound &= _small(fault[1], FAULT_MEAN_GAIN / (2.0 - FAULT_MEAN_GAIN), self.false_alarm)
+            self._variance = (1.0 - FAULT_MEAN_GAIN) ** 2 * self._variance + FAULT_MEAN_GAIN**2
+            small = _small(fault[1], self._variance, self.false_alarm)
+            if not small.all():
+                self._sound = small
 
 
 @dataclass(frozen=True)
