@@ -79,14 +79,14 @@ def test_acceleration_of_the_air_velocity_is_what_the_body_feels():
 
 
 def test_true_airspeed_by_height_and_by_pressure():
-    # U.S. Standard Atmosphere 1976, table I, 5000 m: 54019.9 Pa, 0.73612 kg/m^3
-    expected = 30 * math.sqrt(1.225 / 0.73612)
+    # U.S. Standard Atmosphere 1976, table I, geometric 5000 m: 54048 Pa, 0.73643 kg/m^3
+    expected = 30 * math.sqrt(1.225 / 0.73643)
     by_height, by_pressure = TrueAirspeed(5000.0, 5.0), TrueAirspeed(0.0, 5.0)
     for airspeed in (by_height, by_pressure):
         airspeed.add_eas(1.0, 30.0)
     assert by_height.at(1.0) == pytest.approx(expected, rel=1e-4)
     assert by_pressure.at(1.0) == pytest.approx(30.0, rel=1e-4)
-    by_pressure.add_pressure(54019.9)
+    by_pressure.add_pressure(54048.0)
     assert by_pressure.at(1.0) == pytest.approx(expected, rel=1e-4)
 
 
@@ -116,29 +116,17 @@ def cut(samples, start, stop):
     return ImuSamples(samples.t[start:stop], samples.dt[start:stop], samples.dtheta[start:stop], samples.dv[start:stop])
 
 
-@pytest.mark.parametrize("size", [1, 7, 1000])
-def test_turns_end_when_it_has_been_quiet_for_long_enough(size):
+@pytest.mark.parametrize("size", [1, 7, 50])
+def test_a_turn_is_over_when_it_has_been_quiet_for_long_enough(size):
+    """Quiet, half a degree per second; 3 s of turn from 3 s on; quiet again, just below the limit."""
     samples = rates([0.5] * 300 + [-30.0] * 300 + [1.9] * 400)
     detector = TurnDetector()
-    straight = []
     assert not detector.straight(0.0)
-    for start in range(0, 1000, size):
-        detector.push(cut(samples, start, start + size))
-        straight.append(
-            (float(samples.t[min(start + size, 1000) - 1]), detector.straight(samples.t[start:][:size][-1]))
-        )
-    told = dict(straight)
-    assert told[10.0]
-    if size == 1:
-        assert [told[t] for t in (1.99, 2.0, 3.0, 3.01, 6.01, 7.99, 8.0)] == [
-            False,
-            True,
-            True,
-            False,
-            False,
-            False,
-            True,
-        ]
+    for start in range(0, len(samples), size):
+        block = cut(samples, start, start + size)
+        detector.push(block)
+        t = float(block.t[-1])
+        assert detector.straight(t + 1e-9) is ((t + 1e-9 >= 2.0 and t < 3.005) or t > 7.995)
 
 
 def test_a_rate_that_is_not_finite_is_no_straight():
