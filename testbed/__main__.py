@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from testbed.data import data_dir
+from testbed.data import data_dir, is_result
 from testbed.errors import UserError
 
 if TYPE_CHECKING:
+    import xarray
     from rich.console import Console
 
     from testbed.loop import Publisher, RunResult
@@ -96,11 +97,16 @@ def scenarios() -> None:
 def run(
     scenario: ScenarioName,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results; runs/<scenario>.")] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", min=0, help="In place of the scenario's seed.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", min=0, max=2**63 - 1, help="In place of the scenario's seed.")
+    ] = None,
     overrides: Overrides = None,
     mavlink: Annotated[
         list[str] | None,
         typer.Option(metavar="URL", help="Stream to udpout, tcp or tcpin:HOST:PORT, or to tlog:FILE; repeatable."),
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Which estimator to stream; the scenario's first.")
     ] = None,
     realtime: Annotated[
         float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
@@ -113,8 +119,9 @@ def run(
     loaded = _load(scenario, overrides)
     folder = out or RUNS / Path(scenario).stem
     with _output_folder(folder):
-        result = _fly(loaded, folder, seed=seed, links=_connect(mavlink or [], loaded), realtime=realtime)
-        _conclude(result, folder, report)
+        links = _connect(mavlink or [], loaded, folder, estimator)
+        result = _fly(loaded, folder, seed=seed, links=links, shown=estimator, realtime=realtime)
+        _conclude(result.dataset, result.metrics, folder / "run.nc", report)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
 
@@ -145,10 +152,14 @@ def check(
 @app.command()
 def report(run_file: RunFile) -> None:
     """Write figures and report.html again from a run file, beside it."""
-    from testbed import loop, metrics, record
+    from testbed import metrics, record
 
     dataset = record.load(run_file)
-    _conclude(loop.RunResult(dataset, metrics.compute(dataset), run_file.parent), run_file.parent, report=True)
+    computed = metrics.compute(dataset)
+    kept = run_file.parent / "metrics.json"
+    if not kept.exists():  # the run was killed
+        metrics.save(computed, kept)
+    _conclude(dataset, computed, run_file, report=True)
 
 
 @app.command()
@@ -206,10 +217,13 @@ def campaign(
 
 @app.command()
 def bench() -> None:
-    """Measure speed, each figure as a ratio within the same run."""
+    """Measure speed, each figure as a ratio within the same run; exit code 1 if a bound was missed."""
     from testbed import bench as benchmarks
 
-    benchmarks.main()
+    missed = benchmarks.main()
+    if missed:
+        print(f"testbed: bench: bound missed by {', '.join(missed)}", file=sys.stderr)
+        raise typer.Exit(EXIT_FAILED)
 
 
 def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> dict[str, bool]:
@@ -305,11 +319,18 @@ def _keeping(what_is_left: str) -> Iterator[None]:
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def _connect(urls: Sequence[str], scenario: Scenario) -> list[Publisher]:
+def _connect(urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None) -> list[Publisher]:
+    """Open the links, once it is sure that there is something to show and that no log would overwrite a result."""
     if not urls:
         return []
-    from testbed.mavlink import MavlinkPublisher
+    from testbed.loop import shown_estimator
+    from testbed.mavlink import MavlinkPublisher, log_path
 
+    shown_estimator(scenario, estimator)
+    for url in urls:
+        path = log_path(url)
+        if path is not None and path.resolve().parent == folder.resolve() and is_result(path.name):
+            raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
     return [MavlinkPublisher(urls, scenario.date)]
 
 
@@ -319,6 +340,7 @@ def _fly(
     *,
     seed: int | None = None,
     links: Sequence[Publisher] = (),
+    shown: str | None = None,
     realtime: float | None = None,
 ) -> RunResult:
     from testbed import loop, progress
@@ -327,23 +349,27 @@ def _fly(
         _keeping(f"the record so far is {folder / 'run.nc'}"),
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
-        return loop.run(
+        result = loop.run(
             scenario,
             seed=seed,
             out=folder,
             links=links,
+            shown=shown,
             realtime=realtime,
             progress=lambda now: tell(*progress.of_run(now)),
         )
+    for remark in result.remarks:
+        print(f"testbed: {remark}", file=sys.stderr)
+    return result
 
 
-def _conclude(result: RunResult, folder: Path, report: bool) -> None:
+def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool) -> None:
     from testbed import report as reports
 
-    _console().print(reports.summary_table(result.metrics))
+    _console().print(reports.summary_table(metrics))
     if report:
-        print(f"report: {reports.write_report(result.dataset, result.metrics, folder)}")
-    print(f"record: {folder / 'run.nc'}")
+        print(f"report: {reports.write_report(dataset, metrics, run_file.parent)}")
+    print(f"record: {run_file}")
 
 
 def _lost(result: RunResult) -> bool:

@@ -32,7 +32,6 @@ from nav.ins import Ins, InsConfig
 from nav.rotation import quat_from_euler
 from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
 from testbed import loop
-from testbed.errors import UserError
 from testbed.scenario import Scenario
 
 MAIN = "loiter_gnss_outage"
@@ -277,8 +276,8 @@ def _aligned(trajectory: Any) -> Ins:
     return ins
 
 
-def main() -> None:
-    """Measure and print everything; ends with an error message naming any bound that was not kept."""
+def main() -> list[str]:
+    """Measure and print everything; returns the names of the figures that missed their bound."""
     console = Console()
     rows: list[Row] = []
     for measure in (whole_run, strapdown_alone, ins_at_every_sample, start_up):
@@ -297,6 +296,4 @@ def main() -> None:
     console.print(costs)
     if not HAS_PEERS:
         console.print("The peers are not installed: `make bench` installs them and compares.")
-    missed = [row.what for row in rows if not row.kept]
-    if missed:
-        raise UserError(f"bench: bound missed by {', '.join(missed)}")
+    return [row.what for row in rows if not row.kept]

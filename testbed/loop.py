@@ -8,6 +8,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,8 @@ from typing import TYPE_CHECKING, Protocol
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
 from testbed import estimators, metrics, sensors
 from testbed.ahead import Ahead
+from testbed.data import remove_derived
+from testbed.errors import UserError
 from testbed.pacer import Pacer
 from testbed.record import Recorder
 from testbed.scenario import FlightTruth, Scenario
@@ -28,6 +31,7 @@ BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
 PACED_S = 1.0  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REFUSALS = 10  # of an aid in a row, before it is worth an event
+LARGEST_SEED = 2**63 - 1
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
 
@@ -45,13 +49,15 @@ class Progress:
 class RunResult:
     """What `run` gives back: the recorded dataset, its metrics, and the folder written (None when in memory).
 
-    ``failure`` is empty unless the motion ended early because control was lost; then it says how.
+    ``failure`` is empty unless the motion ended early because control was lost; then it says how. ``remarks`` are what
+    else the caller should know: a plan that ended before the run, deadlines missed in real time.
     """
 
     dataset: xarray.DataTree
     metrics: dict[str, float]
     path: Path | None
     failure: str = ""
+    remarks: tuple[str, ...] = ()
 
 
 class Publisher(Protocol):
@@ -68,7 +74,7 @@ class Publisher(Protocol):
         others: Sequence[tuple[str, Estimate]],
         reports: Sequence[UpdateReport],
     ) -> None:
-        """One row of truth; the first estimator's estimate and its reports since the last call; the newest sample of
+        """One row of truth; the shown estimator's estimate and its reports since the last call; the newest sample of
         each sensor; increments up to the row or beyond; the other estimators' estimates.
         """
         ...
@@ -80,6 +86,18 @@ class Publisher(Protocol):
     def close(self) -> None:
         """The run is over."""
         ...
+
+
+def shown_estimator(scenario: Scenario, asked: str | None = None) -> str:
+    """The estimator that links show: the one asked for, or the first. Raises UserError when there is none such."""
+    names = [one.name for one in scenario.estimator]
+    if not names:
+        raise UserError("the scenario has no [[estimator]], so a link has nothing to show: add one, or leave it out")
+    if asked is None:
+        return names[0]
+    if asked not in names:
+        raise UserError(f"--estimator {asked}: the scenario has no such estimator: choose from {', '.join(names)}")
+    return asked
 
 
 def motion(scenario: Scenario, seed: int) -> MotionSource:
@@ -106,8 +124,8 @@ class _EventWatch:
 
     @property
     def denied(self) -> bool:
-        """Whether some GNSS receiver that had a fix has none now."""
-        return not all(self.fix.values())
+        """Whether no GNSS receiver has a fix, as in `metrics.outages`; one that has said nothing yet doesn't count."""
+        return bool(self.fix) and not any(self.fix.values())
 
     def sample(self, sample: Sample) -> None:
         if not isinstance(sample, GnssSample):
@@ -126,8 +144,9 @@ class _EventWatch:
             if self.refusals.pop(key, 0) >= REFUSALS:
                 self.emit(report.t, "info", f"{estimator}: {report.aid} accepted again")
         elif math.isnan(report.nis):
+            key = (estimator, report.sensor)  # a sample may serve several aids
             if report.t - self.unsound.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
-                self.emit(report.t, "warning", f"{estimator}: {report.aid} refused, {report.reason}")
+                self.emit(report.t, "warning", f"{estimator}: {report.sensor} refused, {report.reason}")
                 self.unsound[key] = report.t
         else:
             self.refusals[key] = self.refusals.get(key, 0) + 1
@@ -173,9 +192,21 @@ class _Latest:
 def _take(reports: deque[UpdateReport], until: float) -> list[UpdateReport]:
     """Remove and give the reports on samples up to a time."""
     taken = []
-    while reports and reports[0].t <= until:
+    while reports and not reports[0].t > until:  # a time may be NaN
         taken.append(reports.popleft())
     return taken
+
+
+def _flown(scenario: Scenario, end: float) -> tuple[str, str]:
+    """Severity and text of a plan that ended before the run; a denial that it never reached is worth a warning."""
+    text = f"plan flown: the run ends at {end:.0f} s of {scenario.duration_s:g} s"
+    missed = [
+        f"{name} denied from {window[0]:g} s"
+        for name, config in scenario.sensors.items()
+        for window in getattr(config, "denied", ())
+        if window[0] >= end
+    ]
+    return ("warning", f"{text}, before {', '.join(missed)}") if missed else ("info", text)
 
 
 def run(
@@ -184,6 +215,7 @@ def run(
     seed: int | None = None,
     out: Path | None = None,
     links: Sequence[Publisher] = (),
+    shown: str | None = None,
     realtime: float | None = None,
     progress: Callable[[Progress], None] | None = None,
     source: MotionSource | None = None,
@@ -191,53 +223,61 @@ def run(
     """Fly, sense, estimate and record one scenario.
 
     ``seed`` replaces the scenario's own. With ``out`` the record goes to ``out/run.nc`` as it is made, and
-    metrics.json beside it; without, everything stays in memory. ``links`` watch; ``realtime`` paces the run (1 = wall
-    clock).
+    metrics.json beside it; without, everything stays in memory. ``links`` watch the estimator ``shown``, the first
+    unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
     ``source`` replaces the motion, to share one flown truth between runs. Same scenario and seed, same bits.
-    Raises UserError when the folder can't be written or the motion can't be started.
+    Raises UserError when the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
-    seed = scenario.seed if seed is None else seed
-    started = time.perf_counter()
-    rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
-    site = scenario.site()
-    inertial: dict[str, sensors.Imu] = {}
-    aiding: dict[str, sensors.AidingSensor] = {}
-    for name, config in scenario.sensors.items():
-        sensor = sensors.build(name, config, rate_hz, seed, site)
-        if isinstance(sensor, sensors.Imu):
-            inertial[name] = sensor
-        else:
-            aiding[name] = sensor
-    filters = estimators.build(scenario)
-    plan = [leg.leg for leg in scenario.plan]
-
-    ticks = round(scenario.duration_s * rate_hz) + 1
-    record_every = round(rate_hz / scenario.record.rate_hz)
-    events_every = max(1, round(EVENTS_S * rate_hz))
-    publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
-    chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
-    pacer = Pacer(realtime) if realtime else None
-    recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
-    ahead = None
-    if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
-        source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
-    elif source is None:
-        source = motion(scenario, seed)
-
-    def emit(t: float, severity: str, text: str) -> None:
-        recorder.event(t, severity, text)
+    with ExitStack() as ending:
         for link in links:
-            link.event(t, severity, text)
+            ending.callback(link.close)
+        seed = scenario.seed if seed is None else seed
+        if not 0 <= seed <= LARGEST_SEED:
+            raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
+        shown = shown_estimator(scenario, shown) if links or shown is not None else None
+        started = time.perf_counter()
+        rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
+        site = scenario.site()
+        inertial: dict[str, sensors.Imu] = {}
+        aiding: dict[str, sensors.AidingSensor] = {}
+        for name, config in scenario.sensors.items():
+            sensor = sensors.build(name, config, rate_hz, seed, site)
+            if isinstance(sensor, sensors.Imu):
+                inertial[name] = sensor
+            else:
+                aiding[name] = sensor
+        filters = estimators.build(scenario)
+        behind = {name: one.horizon.lag_s for name, one in filters.items()}
+        plan = [leg.leg for leg in scenario.plan]
 
-    watch = _EventWatch(emit)
-    latest = _Latest()
-    shown = next(iter(filters), None)  # the estimator that the links show first
-    unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
-    unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
-    arrived: list[Sample] = []  # nor these
-    truth_s = 0.0
-    gc.freeze()  # samples come by the million, and the collector would walk all that was there before again and again
-    try:
+        ticks = round(scenario.duration_s * rate_hz) + 1
+        record_every = round(rate_hz / scenario.record.rate_hz)
+        events_every = max(1, round(EVENTS_S * rate_hz))
+        publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
+        chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
+        pacer = Pacer(realtime) if realtime else None
+        recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
+        ending.callback(recorder.close)
+        if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
+            source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
+            ending.callback(ahead.close)
+        elif source is None:
+            source = motion(scenario, seed)
+
+        def emit(t: float, severity: str, text: str) -> None:
+            recorder.event(t, severity, text)
+            for link in links:
+                link.event(t, severity, text)
+
+        watch = _EventWatch(emit)
+        latest = _Latest()
+        unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
+        unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
+        arrived: list[Sample] = []  # nor these
+        truth_s = 0.0
+        # Samples come by the million, and the collector would walk all that was there before again and again.
+        gc.freeze()
+        ending.callback(gc.unfreeze)
         tick = 0
         while tick < ticks:
             before = time.perf_counter()
@@ -245,6 +285,8 @@ def run(
             truth_s += time.perf_counter() - before
             if not len(block):
                 break
+            if tick == 0 and out is not None:  # from here on what an earlier run left there would not fit the record
+                remove_derived(out)
             imu = {name: sensor.sense(block) for name, sensor in inertial.items()}
             samples = {name: sensor.sense(block) for name, sensor in aiding.items()}
             for own in samples.values():
@@ -282,15 +324,17 @@ def run(
                     watch.row(times[i], block.leg[k], plan)
                     for name, estimate in now:
                         watch.estimate(name, estimate)
-                        for report in _take(unread[name], times[i] - filters[name].horizon.lag_s):
+                        for report in _take(unread[name], times[i] - behind[name]):
                             watch.report(name, report)
                 if (tick + k) % record_every == 0:
                     for name, estimate in now:
                         recorder.estimate(name, estimate)
                 if publish_every and (tick + k) % publish_every == 0 and shown is not None:
-                    due = _take(unshown, times[i] - filters[shown].horizon.lag_s)
+                    due = _take(unshown, times[i] - behind[shown])
+                    row, first = block.rows(k, k + 1), estimates[shown][i]
+                    others = [(name, estimate) for name, estimate in now if name != shown]
                     for link in links:
-                        link.publish(block.rows(k, k + 1), now[0][1], latest.by_sensor, integrated[shown], now[1:], due)
+                        link.publish(row, first, latest.by_sensor, integrated[shown], others, due)
             tick += len(block)
             t = float(block.t[-1])
             if pacer is not None:
@@ -299,23 +343,24 @@ def run(
                 activity = "GNSS denied" if watch.denied else source.activity()
                 factor = t / max(time.perf_counter() - started, 1e-9)
                 progress(Progress(t, scenario.duration_s, factor, activity))
+        end = (tick - 1) / rate_hz
+        remarks = []
         if source.failure:
-            emit((tick - 1) / rate_hz, "error", source.failure)
-    finally:
-        gc.unfreeze()
-        if ahead is not None:
-            ahead.close()
-        recorder.close()
-        for link in links:
-            link.close()
+            emit(end, "error", source.failure)
+        elif tick < ticks:
+            severity, remark = _flown(scenario, end)
+            emit(end, severity, remark)
+            remarks.append(remark)
+        if pacer is not None and pacer.missed:
+            remarks.append(str(pacer))
     dataset = recorder.dataset()
     wall_s = time.perf_counter() - started
     results = metrics.compute(dataset)
     results |= {
         "run.wall_s": wall_s,
         "run.truth_s": truth_s,
-        "run.realtime_factor": (tick - 1) / rate_hz / wall_s,
+        "run.realtime_factor": end / wall_s,
     }
     if out is not None:
         metrics.save(results, out / "metrics.json")
-    return RunResult(dataset, results, out, source.failure)
+    return RunResult(dataset, results, out, source.failure, tuple(remarks))

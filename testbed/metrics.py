@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from nav import earth
 from nav.samples import Array, FixType, Status
-from testbed.errors import UserError
+from testbed.data import write_file
 
 if TYPE_CHECKING:
     import xarray
@@ -331,7 +331,5 @@ def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: floa
 
 def save(metrics: Mapping[str, float], path: Path) -> None:
     """Write metrics as JSON. Raises UserError when the file can't be written."""
-    try:
-        path.write_text(json.dumps(dict(metrics), indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: can't write metrics: {error.strerror or error}") from error
+    text = json.dumps(dict(metrics), indent=1, sort_keys=True, allow_nan=False) + "\n"
+    write_file(path, text.encode())

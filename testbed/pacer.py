@@ -18,7 +18,7 @@ class Pacer:
     late catches up at most `MAX_LAG_S` of wall time; what exceeds it is given up, and the deadlines after it move.
 
     ``waits`` counts the calls after the first, ``missed`` those that came after their deadline; ``worst_s`` is the
-    latest of them and ``given_up_s`` the wall time that was not made good.
+    latest of them and ``given_up_s`` the wall time that was not made good. As text, it says these.
     """
 
     def __init__(
@@ -56,3 +56,9 @@ class Pacer:
             excess = max(0.0, late - MAX_LAG_S)
             self.given_up_s += excess
             self._start += excess
+
+    def __str__(self) -> str:
+        return (
+            f"real time: {self.missed} of {self.waits} deadlines missed, at worst by {self.worst_s:.2g} s; "
+            f"{self.given_up_s:.2g} s not made good"
+        )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from scipy.stats import chi2
 from nav import earth
 from nav.samples import Array
 from testbed import metrics as scores
+from testbed.data import write_file
 from testbed.errors import UserError
 from testbed.metrics import Errors, column
 
@@ -629,10 +631,12 @@ def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder:
         shown = []
         for name, caption, figure in _figures(run):
             if figure is not None:
-                figure.savefig(folder / f"{name}.png", pil_kwargs={"compress_level": 4})
-                shown.append((caption, (folder / f"{name}.png").read_bytes()))
+                png = io.BytesIO()
+                figure.savefig(png, pil_kwargs={"compress_level": 4})
+                write_file(folder / f"{name}.png", png.getvalue())
+                shown.append((caption, png.getvalue()))
         page = folder / "report.html"
-        page.write_text(_page(run, metrics, shown), encoding="utf-8")
+        write_file(page, _page(run, metrics, shown).encode())
     except OSError as error:
         raise UserError(
             f"{folder}: can't write the report ({error.strerror or error}); choose another --out"

@@ -4,6 +4,7 @@
 they go. Data comes in by `MavlinkPublisher.publish`; nothing here is known to the rest of the testbed.
 """
 
+from testbed.mavlink.link import log_path
 from testbed.mavlink.stream import MavlinkPublisher
 
-__all__ = ["MavlinkPublisher"]
+__all__ = ["MavlinkPublisher", "log_path"]

@@ -42,16 +42,20 @@ class Link(Protocol):
         ...
 
 
+def log_path(url: str) -> Path | None:
+    """The file that ``url`` names; None when it names no telemetry log."""
+    return Path(url.removeprefix("tlog:")) if url.startswith("tlog:") or url.endswith(".tlog") else None
+
+
 def connect(url: str) -> Link:
     """Open the link that ``url`` names.
 
     Raises UserError, naming the address and what to do, when it is malformed, its host unknown, its port taken, nobody
     listens, or the file can't be written.
     """
-    if url.startswith("tlog:"):
-        return TelemetryLog(url, Path(url.removeprefix("tlog:")))
-    if url.endswith(".tlog"):
-        return TelemetryLog(url, Path(url))
+    path = log_path(url)
+    if path is not None:
+        return TelemetryLog(url, path)
     kind, _, where = url.partition(":")
     if kind not in ("udpout", "tcp", "tcpin"):
         raise UserError(f"{url}: not a MAVLink address; use {_FORMS}")
@@ -67,7 +71,7 @@ def connect_all(urls: Sequence[str]) -> list[Link]:
         raise UserError(f"{', '.join(urls)}: the same MAVLink address is given twice; give it once")
     with contextlib.ExitStack() as opened:
         links = {}
-        for url in sorted(urls, key=lambda url: url.startswith("tlog:") or url.endswith(".tlog")):
+        for url in sorted(urls, key=lambda url: log_path(url) is not None):
             links[url] = connect(url)
             opened.callback(links[url].close)
         opened.pop_all()

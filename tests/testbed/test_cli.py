@@ -20,7 +20,7 @@ import pytest
 from rich.console import Console
 
 import testbed.__main__ as cli
-from testbed import flight, loop, progress, record
+from testbed import bench, flight, loop, progress, record
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.scenario import Bounds
@@ -123,6 +123,21 @@ def test_start_up_is_quick(arguments: list[str]) -> None:
         (["run", "u_turn", "--realtime", "nan"], "testbed: --realtime nan: the factor must be above 0"),
         (["run", "u_turn", "--seed", "-1"], "--seed"),
         (["run", "u_turn", "--seed", "x"], "--seed"),
+        (["run", "u_turn", "--seed", "99999999999999999999"], "--seed"),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:a.tlog", "--estimator", "inz"],
+            "testbed: --estimator inz: the scenario has no such estimator: choose from ins",
+        ),
+        (["run", "u_turn", "--estimator", "inz"], "testbed: --estimator inz: the scenario has no such estimator"),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:a.tlog", "--set", "estimator=[]", "--set", "expect={}"],
+            "testbed: the scenario has no [[estimator]], so a link has nothing to show: add one",
+        ),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:runs/u_turn/../u_turn/run.nc"],
+            "testbed: tlog:runs/u_turn/../u_turn/run.nc: a result of the run goes there: give the log another name",
+        ),
+        (["run", "u_turn", "--mavlink", "tlog:o/report.html", "--out", "o"], "a result of the run goes there"),
         (["run", "u_turn", "--mavlink", "udp"], "testbed: udp: not a MAVLink address"),
         (["run", "u_turn", "--mavlink", "udpout:127.0.0.1:99999"], "testbed: udpout:127.0.0.1:99999: no port number"),
         (["run", "u_turn", "--bogus"], "No such option"),
@@ -273,9 +288,13 @@ def test_export_and_report_of_a_run(testbed: Testbed, tmp_path: Path) -> None:
         ended = testbed("export", "out/run.nc", "--format", form)
         assert (ended.code, ended.out) == (0, f"out/{made}\n")
         assert (tmp_path / "out" / made).exists()
-    ended = testbed("report", "out/run.nc")
+    (tmp_path / "out/run.nc").rename(tmp_path / "out/mine.nc")
+    (tmp_path / "out/metrics.json").unlink()  # as after a killed run
+    ended = testbed("report", "out/mine.nc")
     assert ended.code == 0, ended.err
+    assert ended.out.splitlines()[-1] == "record: out/mine.nc"
     assert (tmp_path / "out/report.html").stat().st_size > 10_000
+    assert "ins.aligned_s" in (tmp_path / "out/metrics.json").read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -291,7 +310,7 @@ def test_export_and_report_of_a_run(testbed: Testbed, tmp_path: Path) -> None:
 def test_check(
     testbed: Testbed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, metrics: dict[str, float], code: int
 ) -> None:
-    monkeypatch.setattr(loop, "run", lambda *_, **__: SimpleNamespace(metrics=metrics, failure=""))
+    monkeypatch.setattr(loop, "run", lambda *_, **__: SimpleNamespace(metrics=metrics, failure="", remarks=()))
     text = (data_dir("scenarios") / "u_turn.toml").read_text("utf-8")
     expect = '[expect]\n"ins.position_horizontal_rms_m" = 3.0\n"ins.position_nees_mean" = { min = 0.6, max = 1.5 }\n'
     (tmp_path / "mine.toml").write_text(text[: text.index("[expect]")] + expect)
@@ -314,6 +333,21 @@ def test_judge() -> None:
     expect = {"a": Bounds(max=1.0), "b": Bounds(min=2.0), "c": Bounds(min=0.0, max=1.0)}
     assert cli.judge(expect, {"a": 1.0, "b": 2.0, "c": 0.5}) == {"a": True, "b": True, "c": True}
     assert cli.judge(expect, {"a": 1.1, "b": 1.9}) == {"a": False, "b": False, "c": False}
+
+
+@pytest.mark.parametrize(("missed", "code"), [([], 0), (["whole run", "strapdown"], 1)])
+def test_a_missed_bound_is_a_failure(
+    testbed: Testbed, monkeypatch: pytest.MonkeyPatch, missed: list[str], code: int
+) -> None:
+    monkeypatch.setattr(bench, "main", lambda: missed)
+    ended = testbed("bench")
+    assert (ended.code, ended.err) == (code, "testbed: bench: bound missed by whole run, strapdown\n" if missed else "")
+
+
+def test_what_a_run_remarks_is_said(testbed: Testbed) -> None:
+    ended = testbed("run", "u_turn", "--set", "plan=[{leg='straight', length_m=200}]", "--no-report")
+    assert ended.code == 0
+    assert re.fullmatch(r"testbed: plan flown: the run ends at \d+ s of 200 s", ended.err.splitlines()[-1])
 
 
 # --- arguments and progress

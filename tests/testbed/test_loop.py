@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, UpdateReport
 from testbed import Scenario, flight, loop, record, run
+from testbed.errors import UserError
 from testbed.truth import MotionSource, TruthBlock
 
 SHORT = ["duration_s=40", "sensors.gnss.denied=[[20, 26]]"]
@@ -146,6 +148,90 @@ def test_lost_control_is_an_event_and_ends_the_run(monkeypatch: pytest.MonkeyPat
     assert 10.0 < end < 59.0
     assert result.failure.startswith("control lost: bank")
     assert watcher.events[-1] == (pytest.approx(end, abs=0.1), "error", result.failure)
+
+
+@pytest.mark.parametrize(
+    ("denied", "severity", "more"),
+    [([[2.0, 4.0]], "info", ""), ([[2.0, 4.0], [150.0, 160.0]], "warning", ", before gnss denied from 150 s")],
+)
+def test_a_plan_that_ends_before_the_run_is_an_event(denied: list[list[float]], severity: str, more: str) -> None:
+    short = ["plan=[{leg='straight', length_m=200}]", f"sensors.gnss.denied={denied}"]
+    result = run(Scenario.load("u_turn", short))
+    end = result.dataset["truth"]["time"].values[-1]
+    assert end < 20.0
+    said = f"plan flown: the run ends at {end:.0f} s of 200 s{more}"
+    assert (result.failure, result.remarks) == ("", (said,))
+    assert result.dataset["events"]["text"].values[-1] == said
+    assert result.dataset["events"]["severity"].values[-1] == severity
+
+
+def test_links_show_the_estimator_that_was_asked_for() -> None:
+    class Naming(Watcher):
+        def publish(self, truth, estimate, samples, imu, others, reports):  # type: ignore[no-untyped-def]
+            super().publish(truth, estimate, samples, imu, others, reports)
+            self.shown = "wind" in estimate.extra, [name for name, _ in others], [r.aid for r in reports]
+
+    estimators = ", ".join(
+        f"{{name='{n}', aids={a}}}" for n, a in (("a", ["gnss"]), ("b", ["gnss", "airspeed"]), ("c", []))
+    )
+    scenario = Scenario.load("u_turn", ["duration_s=8", f"estimator=[{estimators}]", "expect={}"])
+    for shown, expected in ((None, (False, ["b", "c"])), ("b", (True, ["a", "c"]))):
+        watcher = Naming()
+        run(scenario, links=[watcher], shown=shown)
+        assert watcher.shown[:2] == expected
+        assert ("airspeed" in watcher.shown[2]) <= (shown == "b")
+
+
+@pytest.mark.parametrize(
+    ("options", "overrides", "says"),
+    [
+        ({"seed": -1}, [], "seed -1: must be from 0 to 9223372036854775807"),
+        ({"seed": 2**63}, [], "seed 9223372036854775808: must be from 0"),
+        ({"shown": "inz"}, [], "--estimator inz: the scenario has no such estimator: choose from ins"),
+        ({}, ["estimator=[]", "expect={}"], r"no \[\[estimator\]\], so a link has nothing to show"),
+        ({"out": Path("/proc/testbed")}, [], "can't write here"),
+    ],
+)
+def test_a_refused_run_closes_its_links(options: dict[str, Any], overrides: list[str], says: str) -> None:
+    watcher = Watcher()
+    with pytest.raises(UserError, match=says):
+        run(Scenario.load("u_turn", overrides), links=[watcher], **options)
+    assert watcher.closed
+
+
+def test_the_largest_seed_flies() -> None:
+    assert run(Scenario.load("u_turn", ["duration_s=1"]), seed=2**63 - 1).dataset.attrs["seed"] == 2**63 - 1
+
+
+def test_what_an_earlier_run_left_goes_when_the_next_one_starts(tmp_path: Path) -> None:
+    scenario = Scenario.load("u_turn", ["duration_s=3"])
+    stale = [tmp_path / name for name in ("metrics.json", "report.html", "nees.png", "old_biases.png")]
+    mine = [tmp_path / name for name in ("run.tlog", "photo.png", "notes.html")]
+
+    class Broken:
+        """A motion that fails at its first or at its second call."""
+
+        rate_hz, failure = 200.0, ""
+
+        def __init__(self, rows: int) -> None:
+            self.inner, self.left = loop.motion(scenario, 1), rows
+
+        def advance(self, ticks: int) -> TruthBlock:
+            if not self.left:
+                raise UserError("no trim")
+            self.left -= 1
+            return self.inner.advance(200)
+
+        def activity(self) -> str:
+            return ""
+
+    for path in stale + mine:
+        path.write_text("")
+    for calls, left in ((0, True), (1, False)):
+        with pytest.raises(UserError, match="no trim"):
+            run(scenario, out=tmp_path, source=Broken(calls))
+        assert {path.exists() for path in stale} == {left}
+        assert all(path.exists() for path in mine)
 
 
 def test_metrics_and_record_are_written(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from rich.console import Console
 from synthetic_run import Errors, circle, scenario
 
 from testbed import metrics, report
+from testbed.data import is_result
 from testbed.errors import UserError
 from testbed.record import Recorder
 
@@ -46,6 +47,7 @@ def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> N
     text = page.read_text(encoding="utf-8")
     images = sorted(p.name for p in tmp_path.glob("*.png"))
     assert {"flight.png", "ground_track.png"} <= set(images)
+    assert all(is_result(path.name) for path in tmp_path.iterdir()), "the next run would leave it there"
     assert text.count("data:image/png;base64,") == len(images)
     assert not re.findall(r"(?:src|href)='(?!data:)", text)
     assert "A made-up circle" in text
