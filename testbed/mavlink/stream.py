@@ -84,6 +84,7 @@ class MavlinkPublisher:
         """
         midnight = datetime.datetime.combine(date, datetime.time(), datetime.UTC)
         self._start_us = int(midnight.timestamp()) * 10**6
+        self._sent_us = 0
         self._encoder = Encoder()
         self._calls = 0
         self._long_texts = 0
@@ -147,9 +148,9 @@ class MavlinkPublisher:
                 stack.callback(link.close)
 
     def _send(self, t: float, frames: Sequence[bytes]) -> None:
-        time_us = self._start_us + microseconds(t)
+        self._sent_us = max(self._sent_us, self._start_us + microseconds(t))  # events tell of times before the last row
         for link in self._links:
-            link.send(time_us, frames)
+            link.send(self._sent_us, frames)
 
     def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
         """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""

@@ -609,6 +609,18 @@ def test_events(tmp_path):
     assert log[2][1].id == log[3][1].id != log[4][1].id
 
 
+def test_time_never_runs_backwards_in_the_log(tmp_path):
+    path = tmp_path / "run.tlog"
+    publisher = MavlinkPublisher([str(path)], DATE)
+    publish(publisher, range(50))
+    publisher.event(1.0, "info", "of a sample that was used late")
+    publish(publisher, range(50, 60))
+    publisher.close()
+    stamps = [time_us for time_us, _ in read_log(path)]
+    assert stamps == sorted(stamps)
+    assert stamps[-1] == MIDNIGHT_US + 59 * 40_000
+
+
 def test_several_links_say_the_same(tmp_path):
     paths = [tmp_path / "a.tlog", tmp_path / "b.tlog"]
     publisher = MavlinkPublisher([f"tlog:{path}" for path in paths], DATE)
