@@ -176,6 +176,8 @@ EXTRA = {
     "gnss_velocity_error": Variable("m/s", "estimated correlated error of GNSS velocity", ("ned",)),
     "barometer_bias": Variable("m", "estimated bias of pressure altitude"),
     "magnetometer_bias": Variable("T", "estimated magnetometer bias", ("body",)),
+    "magnetometer_anomaly": Variable("T", "estimated error of the reference field, constant over ground", ("ned",)),
+    "magnetometer_error": Variable("T", "estimated correlated error of the magnetometer", ("body",)),
     "wind": Variable("m/s", "estimated velocity of the air over ground, without gusts", ("north_east",)),
     "gust": Variable("m/s", "estimated gust beside the steady wind", ("north_east",)),
     "airspeed_scale": Variable("1", "estimated scale factor error of the airspeed sensor"),

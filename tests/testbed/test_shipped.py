@@ -29,6 +29,18 @@ def test_loads_and_says_what_it_shows(name: str) -> None:
     assert scenario.expect, "a scenario without [expect] can't fail"
 
 
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_all_that_is_recorded_has_a_known_unit(name: str) -> None:
+    recorded = run(Scenario.load(name, ["duration_s=8", "sensors.gnss.denied=[]"])).dataset
+    units = {
+        f"{node.path}/{variable}": values.attrs.get("units")
+        for node in recorded.subtree
+        for variable, values in node.data_vars.items()
+    }
+    assert units
+    assert not {path for path, unit in units.items() if unit and "unknown" in unit}
+
+
 def keeps_its_promises(name: str) -> None:
     scenario = Scenario.load(name)
     verdicts = judge(scenario.expect, run(scenario).metrics)
