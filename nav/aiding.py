@@ -13,12 +13,10 @@ import math
 import numpy as np
 
 from nav._jit import njit
-from nav.earth import earth_rate_n, isa_density, position_difference_n
+from nav.earth import SEA_LEVEL_DENSITY, earth_rate_n, isa_density, position_difference_n
 from nav.error_model import PHI, POS, VEL, Drive, Indices
 from nav.rotation import cross, dcm_from_quat, skew
 from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, MagnetometerSample, Sample
-
-SEA_LEVEL_DENSITY = 1.225  # that defines equivalent airspeed [kg/m^3]
 
 # What an instrument could possibly report; beyond it the sample is broken.
 HEIGHT_LIMITS = (-1000.0, 50_000.0)  # [m]

@@ -39,6 +39,7 @@ SEA_LEVEL_TEMPERATURE = 288.15  # [K]
 LAPSE_RATE = 0.0065  # [K/m of geopotential height]
 TROPOPAUSE = 11000.0  # [m of geopotential height]
 TROPOPAUSE_TEMPERATURE = SEA_LEVEL_TEMPERATURE - LAPSE_RATE * TROPOPAUSE
+SEA_LEVEL_DENSITY = 1.225  # that defines equivalent airspeed [kg/m^3]
 GAS_CONSTANT = 287.05287  # of dry air [J/(kg K)]
 STANDARD_GRAVITY = 9.80665  # [m/s^2]
 GEOPOTENTIAL_RADIUS = 6356766.0  # [m]

@@ -13,8 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from nav.aiding import SEA_LEVEL_DENSITY
-from nav.earth import isa_density, pressure_altitude
+from nav.earth import SEA_LEVEL_DENSITY, isa_density, pressure_altitude
 from nav.samples import Array, ImuSamples
 
 AIRSPEED_VALID_S = 2.0  # an airspeed is good for as long

@@ -11,6 +11,7 @@ import jsbsim
 import numpy as np
 
 from nav._jit import njit
+from nav.earth import GAS_CONSTANT
 from nav.rotation import quat_conjugate, quat_from_euler, quat_rotate
 from nav.samples import Array
 from testbed.data import data_dir
@@ -25,7 +26,6 @@ FOOT = 0.3048  # [m]
 POUND = 0.45359237  # [kg]
 PSF = 47.88025898  # one pound-force per square foot [Pa]
 RANKINE = 5 / 9  # [K]
-GAS_CONSTANT = 287.05287  # of dry air [J/(kg K)]
 
 GUIDANCE_HZ = 20.0
 SETTLING_S = 90.0  # of straight and level flight before the run starts

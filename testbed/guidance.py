@@ -15,11 +15,10 @@ from typing import Annotated, Literal, NamedTuple, Protocol, Self, TypeAlias, Ty
 
 from pydantic import AfterValidator, Field, model_validator
 
-from nav.earth import E2, A, isa_density
+from nav.earth import E2, SEA_LEVEL_DENSITY, A, isa_density
 from testbed.schema import Section
 
 GRAVITY = 9.81  # [m/s^2], for banks and load factors only
-SEA_LEVEL_DENSITY = 1.225  # [kg/m^3]
 
 # What the aircraft can do (aircraft/SOURCES.md says where each comes from).
 STALL_EAS = 17.3  # equivalent airspeed at 1 g stall, full tank [m/s]

@@ -17,7 +17,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from nav.earth import position_difference_n, pressure_altitude
+from nav.earth import SEA_LEVEL_DENSITY, STANDARD_GRAVITY, position_difference_n, pressure_altitude
 from nav.rotation import dcm_from_quat, euler_from_quat, quat_conjugate, quat_multiply, rotvec_from_quat, skew
 from nav.samples import (
     AirspeedSample,
@@ -38,8 +38,6 @@ Point: TypeAlias = tuple[float, float, float]
 
 STALE_S = 5.0  # a sensor silent for longer counts as failed
 FLYING_MPS = 8.0  # faster than this, through the air or over ground, is flight: well below any stall speed
-SEA_LEVEL_DENSITY = 1.225  # of the standard atmosphere [kg/m^3], the reference of equivalent airspeed
-STANDARD_GRAVITY = 9.80665  # [m/s^2]
 PX4_HOLD = 4 << 16 | 3 << 24  # main mode auto, sub mode loiter, as PX4 packs them
 TERRAIN_UNKNOWN = -10000.0  # ALTITUDE: below -1000 means unknown
 NO_OFFSET = [0.0, 0.0, 0.0, 0.0]  # ATTITUDE_QUATERNION: no other attitude for display

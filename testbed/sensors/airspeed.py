@@ -8,20 +8,14 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from nav.earth import SEA_LEVEL_DENSITY
 from nav.samples import AirspeedSample
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import PERCENT
-from testbed.truth import Column, TruthBlock
+from testbed.truth import TruthBlock
 
-COLUMNS: dict[str, Column] = {
-    "t": Column("s", 1, "time of validity"),
-    "t_arrival": Column("s", 1, "time of arrival"),
-    "eas": Column("m/s", 1, "equivalent airspeed along body x"),
-}
-
-SEA_LEVEL_DENSITY = 1.225  # [kg/m^3], U.S. Standard Atmosphere 1976
 REFERENCE_EAS = 25.0  # [m/s], where `AirspeedErrors` turns pressure into speed
 
 GRADES: dict[str, dict[str, Any]] = {

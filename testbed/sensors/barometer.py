@@ -11,13 +11,7 @@ from nav.samples import BarometerSample
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
-from testbed.truth import Column, TruthBlock
-
-COLUMNS: dict[str, Column] = {
-    "t": Column("s", 1, "time of validity"),
-    "t_arrival": Column("s", 1, "time of arrival"),
-    "pressure": Column("Pa", 1, "static pressure"),
-}
+from testbed.truth import TruthBlock
 
 GRADES: dict[str, dict[str, Any]] = {
     "perfect": {},

@@ -23,22 +23,7 @@ from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, LeverArm
-from testbed.truth import Column, TruthBlock
-
-COLUMNS: dict[str, Column] = {
-    "t": Column("s", 1, "time of validity"),
-    "t_arrival": Column("s", 1, "time of arrival"),
-    "lat": Column("rad", 1, "geodetic latitude of the antenna, WGS84; NaN without a fix"),
-    "lon": Column("rad", 1, "longitude of the antenna, WGS84"),
-    "h": Column("m", 1, "height of the antenna above the ellipsoid"),
-    "v_n": Column("m/s", 3, "velocity of the antenna over ground, NED"),
-    "sigma_position_n": Column("m", 3, "reported 1-sigma position accuracy, NED"),
-    "sigma_velocity_n": Column("m/s", 3, "reported 1-sigma velocity accuracy, NED"),
-    "fix_type": Column("1", 1, "1 no fix, 3 three-dimensional fix"),
-    "satellites": Column("1", 1, "satellites used"),
-    "hdop": Column("1", 1, "horizontal dilution of precision"),
-    "vdop": Column("1", 1, "vertical dilution of precision"),
-}
+from testbed.truth import TruthBlock
 
 NO_FIX_DOP = 99.99  # what receivers report when they have none
 REPORTED_AT_LEAST = 1e-3  # accuracy is reported in whole millimetres, never as none at all [m], [m/s]

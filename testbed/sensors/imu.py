@@ -34,17 +34,10 @@ from testbed.sensors.units import (
     G,
     LeverArm,
 )
-from testbed.truth import Column, TruthBlock
+from testbed.truth import TruthBlock
 
 Triple: TypeAlias = tuple[float, float, float]
 Angle: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
-
-COLUMNS: dict[str, Column] = {
-    "t": Column("s", 1, "end of the interval"),
-    "dt": Column("s", 1, "length of the interval"),
-    "dtheta": Column("rad", 3, "integrated angular rate relative to i, axes of the unit"),
-    "dv": Column("m/s", 3, "integrated specific force, axes of the unit"),
-}
 
 # A Gauss-Markov process of standard deviation sigma and correlation time tau has the Allan deviation
 # sigma sqrt(2 tau/T (1 - tau/(2 T) (3 - 4 exp(-T/tau) + exp(-2 T/tau)))) (IEEE Std 952, annex C), flat around its

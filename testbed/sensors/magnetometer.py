@@ -19,13 +19,7 @@ from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, MICROTESLA, PERCENT
-from testbed.truth import Column, TruthBlock
-
-COLUMNS: dict[str, Column] = {
-    "t": Column("s", 1, "time of validity"),
-    "t_arrival": Column("s", 1, "time of arrival"),
-    "field_b": Column("T", 3, "magnetic flux density, body axes"),
-}
+from testbed.truth import TruthBlock
 
 NANOTESLA = 1e-9
 WMM_YEARS = (2010, 2030)  # covered by the models that pygeomag carries, five years each

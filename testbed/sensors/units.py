@@ -7,11 +7,13 @@ from typing import Annotated, TypeAlias
 
 from pydantic import Field
 
+from nav.earth import STANDARD_GRAVITY
+
 DEG = math.pi / 180  # rad
 DEG_PER_H = DEG / 3600  # rad/s
 DEG_PER_ROOT_H = DEG / 60  # rad/sqrt(s), angle random walk
 DEG_PER_H_PER_ROOT_H = DEG_PER_H / 60  # rad/s/sqrt(s), rate random walk
-G = 9.80665  # m/s^2, standard gravity (CGPM 1901)
+G = STANDARD_GRAVITY  # m/s^2
 MG = 1e-3 * G  # m/s^2
 MPS_PER_ROOT_H = 1 / 60  # m/s/sqrt(s), velocity random walk
 MG_PER_ROOT_H = MG / 60  # m/s^2/sqrt(s), acceleration random walk
