@@ -215,7 +215,7 @@ def test_across_the_date_line_nothing_jumps() -> None:
 def test_metrics_are_saved_as_strict_json(tmp_path: Path, computed: dict[str, float]) -> None:
     metrics.save(computed, tmp_path / "metrics.json")
     assert json.loads((tmp_path / "metrics.json").read_text()) == computed
-    with pytest.raises(UserError, match="can't write metrics"):
+    with pytest.raises(UserError, match="can't be written"):
         metrics.save(computed, tmp_path / "absent" / "metrics.json")
 
 
