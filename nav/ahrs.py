@@ -57,6 +57,7 @@ TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REPORTS_KEPT = 1000  # of levelling, until the next sample takes them along
+UNKNOWN = np.full(3, np.nan)
 DEG = math.pi / 180
 
 
@@ -272,9 +273,10 @@ class Ahrs:
             s.period_end += period
 
     def _air_velocity_n(self, s: _State, t: float) -> Array:
-        return quat_rotate(s.q_nb, np.array([self._airspeed.at(t), 0.0, 0.0]))
+        speed = self._airspeed.at(t)
+        return UNKNOWN if math.isnan(speed) else quat_rotate(s.q_nb, np.array([speed, 0.0, 0.0]))
 
-    def _free_fall(self, s: _State, t: float) -> tuple[Array, LowDynamics]:
+    def _steady_force(self, s: _State, t: float) -> tuple[Array, LowDynamics]:
         """Mean specific force over the period, known acceleration taken off, and the limits that then hold."""
         T = float(s.elapsed[1])
         f_n = s.force / T
@@ -286,7 +288,7 @@ class Ahrs:
     def _find_level(self, s: _State, t: float) -> None:
         """Roll and pitch from specific force, heading from the magnetic field or from outside (equations 1 to 3)."""
         config = self.config
-        f_0, _ = self._free_fall(s, t)
+        f_0, _ = self._steady_force(s, t)
         no_field = "magnetometer" in self._aids and not s.field_n.any()
         if no_field or not abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit:
             s.q_nb = np.array([1.0, 0.0, 0.0, 0.0])
@@ -312,7 +314,7 @@ class Ahrs:
     def _level(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
         config = self.config
-        f_n, limits = self._free_fall(s, t)
+        f_n, limits = self._steady_force(s, t)
         omega_b = s.angle / s.elapsed[1] - s.gyro_bias
         if not limits.judge(f_n, omega_b, self._g, self.autopilot_level).low:
             s.mode_counter = s.correction_counter = 0
@@ -330,16 +332,20 @@ class Ahrs:
         config = self.config
         if max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) >= config.correction_sigma**2:
             return
-        source = s.x[[PHI, PHI, PHI + 2]] if config.literal else s.x[PHI : PHI + 3]
-        step = np.clip(source, -config.phi_limit, config.phi_limit)
-        bias = s.x[BIAS:].copy() if config.gyro_bias_feedback else np.zeros(3)
+        north, east, down = s.x[PHI : PHI + 3].tolist()
+        if config.literal:
+            east = north
         if "magnetometer" not in self._aids:
-            step[2] = bias[2] = 0.0  # nothing sees the heading: what the filter thinks of it and of its gyro is a guess
+            down = 0.0  # nothing sees the heading: what the filter thinks of it, and of its gyro, is a guess
+        limit = config.phi_limit
+        step = np.array([min(max(error, -limit), limit) for error in (north, east, down)])
         s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(step), s.q_nb))  # C = (I + [phi x]) C_hat
         s.x[PHI : PHI + 3] -= step
         s.correction_counter += 1
-        s.gyro_bias -= bias
-        s.x[BIAS:] -= bias
+        if config.gyro_bias_feedback:
+            seen = slice(BIAS, STATES if "magnetometer" in self._aids else BIAS + 2)
+            s.gyro_bias[: seen.stop - BIAS] -= s.x[seen]
+            s.x[seen] = 0.0
 
     def _update_magnetometer(self, sample: MagnetometerSample) -> list[UpdateReport]:
         """Take the direction of the levelled field for heading; while levelling, collect it.
@@ -416,7 +422,7 @@ def _fresh(period_end: float) -> _State:
         x=np.zeros(STATES),
         P=np.zeros((STATES, STATES)),
         gyro_bias=np.zeros(3),
-        air_velocity_n=np.full(3, np.nan),
+        air_velocity_n=UNKNOWN,
         field_n=np.zeros(3),
         rates=np.zeros((2, 3)),
         turned=np.zeros((3, 3)),
@@ -463,7 +469,11 @@ def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n:
     """Take error states and covariance over the time in ``elapsed``, and empty the integral."""
     T = elapsed[0]
     Phi = transition(turned, earth_n, T)
-    x[PHI : PHI + 3] = Phi @ x
+    before = x.copy()
+    for i in range(3):
+        x[PHI + i] = 0.0
+        for j in range(STATES):
+            x[PHI + i] += Phi[i, j] * before[j]
     predict(P, Phi, np.ones(STATES), 0.5 * T * variance_rate, np.empty((3, STATES)))
     turned[:] = 0.0
     elapsed[0] = 0.0

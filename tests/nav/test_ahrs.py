@@ -334,6 +334,18 @@ def test_counters():
     assert estimates[230].extra["mode_counter"][0][0] == 0
 
 
+def test_the_autopilot_has_a_say():
+    truth = level_flight()
+    filter_ = Ahrs(PAPER)
+    filter_.start(0.0, truth.q_nb[0])
+    filter_.autopilot_level = False
+    filter_.propagate(cut(imu(truth, 0), slice(0, 4000)))
+    assert not filter_._reports
+    filter_.autopilot_level = True
+    filter_.propagate(cut(imu(truth, 0), slice(4000, 8000)))
+    assert len(filter_._reports) > 15
+
+
 def test_bias_feedback_finds_level_biases_and_leaves_the_vertical_gyro_alone():
     truth, bias = level_flight(), 300 * DEGPH
     increments = imu(truth, 0, gyro_bias=bias)
