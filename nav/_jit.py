@@ -14,6 +14,10 @@ R = TypeVar("R")
 def njit(function: Callable[P, R]) -> Callable[P, R]:
     """Compile ``function`` in nopython mode with an on-disk cache.
 
+    It can be called from Python and from other such functions, but not handed over as a value: the wrapper which that
+    would need is not compiled.
+
     fastmath stays off: reordered sums would make results depend on the machine's vector width.
     """
-    return cast("Callable[P, R]", numba.njit(cache=True)(function))
+    compiled = numba.njit(cache=True, no_cfunc_wrapper=True)(function)  # type: ignore[call-overload]
+    return cast("Callable[P, R]", compiled)

@@ -13,9 +13,9 @@ import math
 import numpy as np
 
 from nav._jit import njit
-from nav.earth import SEA_LEVEL_DENSITY, earth_rate_n, isa_density, position_difference_n
+from nav.earth import SEA_LEVEL_DENSITY, displacement_n, earth_rate_n, isa_density
 from nav.error_model import PHI, POS, VEL, Drive, Indices
-from nav.rotation import cross, dcm_from_quat, skew
+from nav.rotation import cross, dcm_from_quat, quat_rotate
 from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, MagnetometerSample, Sample
 
 # What an instrument could possibly report; beyond it the sample is broken.
@@ -78,12 +78,13 @@ def gnss_position(
     q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float, lon: float, h: float
 ) -> tuple[Array, Array]:
     """Antenna position [m], NED: p + C_nb arm_b + correlated receiver error."""
-    arm_n = dcm_from_quat(q_nb) @ arm_b
-    nu = position_difference_n(lat, lon, h, lla[0], lla[1], lla[2]) - arm_n
+    arm_n = quat_rotate(q_nb, arm_b)
+    nu = displacement_n(lat, lon, h, lla[0], lla[1], lla[2])
     H = np.zeros((3, len(x)))
-    H[:, PHI : PHI + 3] = skew(arm_n)
+    _put_skew(H, arm_n)
     for i in range(3):
         H[i, POS + i] = 1.0
+        nu[i] -= arm_n[i]
         if gnss_position_error >= 0:
             H[i, gnss_position_error + i] = 1.0
             nu[i] -= x[gnss_position_error + i]
@@ -108,29 +109,37 @@ def gnss_velocity(
     omega_ib is the measured angular rate less the estimated sensor ``errors`` (4, 3), rows as `Drive`; ``driven`` tells
     which states those are (`ErrorModel.driven`).
     """
-    gain = 1 / (1 + errors[Drive.GYRO_SCALE])
-    omega_b = (omega_measured_b - errors[Drive.GYRO]) * gain
     C_nb = dcm_from_quat(q_nb)
-    arm_n = C_nb @ arm_b
-    swing_n = C_nb @ cross(omega_b, arm_b)
-    earth_n = earth_rate_n(lla[0])
-    nu = antenna_v_n - v_n - swing_n + cross(earth_n, arm_n)
-    H = np.zeros((3, len(x)))
-    H[:, PHI : PHI + 3] = skew(swing_n) - skew(earth_n) @ skew(arm_n)
-    from_gyro = C_nb @ skew(arm_b)  # a gyro bias estimated too high leaves too little rate
-    for block in range(len(driven)):
-        kind, start = driven[block, 0], driven[block, 1]
-        for i in range(3):
-            for j in range(3):
-                if kind == Drive.GYRO:
-                    H[i, start + j] = from_gyro[i, j] * gain[j]
-                elif kind == Drive.GYRO_SCALE:
-                    H[i, start + j] = from_gyro[i, j] * gain[j] * omega_b[j]
+    gain, omega_b = np.empty(3), np.empty(3)
     for i in range(3):
+        gain[i] = 1 / (1 + errors[Drive.GYRO_SCALE, i])
+        omega_b[i] = (omega_measured_b[i] - errors[Drive.GYRO, i]) * gain[i]
+    arm_n = quat_rotate(q_nb, arm_b)
+    swing_n = quat_rotate(q_nb, cross(omega_b, arm_b))
+    earth_n = earth_rate_n(lla[0])
+    carried_n = cross(earth_n, arm_n)
+    nu = np.empty(3)
+    H = np.zeros((3, len(x)))
+    _put_skew(H, swing_n)
+    along = earth_n[0] * arm_n[0] + earth_n[1] * arm_n[1] + earth_n[2] * arm_n[2]
+    for i in range(3):
+        nu[i] = antenna_v_n[i] - v_n[i] - swing_n[i] + carried_n[i]
+        for j in range(3):
+            H[i, PHI + j] -= arm_n[i] * earth_n[j]  # [earth x] [arm x] = arm earth' - (earth . arm) I
+        H[i, PHI + i] += along
         H[i, VEL + i] = 1.0
         if gnss_velocity_error >= 0:
             H[i, gnss_velocity_error + i] = 1.0
             nu[i] -= x[gnss_velocity_error + i]
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        if kind == Drive.GYRO or kind == Drive.GYRO_SCALE:
+            for i in range(3):
+                for j in range(3):
+                    # C_nb [arm x]: a gyro bias estimated too high leaves too little rate
+                    one, two = (j + 1) % 3, (j + 2) % 3
+                    from_gyro = (C_nb[i, one] * arm_b[two] - C_nb[i, two] * arm_b[one]) * gain[j]
+                    H[i, start + j] = from_gyro if kind == Drive.GYRO else from_gyro * omega_b[j]
     return nu, H
 
 
@@ -187,7 +196,8 @@ def airspeed(
     root = (1 + scale) * math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
     nu, H = _air_velocity(C_nb, v_n, x, wind, gust, 0)
     predicted = -root * nu[0]
-    H *= root
+    for i in range(len(x)):
+        H[0, i] *= root
     nu[0] = eas - predicted
     half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
     H[0, POS + 2] = -predicted * half_lapse
@@ -205,14 +215,26 @@ def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[A
 @njit
 def _air_velocity(C_nb: Array, v_n: Array, x: Array, wind: int, gust: int, axis: int) -> tuple[Array, Array]:
     """Zero minus the velocity through the air along one body axis, and the Jacobian of that velocity."""
-    air_n = v_n.copy()
-    along_n = C_nb[:, axis].copy()
+    air_n, along_n = np.empty(3), np.empty(3)
     H = np.zeros((1, len(x)))
+    for i in range(3):
+        air_n[i], along_n[i] = v_n[i], C_nb[i, axis]
     for start in (wind, gust):
         if start >= 0:
             for i in range(2):
                 air_n[i] -= x[start + i]
                 H[0, start + i] = -along_n[i]
-    H[0, PHI : PHI + 3] = cross(air_n, along_n)
-    H[0, VEL : VEL + 3] = along_n
-    return np.array([-(along_n @ air_n)]), H
+    turned = cross(air_n, along_n)
+    nu = np.zeros(1)
+    for i in range(3):
+        H[0, PHI + i], H[0, VEL + i] = turned[i], along_n[i]
+        nu[0] -= along_n[i] * air_n[i]
+    return nu, H
+
+
+@njit
+def _put_skew(H: Array, v: Array) -> None:
+    """Write [v x] into the columns of the attitude."""
+    for j in range(3):
+        one, two = (j + 1) % 3, (j + 2) % 3
+        H[one, PHI + two], H[two, PHI + one] = -v[j], v[j]

@@ -291,7 +291,13 @@ def _attitude_jacobian(primary_b: Array, second_b: Array, primary_n: Array, seco
 def _accumulate(q_0b: Array, angle_0: Array, dv_0: Array, dtheta: Array, dv: Array) -> None:
     """Turn ``q_0b`` by increments (N, 3) and add them up in its axes, each taken half-way through its own turn."""
     for k in range(len(dtheta)):
-        middle = quat_multiply(q_0b, quat_from_rotvec(0.5 * dtheta[k]))
-        angle_0 += quat_rotate(middle, dtheta[k])
-        dv_0 += quat_rotate(middle, dv[k])
-        q_0b[:] = quat_normalise(quat_multiply(q_0b, quat_from_rotvec(dtheta[k])))
+        turn = quat_from_rotvec(dtheta[k])
+        after = quat_normalise(quat_multiply(q_0b, turn))
+        turn[0] += 1.0  # half of it, when normalised
+        middle = quat_multiply(q_0b, quat_normalise(turn))
+        angle, push = quat_rotate(middle, dtheta[k]), quat_rotate(middle, dv[k])
+        for i in range(3):
+            angle_0[i] += angle[i]
+            dv_0[i] += push[i]
+        for i in range(4):
+            q_0b[i] = after[i]

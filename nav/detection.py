@@ -26,7 +26,7 @@ from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, exp1
 
 from nav._jit import njit
-from nav.earth import position_difference_n
+from nav.earth import displacement_n
 from nav.samples import Array, GnssSample
 
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
@@ -586,7 +586,7 @@ class GnssMonitor:
         dt = fix.t - before.t
         if dt > self.outage_s:
             return False
-        moved = position_difference_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
+        moved = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
         jump = moved - 0.5 * dt * (v0_n + v_n)
         variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
         variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2

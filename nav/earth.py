@@ -141,18 +141,31 @@ def quat_en(lat: float, lon: float) -> Array:
 
 
 @njit
-def position_difference_n(lat: Scalar, lon: Scalar, h: Scalar, lat0: Scalar, lon0: Scalar, h0: Scalar) -> Array:
-    """Position minus reference position in metres north-east-down, (3,), or (N, 3) when ``lat`` is an array.
+def displacement_n(lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float) -> Array:
+    """Position minus reference position (3,) in metres north-east-down.
 
     Arc lengths with the radii half-way between the two, for points a few kilometres apart; safe across the date line.
     """
     mid_lat, mid_h = 0.5 * (lat + lat0), 0.5 * (h + h0)
     R_M, R_N = radii(mid_lat)
-    difference = np.empty((*np.asarray(lat).shape, 3))
-    difference[..., 0] = (R_M + mid_h) * (lat - lat0)
-    difference[..., 1] = (R_N + mid_h) * np.cos(mid_lat) * wrap_longitude(lon - lon0)
-    difference[..., 2] = h0 - h
+    east = (R_N + mid_h) * math.cos(mid_lat) * wrap_longitude(lon - lon0)
+    return np.array([(R_M + mid_h) * (lat - lat0), east, h0 - h])
+
+
+@njit
+def _displacements_n(lat: Array, lon: Array, h: Array, lat0: Array, lon0: Array, h0: Array) -> Array:
+    difference = np.empty((len(lat), 3))
+    for k in range(len(lat)):
+        one = displacement_n(lat[k], lon[k], h[k], lat0[k], lon0[k], h0[k])
+        difference[k, 0], difference[k, 1], difference[k, 2] = one[0], one[1], one[2]
     return difference
+
+
+def position_difference_n(lat: Scalar, lon: Scalar, h: Scalar, lat0: Scalar, lon0: Scalar, h0: Scalar) -> Array:
+    """`displacement_n` of one point, (3,), or of N at once, (N, 3), when any argument is an array."""
+    points = np.broadcast_arrays(lat, lon, h, lat0, lon0, h0)
+    difference = _displacements_n(*[np.array(column, dtype=float).ravel() for column in points])
+    return difference.reshape(*points[0].shape, 3)
 
 
 @njit

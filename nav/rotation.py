@@ -70,7 +70,8 @@ def quat_conjugate(q: Array) -> Array:
 @njit
 def quat_normalise(q: Array) -> Array:
     """``q`` (4,) scaled to unit norm."""
-    return q / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return np.array([q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm])
 
 
 @njit
@@ -88,7 +89,7 @@ def rotvec_from_quat(q: Array) -> Array:
     if sine == 0.0:
         return np.zeros(3)
     scale = 2 * math.atan2(sine, q[0]) / sine if q[0] >= 0 else -2 * math.atan2(sine, -q[0]) / sine
-    return scale * q[1:4]
+    return np.array([scale * q[1], scale * q[2], scale * q[3]])
 
 
 @njit
@@ -112,7 +113,10 @@ def quat_from_dcm(C: Array) -> Array:
     """
     trace = C[0, 0] + C[1, 1] + C[2, 2]
     q = np.empty(4)
-    i = int(np.argmax(np.array([trace, C[0, 0], C[1, 1], C[2, 2]])))
+    i, largest = 0, trace
+    for axis in range(3):
+        if C[axis, axis] > largest:
+            i, largest = axis + 1, C[axis, axis]
     if i == 0:
         q[0] = 1 + trace
         q[1] = C[2, 1] - C[1, 2]
@@ -125,7 +129,8 @@ def quat_from_dcm(C: Array) -> Array:
         q[1 + b] = C[a, b] + C[b, a]
         q[1 + c] = C[a, c] + C[c, a]
     if q[0] < 0:
-        q = -q
+        for k in range(4):
+            q[k] = -q[k]
     return quat_normalise(q)
 
 
@@ -189,4 +194,7 @@ def left_jacobian_solve(phi: Array, v: Array) -> Array:
     # The rounding error of k grows as 1/s, but k multiplies terms of order s.
     k = (1 - 0.5 * a / b) / s if s > 1e-8 else 1 / 12
     first = cross(phi, v)
-    return v - 0.5 * first + k * cross(phi, first)
+    second = cross(phi, first)
+    for axis in range(3):
+        second[axis] = v[axis] - 0.5 * first[axis] + k * second[axis]
+    return second

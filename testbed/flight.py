@@ -423,12 +423,16 @@ def _mode(name: str, s: complex) -> Mode:
 def _attitude_and_air(euler: Array, v_n: Array, wind_n: Array) -> tuple[Array, Array]:
     """Quaternions (N, 4), and (N, 3) true airspeed [m/s], angles of attack and sideslip [rad]."""
     q_nb, air = np.empty((len(euler), 4)), np.empty((len(euler), 3))
+    air_n = np.empty(3)
     for k in range(len(euler)):
-        q_nb[k] = quat_from_euler(euler[k, 0], euler[k, 1], euler[k, 2])
-        u, v, w = quat_rotate(quat_conjugate(q_nb[k]), v_n[k] - wind_n[k])
-        air[k, 0] = math.sqrt(u * u + v * v + w * w)
-        air[k, 1] = math.atan2(w, u)
-        air[k, 2] = math.asin(v / air[k, 0])
+        q = quat_from_euler(euler[k, 0], euler[k, 1], euler[k, 2])
+        for i in range(4):
+            q_nb[k, i] = q[i]
+        for i in range(3):
+            air_n[i] = v_n[k, i] - wind_n[k, i]
+        air_b = quat_rotate(quat_conjugate(q), air_n)
+        speed = math.sqrt(air_b[0] * air_b[0] + air_b[1] * air_b[1] + air_b[2] * air_b[2])
+        air[k, 0], air[k, 1], air[k, 2] = speed, math.atan2(air_b[2], air_b[0]), math.asin(air_b[1] / speed)
     return q_nb, air
 
 
