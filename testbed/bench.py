@@ -242,8 +242,8 @@ def _oracle_hour() -> tuple[Any, Any, Any]:
 
 def _increments(imu: Any) -> ImuSamples:
     """The hour's increments as samples; the first row ends at time zero and is left out."""
-    t = imu.index.to_numpy()[1:]
-    columns = [np.ascontiguousarray(imu[[f"{name}_{axis}" for axis in "xyz"]].to_numpy()[1:]) for name in IMU_COLUMNS]
+    t = np.array(imu.index)[1:]
+    columns = [np.array(imu[[f"{name}_{axis}" for axis in "xyz"]], order="C")[1:] for name in IMU_COLUMNS]
     return ImuSamples(t, np.full(len(t), 1 / RATE_HZ), columns[0], columns[1])
 
 
@@ -261,7 +261,7 @@ def _initial(trajectory: Any) -> tuple[Array, Array, Array]:
     first = trajectory.iloc[0]
     return (
         quat_from_euler(first.roll * DEG, first.pitch * DEG, first.heading * DEG),
-        first[["VN", "VE", "VD"]].to_numpy(dtype=float),
+        np.array(first[["VN", "VE", "VD"]], dtype=float),  # a copy: what a frame gives can't be written to
         np.array([first.lat * DEG, first.lon * DEG, first.alt]),
     )
 
