@@ -26,6 +26,7 @@ from scipy.spatial.transform import Rotation
 from nav import ahrs as module
 from nav.ahrs import BIAS, PHI, STATES, Ahrs, AhrsConfig
 from nav.earth import OMEGA_IE
+from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, BarometerSample, ImuSamples, MagnetometerSample, Status
@@ -148,6 +149,51 @@ def test_heading_jacobian_against_finite_differences():
     assert found[2] == pytest.approx(-1, rel=1e-6)
 
 
+def test_covariance_without_levelling_against_the_formula():
+    """sigma^2 + sigma_b^2 T^2 + gyro noise^2 T + walk^2 T^3 / 3, and the tilt of a biased accelerometer on top."""
+    T, model = 100.0, ImuModel(1e-4, 0.0, 5e-5, 0.01, gyro_bias_walk=1e-5)
+    filter_ = Ahrs(replace(INERTIAL, imu=model, tilt_sigma=1e-3, heading_sigma=2e-3))
+    filter_.start(0.0, np.array([1.0, 0, 0, 0]))
+    filter_.propagate(at_rest(T))
+    estimate = filter_.estimate()
+    grown = 5e-5**2 * T**2 + 1e-4**2 * T + 1e-5**2 * T**3 / 3
+    floor = (0.01 / 9.8) ** 2
+    expected = [1e-3**2 + grown + floor, 1e-3**2 + grown + floor, 2e-3**2 + grown]
+    np.testing.assert_allclose(np.diag(estimate.covariance)[6:], expected, rtol=2e-3)
+    np.testing.assert_allclose(estimate.sigma_gyro_bias, math.sqrt(5e-5**2 + 1e-5**2 * T), rtol=1e-6)
+
+
+def test_what_is_still_to_be_corrected_is_part_of_the_claimed_error():
+    filter_ = Ahrs(PAPER)
+    filter_.start(0.0, small(0, 3 * DEG))
+    filter_.propagate(at_rest(6.0))
+    estimate = filter_.estimate()
+    error = phi(estimate.q_nb, [1.0, 0, 0, 0])[0]
+    assert error > 1 * DEG
+    assert error < np.sqrt(estimate.covariance[6, 6]) < 1.5 * error
+
+
+def test_nothing_is_corrected_before_the_tilt_is_known_well_enough():
+    for sigma, corrections in ((1e-4, 0), (1 * DEG, 10)):
+        filter_ = Ahrs(replace(PAPER, correction_sigma=sigma))
+        filter_.start(0.0, small(0, 3 * DEG))
+        filter_.propagate(at_rest(10.0))
+        extra = filter_.estimate().extra
+        assert extra["mode_counter"][0][0] == 10
+        assert extra["correction_counter"][0][0] == corrections
+
+
+def test_rates_are_judged_without_the_bias_that_is_known():
+    increments = at_rest(5.0)
+    increments.dtheta[:, 2] += 1 * DEG * DT
+    for known, low in ((0.0, 0), (1 * DEG, 5)):
+        filter_ = Ahrs(PAPER)
+        filter_.start(0.0, np.array([1.0, 0, 0, 0]))
+        filter_._state.gyro_bias[2] = known
+        filter_.propagate(increments)
+        assert filter_.estimate().extra["mode_counter"][0][0] == low
+
+
 # --- exactness
 
 
@@ -166,7 +212,11 @@ def test_the_turn_of_an_exactly_known_air_velocity_costs_only_what_the_rotating_
     truth = level_flight()
     config = replace(COMPENSATED, compensated_motion=LowDynamics(1.0, 1.0, 1.0))
     _, error, _, reports = run(config, truth, imu(truth, 0, 0.0, 0.0, gust=0.0), airspeed(), tilt_deg=0.0)
-    assert sum(TURN[0] < report.t < TURN[1] for report in reports) > 50
+    in_turn = [report for report in reports if TURN[0] + 2 < report.t < TURN[1] - 2]
+    assert len(in_turn) > 50
+    # told that airspeed in a turn is worth 1 m/s times the rate
+    added = in_turn[-1].S[0, 0] - reports[-1].S[0, 0]
+    assert added == pytest.approx((3 * DEG) ** 2, rel=0.2)
     assert np.abs(error[:, :2]).max() < 0.12
 
 
@@ -356,6 +406,11 @@ def test_bias_feedback_finds_level_biases_and_leaves_the_vertical_gyro_alone():
     applied = filter_._state.gyro_bias
     np.testing.assert_allclose(np.abs(applied[:2]), bias, atol=0.15 * bias)
     assert applied[2] == 0.0
+    np.testing.assert_allclose(filter_.estimate().gyro_bias[:2], applied[:2], atol=0.05 * bias)
+    plain = Ahrs(replace(PAPER, imu=slow, force_sigma=0.3))
+    plain.start(0.0, truth.q_nb[0])
+    plain.propagate(cut(increments, slice(0, 195 * 200)))
+    np.testing.assert_allclose(plain.estimate().gyro_bias[:2], applied[:2], atol=0.2 * bias)
     # a bias that is taken off no longer tilts: in the turn there is nothing but the gyros
     level = []
     for feedback in (True, False):
@@ -425,13 +480,15 @@ def test_magnetometer_finds_and_holds_the_heading():
 
 def test_slow_or_silent_airspeed_is_no_airspeed():
     truth = level_flight(0.4, SLOW_TURN)
-    for samples in (airspeed(120.0), airspeed(120.0) + [dataclasses.replace(s, eas=3.0) for s in airspeed()[601:]]):
+    fallen = [dataclasses.replace(s, eas=3.0) for s in airspeed()[601:]]
+    for samples, at_once in ((airspeed(120.0), False), (airspeed(120.0) + fallen, True)):
         *_, reports = run(COMPENSATED, truth, imu(truth, 0, gust=0.0), samples)
         with_airspeed, without = (
             np.hypot(*np.mean([r.innovation for r in reports if start < r.t <= start + 3], axis=0))
             for start in (116.0, 122.0)
         )
         assert with_airspeed < 0.1
+        assert bool(np.hypot(*next(r.innovation for r in reports if r.t > 120.5)) > 0.2) is at_once
         assert without > 0.2
 
 
@@ -439,7 +496,7 @@ def test_broken_samples_are_refused_and_told_of():
     filter_ = Ahrs(replace(PAPER, aids=("airspeed", "barometer")))
     increments = at_rest(10.0)
     increments.dtheta[1000] = np.nan
-    increments.dv[1001, 2] = 1e9
+    increments.dv[1001:1041, 2] = 1e9
     filter_.propagate(cut(increments, slice(0, 1100)))
     assert Status.BAD_SAMPLE in filter_.estimate().status
     assert np.abs(phi(filter_.estimate().q_nb, [1.0, 0, 0, 0])).max() < 1e-3
@@ -450,7 +507,10 @@ def test_broken_samples_are_refused_and_told_of():
     assert reports[-1].weight == 0.0
     assert "finite" in reports[-1].reason
     assert Status.BAD_SAMPLE in filter_.estimate().status
-    assert filter_.update(BarometerSample(10.0, 10.0, 90_000.0)) == []
+    # U.S. Standard Atmosphere 1976: 54048 Pa is 5000 m, and 0.73643 kg/m^3
+    assert filter_.update(AirspeedSample(10.0, 10.0, 20.0)) == []
+    assert filter_.update(BarometerSample(10.0, 10.0, 54048.0)) == []
+    assert filter_._airspeed.at(10.0) == pytest.approx(20 * math.sqrt(1.225 / 0.73643), rel=1e-4)
     with pytest.raises(ValueError, match="filter is at 10"):
         filter_.update(AirspeedSample(9.0, 9.0, 20.0))
 
