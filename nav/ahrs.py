@@ -90,7 +90,9 @@ class AhrsConfig:
     airspeed_sigma: float = 1.0  # what gusts, sideslip and angle of attack make of it in a turn [m/s]
     airspeed_smoothing_s: float = 5.0
     airspeed_min: float = 10.0  # equivalent; below it the tube tells nothing [m/s]
-    magnetometer_sigma: float = 3 * DEG  # of the heading from one sample [rad]
+    # Of the heading from one sample, as if errors were white [rad]: hard and soft iron of 2 deg that last for 15 s,
+    # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
+    magnetometer_sigma: float = 30 * DEG
 
     literal: bool = False  # equation 10 as it is printed: the east axis corrected by the north axis' error
 
@@ -276,17 +278,20 @@ class Ahrs:
         speed = self._airspeed.at(t)
         return UNKNOWN if math.isnan(speed) else quat_rotate(s.q_nb, np.array([speed, 0.0, 0.0]))
 
-    def _steady_force(self, s: _State, t: float) -> tuple[Array, LowDynamics]:
-        """Mean specific force over the period, known acceleration taken off, and the limits that then hold."""
+    def _steady_force(self, s: _State, t: float) -> tuple[Array, bool]:
+        """Mean specific force over the period, less the acceleration that airspeed tells, and whether it told any."""
         T = float(s.elapsed[1])
         f_n = s.force / T
         acceleration = acceleration_n(s.air_velocity_n, self._air_velocity_n(s, t), T)
         if math.isnan(acceleration[0]):
-            return f_n, self.config.motion
-        return f_n - acceleration, self.config.compensated_motion
+            return f_n, False
+        return f_n - acceleration, True
 
     def _find_level(self, s: _State, t: float) -> None:
-        """Roll and pitch from specific force, heading from the magnetic field or from outside (equations 1 to 3)."""
+        """Roll and pitch from specific force; heading from the magnetic field or from outside.
+
+        Equations 1 to 3 find it by the Earth's rate, which such gyros do not feel.
+        """
         config = self.config
         f_0, _ = self._steady_force(s, t)
         no_field = "magnetometer" in self._aids and not s.field_n.any()
@@ -314,14 +319,15 @@ class Ahrs:
     def _level(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
         config = self.config
-        f_n, limits = self._steady_force(s, t)
+        f_n, compensated = self._steady_force(s, t)
+        limits = config.compensated_motion if compensated else config.motion
         omega_b = s.angle / s.elapsed[1] - s.gyro_bias
         if not limits.judge(f_n, omega_b, self._g, self.autopilot_level).low:
             s.mode_counter = s.correction_counter = 0
             return
         s.mode_counter += 1
         variance = config.force_sigma**2
-        if limits is config.compensated_motion:
+        if compensated:
             variance += config.airspeed_sigma**2 * float(omega_b @ omega_b)
         report = _fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level")
         reports.append(report)
