@@ -11,9 +11,13 @@ from multiprocessing.connection import Connection
 
 from testbed.truth import MotionSource, TruthBlock
 
+PIPE_BYTES = (
+    1 << 20
+)  # the most that Linux gives anybody: three blocks of 1000 rows, so that neither side waits for the other
+
 
 class Ahead:
-    """The motion source that ``make`` gives, flown one block of ``chunk`` rows ahead of who asks for them.
+    """The motion source that ``make`` gives, flown some blocks of ``chunk`` rows ahead of who asks for them.
 
     The rows are those of the source, bit for bit, and so are its errors. `close` ends the process early.
     """
@@ -25,8 +29,11 @@ class Ahead:
         self._block = TruthBlock.empty(0, 0)
         self._used = 0
         self._ended = False
+        import fcntl  # of Linux, as is the rest
+
         context = multiprocessing.get_context("fork")
         self._blocks, theirs = context.Pipe(duplex=False)
+        fcntl.fcntl(theirs.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._process = context.Process(target=_fly, args=(make, chunk, ticks, theirs, self._blocks), daemon=True)
         self._process.start()
         theirs.close()

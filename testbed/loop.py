@@ -237,6 +237,16 @@ def run(
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
         started = time.perf_counter()
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
+        ticks = round(scenario.duration_s * rate_hz) + 1
+        record_every = round(rate_hz / scenario.record.rate_hz)
+        events_every = max(1, round(EVENTS_S * rate_hz))
+        publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
+        chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
+        if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
+            source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
+            ending.callback(ahead.close)
+        elif source is None:
+            source = motion(scenario, seed)
         site = scenario.site()
         inertial: dict[str, sensors.Imu] = {}
         aiding: dict[str, sensors.AidingSensor] = {}
@@ -250,19 +260,9 @@ def run(
         behind = {name: one.horizon.lag_s for name, one in filters.items()}
         plan = [leg.leg for leg in scenario.plan]
 
-        ticks = round(scenario.duration_s * rate_hz) + 1
-        record_every = round(rate_hz / scenario.record.rate_hz)
-        events_every = max(1, round(EVENTS_S * rate_hz))
-        publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
-        chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
         pacer = Pacer(realtime) if realtime else None
         recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
         ending.callback(recorder.close)
-        if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
-            source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
-            ending.callback(ahead.close)
-        elif source is None:
-            source = motion(scenario, seed)
 
         def emit(t: float, severity: str, text: str) -> None:
             recorder.event(t, severity, text)
