@@ -21,3 +21,11 @@ def njit(function: Callable[P, R]) -> Callable[P, R]:
     """
     compiled = numba.njit(cache=True, no_cfunc_wrapper=True)(function)  # type: ignore[call-overload]
     return cast("Callable[P, R]", compiled)
+
+
+def inlined(function: Callable[P, R]) -> Callable[P, R]:
+    """As `njit`, but compiled as part of the kernel that calls it: for a long function with one caller.
+
+    Compiled by itself first, it would be compiled twice.
+    """
+    return cast("Callable[P, R]", numba.njit(cache=True, inline="always")(function))

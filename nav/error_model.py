@@ -35,7 +35,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.earth import OMEGA_IE, gravity, radii
 from nav.samples import Array
 
@@ -170,7 +170,7 @@ def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
             errors[kind, axis] += x[start + axis]
 
 
-@njit
+@inlined
 def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h: float, sums: Array, T: float) -> None:
     """Fill ``Phi`` (9, mixing), the rows of the motion in the transition over the ``T`` seconds just passed.
 
@@ -256,7 +256,7 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
                     Phi[i, j] += half * FT[k, j]
 
 
-@njit
+@inlined
 def _skew(matrix: Array, row: int, column: int, x: float, y: float, z: float) -> None:
     """Write [(x, y, z) x] into ``matrix`` with its corner at (row, column)."""
     matrix[row, column + 1], matrix[row, column + 2] = -z, y

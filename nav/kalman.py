@@ -10,11 +10,11 @@ import math
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.samples import Array
 
 
-@njit
+@inlined
 def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
     """P <- T P T' + Q, where T = [Phi 0; 0 diag(decay)] in place on ``P`` (n, n).
 
@@ -112,7 +112,7 @@ def invert(S: Array) -> tuple[Array, bool]:
     return inverse, True
 
 
-@njit
+@inlined
 def correct(P: Array, H: Array, R: Array, HP: Array, S_inverse: Array, nu: Array) -> Array:
     """Update ``P`` in place and return K nu (n,), what to add to the estimate; K = P H' S^-1, in Joseph's form:
 
