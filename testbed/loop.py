@@ -291,13 +291,12 @@ def run(
             samples = {name: sensor.sense(block) for name, sensor in aiding.items()}
             for own in samples.values():
                 latest.add(own)
-            outputs = [
-                k
-                for k in range(len(block))
-                if (tick + k) % record_every == 0
-                or (tick + k) % events_every == 0
-                or (publish_every and (tick + k) % publish_every == 0)
-            ]
+            rows = (
+                range(-tick % every, len(block), every)
+                for every in (record_every, events_every, publish_every)
+                if every
+            )
+            outputs = sorted(set().union(*rows))
             times = [float(block.t[k]) for k in outputs]
             estimates: dict[str, list[Estimate]] = {}
             integrated: dict[str, ImuSamples] = {}
