@@ -42,6 +42,10 @@ class Estimator(Protocol):
         """Use a sample that is valid at the estimator's own time."""
         ...
 
+    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+        """The reports on a sample that can't be used: one for each aid that it would have served."""
+        ...
+
     def estimate(self) -> Estimate:
         """The state at the estimator's own time."""
         ...
@@ -55,8 +59,10 @@ class FusionHorizon:
     """Feeds one estimator in time order, ``lag_s`` [s] (the largest latency of its aids) behind the newest increment.
 
     Only samples cut the increments, never the blocks they are pushed in, so the same data give the same result however
-    they are pushed. With ``coning`` raw increments are compensated (`nav.strapdown.compensate`): right for an IMU that
-    sums over intervals in which its rate changes, wrong for increments that are rotation vectors already.
+    they are pushed. An increment counts from its end: nothing at a time knows the one that is still running then, and
+    the state between two of them goes on from the last at its rates. With ``coning`` raw increments are compensated
+    (`nav.strapdown.compensate`): right for an IMU that sums over intervals in which its rate changes, wrong for
+    increments that are rotation vectors already.
     """
 
     def __init__(self, estimator: Estimator, lag_s: float = 0.0, coning: bool = False) -> None:
@@ -67,6 +73,7 @@ class FusionHorizon:
         self._imu = ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
         self._ends: list[float] = []  # its times
         self._next = 0  # first row of _imu that the estimator has not used
+        self._longest = 0.0  # of them [s]
         self._t = -math.inf  # up to where the estimator has come
         self._queue: list[tuple[float, str, int, Sample]] = []
         self._count = 0
@@ -78,12 +85,13 @@ class FusionHorizon:
     def track(
         self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]
     ) -> tuple[list[UpdateReport], list[Estimate]]:
-        """`push`, and the estimates at ``times`` [s] on the way, ascending and within the increments.
+        """`push`, and the estimates at ``times`` [s] on the way, ascending, the last less than an increment ahead.
 
         Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``.
         """
         for sample in samples:
-            heapq.heappush(self._queue, (sample.t, sample.sensor, self._count, sample))
+            t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
+            heapq.heappush(self._queue, (t, sample.sensor, self._count, sample))
             self._count += 1
         if len(imu):
             self._append(imu)
@@ -92,39 +100,47 @@ class FusionHorizon:
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
-        self._use(self._ends[-1] if self._ends else self._t, reports)
+        if self._ends:
+            self._use(self._ends[-1], reports)
         return reports, estimates
 
     def estimate_at(self, t: float) -> Estimate:
         """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
 
-        Raises ValueError when ``t`` is past the newest increment or before what the estimator has already used.
+        Raises ValueError when ``t`` is a whole increment past the newest or before what the estimator has already used.
         """
-        if abs(t - self._t) <= COINCIDENT or self._t == -math.inf:
+        if abs(t - self._t) <= COINCIDENT:
             estimate = self.estimator.estimate()
             return replace(estimate, t=t) if math.isnan(estimate.t) else estimate  # it may have seen nothing yet
         if t < self._t:
             raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
         stop = self._row_after(t)
+        if not stop:
+            estimate = self.estimator.estimate()
+            return estimate if estimate.t == t else replace(estimate, t=t)
         front = _cut(self._imu, self._next, stop)
-        if stop == self._next or self._ends[stop - 1] < t - COINCIDENT:
-            if stop == len(self._ends):
-                raise ValueError(f"no inertial samples up to {t} s")
-            front = _join(front, self._part(stop, t))
+        ahead = t - max(self._ends[stop - 1], self._t)
+        if ahead > self._longest + COINCIDENT:
+            raise ValueError(f"no inertial samples up to {t} s")
+        if ahead > COINCIDENT:
+            front = _join(front, self._beyond(stop - 1, t, ahead))
         return self.estimator.predict(front)
 
     def _use(self, now: float, reports: list[UpdateReport]) -> None:
-        """Bring the estimator to ``lag_s`` before ``now`` with every sample up to there.
+        """Bring the estimator to ``lag_s`` before the last increment by ``now``, with every sample up to there.
 
         An estimator that listens to no sample any more need not wait for any.
         """
-        horizon = now - self.lag_s if self.estimator.listening else now
+        stop = self._row_after(now)
+        if not stop:
+            return
+        horizon = self._ends[stop - 1] - (self.lag_s if self.estimator.listening else 0.0)
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
             t, _, _, sample = heapq.heappop(self._queue)
             if not self.estimator.accepts(sample):
                 continue
             if t < self._t - COINCIDENT:
-                reports.append(_too_late(sample, self._t))
+                reports += self.estimator.refuse(sample, f"{self._t - t:.3g} s too late")
                 continue
             self._advance(t)
             reports += self.estimator.update(sample)
@@ -135,9 +151,11 @@ class FusionHorizon:
             self._t = float(imu.t[0] - imu.dt[0])
         ready = compensate(imu, self._raw) if self.coning else imu
         self._raw = _cut(imu, len(imu) - 1, len(imu))
-        self._imu = _join(_cut(self._imu, self._next, len(self._imu)), ready)
+        kept = max(self._next - 1, 0)  # the last one used as well: its rates lead on
+        self._imu = _join(_cut(self._imu, kept, len(self._imu)), ready)
         self._ends = self._imu.t.tolist()
-        self._next = 0
+        self._longest = max(self._longest, float(imu.dt.max()))
+        self._next -= kept
 
     def _advance(self, t: float) -> None:
         """Bring the estimator to ``t``, splitting an increment in which it falls."""
@@ -166,6 +184,12 @@ class FusionHorizon:
         share = 1 - (whole.t[0] - t) / whole.dt[0]
         return ImuSamples(np.array([t]), share * whole.dt, share * whole.dtheta, share * whole.dv)
 
+    def _beyond(self, row: int, t: float, ahead: float) -> ImuSamples:
+        """What the next increment would be up to ``t``, ``ahead`` [s] long, if one's rates went on."""
+        last = _cut(self._imu, row, row + 1)
+        share = ahead / last.dt[0]
+        return ImuSamples(np.array([t]), share * last.dt, share * last.dtheta, share * last.dv)
+
 
 def _cut(imu: ImuSamples, start: int, stop: int) -> ImuSamples:
     return ImuSamples(imu.t[start:stop], imu.dt[start:stop], imu.dtheta[start:stop], imu.dv[start:stop])
@@ -177,18 +201,4 @@ def _join(first: ImuSamples, second: ImuSamples) -> ImuSamples:
         np.concatenate([first.dt, second.dt]),
         np.concatenate([first.dtheta, second.dtheta]),
         np.concatenate([first.dv, second.dv]),
-    )
-
-
-def _too_late(sample: Sample, now: float) -> UpdateReport:
-    return UpdateReport(
-        t=sample.t,
-        sensor=sample.sensor,
-        aid=sample.sensor,
-        innovation=np.empty(0),
-        S=np.empty((0, 0)),
-        nis=math.nan,
-        threshold=math.nan,
-        weight=0.0,
-        reason=f"{now - sample.t:.3g} s too late",
     )

@@ -324,7 +324,7 @@ class Ins:
         trouble = aiding.problem(sample)
         if trouble:
             self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
-            return [_refused(sample, trouble)]
+            return self.refuse(sample, trouble)
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
         state = self._state
@@ -345,6 +345,28 @@ class Ins:
                 return self._update_magnetometer(state, sample)
             case AirspeedSample():
                 return self._update_airspeed(state, sample)
+
+    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+        """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
+        t = sample.t if math.isfinite(sample.t) else self.t
+        return [
+            UpdateReport(
+                t, sample.sensor, aid, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan, 0.0, reason
+            )
+            for aid, m in self._serves(sample)
+        ]
+
+    def _serves(self, sample: Sample) -> list[tuple[str, int]]:
+        """The aids that a sample of this kind serves, and the size of their innovations."""
+        match sample:
+            case GnssSample():
+                return [("gnss_position", 3)] + [("gnss_velocity", 3)] * self.config.gnss_use_velocity
+            case BarometerSample():
+                return [("barometer", 1)]
+            case MagnetometerSample():
+                return [("magnetometer", 3)]
+            case AirspeedSample():
+                return [("airspeed", 1)] + [("sideslip", 1)] * (self.config.sideslip_sigma is not None)
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
@@ -540,12 +562,6 @@ def _forget(P: Array, start: int, variance: Array) -> None:
     P[block, :] = 0.0
     P[:, block] = 0.0
     P[block, block] = np.diag(variance)
-
-
-def _refused(sample: Sample, reason: str) -> UpdateReport:
-    return UpdateReport(
-        sample.t, sample.sensor, KINDS[type(sample)], np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason
-    )
 
 
 @njit

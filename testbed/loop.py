@@ -257,7 +257,10 @@ def run(
             else:
                 aiding[name] = sensor
         filters = estimators.build(scenario)
-        behind = {name: one.horizon.lag_s for name, one in filters.items()}
+        # Between a tick and what a filter has surely used by then: an increment may not be complete yet.
+        behind = {
+            name: one.horizon.lag_s + 1 / inertial[one.imu].rate_hz - 1 / rate_hz for name, one in filters.items()
+        }
         plan = [leg.leg for leg in scenario.plan]
 
         pacer = Pacer(realtime) if realtime else None

@@ -53,6 +53,9 @@ class Logbook:
         np.testing.assert_allclose(self.angle, ramp(sample.t), atol=1e-12)
         return []
 
+    def refuse(self, sample, reason):
+        return [(sample.sensor, reason)]
+
     def estimate(self):
         return SimpleNamespace(t=self.t)
 
@@ -94,9 +97,9 @@ def test_a_sample_after_its_time_is_refused():
     log = Logbook()
     horizon = FusionHorizon(log, lag_s=0.05)
     horizon.push(increments(30))
-    (report,) = horizon.push(part(increments(31), 30, 31), [BarometerSample(0.1, 0.31, 9e4)])
-    assert report.weight == 0
-    assert "too late" in report.reason
+    assert horizon.push(part(increments(31), 30, 31), [BarometerSample(0.1, 0.31, 9e4)]) == [
+        ("barometer", "0.15 s too late")
+    ]
     assert [name for name, _ in log.seen] == ["imu", "imu"]
 
 
@@ -109,8 +112,57 @@ def test_estimate_at_knows_its_limits():
     assert horizon.estimate_at(0.3).t == pytest.approx(0.3)
     with pytest.raises(ValueError, match="already"):
         horizon.estimate_at(0.1)
+    assert horizon.estimate_at(0.305).t == pytest.approx(0.305)
     with pytest.raises(ValueError, match="no inertial samples"):
-        horizon.estimate_at(0.31)
+        horizon.estimate_at(0.32)
+
+
+def test_a_sample_without_a_time_waits_for_nobody():
+    truth = flight(30)
+    increments_, samples = everything(truth, np.random.default_rng(3))
+    broken = [dataclasses.replace(s, t=math.nan) for s in samples if 10 < s.t < 10.5]
+    ins = Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N)
+    _, reports = feed(FusionHorizon(ins, lag_s=0.2), increments_, samples + broken)
+    assert {r.aid for r in reports if r.reason == "time is not finite"} == {r.aid for r in reports}
+    assert all(10 < r.t < 11 for r in reports if math.isnan(r.nis))
+    assert sum(r.weight for r in reports if r.t > 11) > 800
+
+
+@pytest.mark.parametrize("ticks", [5, 8])  # 40 and 25 Hz
+@pytest.mark.parametrize("lag_s", [0.0, 0.2])
+def test_the_same_bits_between_increments_whether_or_not_the_next_is_there(ticks, lag_s):
+    truth = flight(12)
+    increments_, samples = everything(truth, np.random.default_rng(3))
+    samples = [dataclasses.replace(s, t_arrival=s.t + lag_s) for s in samples]
+    whole = len(increments_) // ticks
+    slow = ImuSamples(
+        increments_.t[ticks - 1 :: ticks][:whole],
+        np.full(whole, ticks * DT),
+        *(
+            getattr(increments_, name)[: whole * ticks].reshape(whole, ticks, 3).sum(axis=1)
+            for name in ("dtheta", "dv")
+        ),
+    )
+    times = np.arange(0, 2390) * DT
+    tracks, ends = [], []
+    for size in (8, 20, 37, 2390):  # ticks
+        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N), lag_s, coning=True)
+        track, reports = [], []
+        for start in range(0, len(times), size):
+            now = times[start : start + size]
+            rows = (slow.t > now[0] - DT / 2) & (slow.t < now[-1] + DT / 2)
+            block = ImuSamples(slow.t[rows], slow.dt[rows], slow.dtheta[rows], slow.dv[rows])
+            sensed = [s for s in samples if now[0] - DT / 2 <= s.t < now[-1] + DT / 2]
+            some, estimates = horizon.track(block, sensed, now[np.arange(start, start + len(now)) % 3 == 0].tolist())
+            track += estimates
+            reports += some
+        tracks.append(np.array([[e.t, e.lat, e.h, *e.v_n, *e.q_nb, e.covariance[0, 0], e.status] for e in track]))
+        ends.append([(r.aid, r.t, r.nis) for r in reports if r.t < 11.5])
+    np.testing.assert_allclose(tracks[0][:, 0], times[::3], atol=1e-9)
+    assert np.isfinite(tracks[0][tracks[0][:, 0] > 5]).all()
+    for track, end in zip(tracks[1:], ends[1:], strict=True):
+        np.testing.assert_array_equal(track, tracks[0])
+        assert end == ends[0]
 
 
 def test_compensation_joins_the_blocks():

@@ -23,9 +23,10 @@ from ins_world import (
 )
 
 from nav.alignment import InitialState
+from nav.detection import GnssMonitor, Verdict
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.samples import AirspeedSample, BarometerSample, FixType, ImuSamples, Status
+from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Status
 
 ARM = (0.5, 0.1, -0.3)
 CONFIG = InsConfig(CONSUMER, gnss_arm_b=ARM, sideslip_sigma=None, gnss_use_velocity=True)
@@ -253,10 +254,16 @@ def test_broken_samples_are_reported_and_not_fused():
         BarometerSample(t, t, -5.0),
         AirspeedSample(t, t, math.inf),
     ]
+    sizes = {"gnss_position": 3, "gnss_velocity": 3, "barometer": 1, "airspeed": 1}
     for sample in broken:
-        (report,) = ins.update(sample)
-        assert report.weight == 0
-        assert report.reason
+        reports = ins.update(sample)
+        assert [r.aid for r in reports] == [aid for aid in sizes if aid.startswith(sample.sensor)]
+        for report in reports:
+            assert report.weight == 0
+            assert report.reason
+            assert report.S.shape == (sizes[report.aid], sizes[report.aid])
+            assert report.innovation.shape == (sizes[report.aid],)
+            assert np.isnan(report.innovation).all()
     after = ins.estimate()
     assert after.status & Status.BAD_SAMPLE
     assert ins.estimate().status == after.status  # looking at an estimate changes none
@@ -324,3 +331,15 @@ def test_the_reference_field_is_looked_up_rarely():
     increments, fixes, others = everything(truth, np.random.default_rng(9))
     feed(FusionHorizon(Ins(CONFIG, counted)), increments, fixes + others)
     assert 1 <= len(calls) < 10
+
+
+def test_a_receiver_slower_than_an_outage_is_fused():
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    verdicts = []
+    sigma = np.full(3, 1.0)
+    for k in range(1, 8):
+        t = 20.0 * k
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        verdicts.append(monitor.judge(fix, np.zeros(3), 0.1 * sigma, inside_gate=True))
+    assert verdicts[1:] == [Verdict.FUSE] * 6
