@@ -31,6 +31,7 @@ from nav.rotation import (
 )
 from nav.samples import Array, GnssSample, ImuSamples
 
+RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REST_SPEED = 0.5  # slower than this is standing [m/s]
 COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
 HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
@@ -101,7 +102,13 @@ class Alignment:
 
     def propagate(self, imu: ImuSamples) -> None:
         """Add a block of increments."""
-        if self._first is not None and len(imu):
+        if self._first is None or not len(imu):
+            return
+        sound = (np.abs(imu.dtheta) <= RATE_LIMIT * imu.dt[:, None]).all()
+        if not (sound and (np.abs(imu.dv) <= FORCE_LIMIT * imu.dt[:, None]).all()):
+            self.problem = "an increment was not sound: collecting again"
+            self._restart(None)
+        else:
             _accumulate(self._q_0b, self._angle_0, self._dv_0, imu.dtheta, imu.dv)
             self._omega_b = imu.dtheta[-1] / imu.dt[-1]
             if math.isnan(self._omega_first_b[0]):
@@ -135,7 +142,7 @@ class Alignment:
             + float(swing_b @ swing_b)
         )
         mismatch = abs(np.linalg.norm(dv_b) - np.linalg.norm(dv_n))
-        if mismatch > 5 * sigma_dv:
+        if not mismatch <= 5 * sigma_dv:
             self.problem = f"accelerometers and GNSS velocity disagree by {mismatch / T:.3g} m/s^2"
             self._restart(fix)
             return None

@@ -556,6 +556,7 @@ class GnssMonitor:
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
     _streak_start: float = math.nan
+    _interval: float = math.inf  # the shortest between two fixes: what the receiver can do
     _was_aided: bool = False
     _previous: tuple[GnssSample, Array] | None = None
 
@@ -563,7 +564,7 @@ class GnssMonitor:
         """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate."""
         if not self._continues(fix, v_n, sigma_v):
             self._streak_start = fix.t
-            self._was_aided = fix.t - self.last_fused <= self.outage_s
+            self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         wait = self.patience_s if self._was_aided else self.recovery_s
@@ -578,13 +579,18 @@ class GnssMonitor:
             self._was_aided = True
         return verdict
 
+    def _longest_gap(self) -> float:
+        """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""
+        return max(self.outage_s, 2 * self._interval) if math.isfinite(self._interval) else self.outage_s
+
     def _continues(self, fix: GnssSample, v_n: Array, sigma_v: Array) -> bool:
         """Whether ``fix`` is where the fix before it and the mean of both velocities say."""
         if self._previous is None:
             return False
         before, v0_n = self._previous
         dt = fix.t - before.t
-        if dt > self.outage_s:
+        self._interval = min(self._interval, dt)
+        if dt > self._longest_gap():
             return False
         moved = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
         jump = moved - 0.5 * dt * (v0_n + v_n)

@@ -16,7 +16,7 @@ import numpy as np
 
 from nav import aiding
 from nav._jit import njit
-from nav.alignment import AidSigmas, Alignment, InitialState
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT, AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
 from nav.earth import pressure_altitude, radii, wrap_longitude
 from nav.error_model import (
@@ -54,7 +54,6 @@ RECENT_S = 2.0  # a position this fresh counts as aided
 FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
-RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
 

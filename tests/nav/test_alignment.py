@@ -7,10 +7,11 @@ import pytest
 from ins_world import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
 from scipy.stats import chi2
 
+from nav.alignment import AidSigmas, Alignment
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.samples import ImuSamples, Status
+from nav.samples import FixType, GnssSample, ImuSamples, Status
 
 NAVIGATION = ImuModel(0.002 * DEG / 60, 1e-4, 0.003 * DEG / 3600, 3e-4)
 
@@ -125,3 +126,25 @@ def test_no_gnss_no_alignment():
     assert reports == []
     assert ins.problem == "waiting for GNSS"
     assert all(math.isnan(e.h) for e in estimates)
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf, 1e4])
+def test_a_broken_increment_starts_the_alignment_again(broken):
+    imu = ImuModel(1e-4, 1e-3, 1e-4, 0.02)
+    aids = AidSigmas(field=1e-7, field_bias=0.0, gnss_position=np.zeros(3), gnss_velocity=np.zeros(3), wind=5.0)
+    alignment = Alignment(imu, aids, np.zeros(3), 2.0)
+    field_n = np.array([2e-5, 0.0, 4e-5])
+    initial = None
+    for k in range(60):  # upright, facing north, at rest, 10 Hz; one increment is broken
+        t = 0.1 * (k + 1)
+        increments = ImuSamples(np.array([t]), np.array([0.1]), np.zeros((1, 3)), np.array([[0.0, 0.0, -0.981]]))
+        if k == 12:
+            increments.dv[0, 1] = broken
+        alignment.propagate(increments)
+        alignment.add_field(field_n)
+        sigma = np.full(3, 0.1)
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        initial = initial or alignment.add_gnss(fix, field_n)
+    assert initial is not None
+    assert initial.t > 1.3 + 2.0 - 1e-6
+    np.testing.assert_allclose(initial.q_nb, [1, 0, 0, 0], atol=0.01)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, UpdateReport
-from testbed import Scenario, flight, loop, record, run
+from testbed import Scenario, flight, loop, record, run, sensors
 from testbed.errors import UserError
 from testbed.truth import MotionSource, TruthBlock
 
@@ -42,7 +43,7 @@ class Watcher:
         assert len(truth) == 1
         assert estimate.t == pytest.approx(t, abs=1e-9)
         assert imu is not None
-        assert imu.t[-1] >= t - 1e-9
+        assert len(imu) == 0 or imu.t[-1] >= t - imu.dt[-1] - 1e-9
         assert all(report.t <= t for report in reports)
         assert all(sample.t_arrival <= t + 1e-9 for sample in samples.values())
         if "gnss" in samples:
@@ -258,3 +259,58 @@ def test_gnss_denied_sample_says_so() -> None:
     assert inside
     assert all(s.fix_type == FixType.NO_FIX for s in inside)
     assert all(np.isnan(s.lat) for s in inside)
+
+
+@pytest.mark.parametrize(
+    ("broken", "refused"),
+    [
+        ("sensors.barometer.bias_pa=100000", "barometer"),
+        ("sensors.magnetometer.hard_iron_ut=500", "magnetometer"),
+        ("sensors.gnss.horizontal_white_m=10000", "gnss_position"),
+    ],
+)
+def test_nonsense_is_refused_and_the_run_goes_on(broken: str, refused: str) -> None:
+    result = run(Scenario.load("u_turn", ["duration_s=75", "sensors.gnss.denied=[]", broken]))
+    assert result.dataset["truth"]["time"].values[-1] == pytest.approx(75.0)
+    assert all(np.isfinite(value) for value in result.metrics.values())
+    innovations = result.dataset.get(f"estimators/ins/innovations/{refused}")
+    assert innovations is None or (innovations["weight"].values == 0).any()
+
+
+def test_an_unsound_sample_of_every_sensor_is_reported_and_not_fused(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = Scenario.load("u_turn", ["duration_s=75", "sensors.gnss.denied=[]"])
+    original = sensors.build
+
+    def build(name: str, *rest: Any) -> Any:
+        sensor = original(name, *rest)
+        if name == "imu":
+            return sensor
+        sense, fields = sensor.sense, {"gnss": "lat", "barometer": "pressure", "airspeed": "eas"}
+
+        def broken(truth: TruthBlock) -> list[Sample]:
+            value = np.full(3, np.nan) if name == "magnetometer" else float("nan")
+            change = {fields.get(name, "field_b"): value}
+            return [replace(s, **change) if 65.0 <= s.t < 65.3 else s for s in sense(truth)]
+
+        sensor.sense = broken
+        return sensor
+
+    monkeypatch.setattr(sensors, "build", build)
+    watcher = Watcher()
+    result = run(scenario, links=[watcher])
+    texts = [text for t, _, text in watcher.events if 65.0 <= t < 66.0]
+    for aid in ("gnss_position", "barometer", "magnetometer", "airspeed"):
+        assert any(f"ins: {aid.removesuffix('_position')} refused" in text for text in texts), (aid, texts)
+        innovations = result.dataset[f"estimators/ins/innovations/{aid}"]
+        t, weight = innovations["sample_time"].values, innovations["weight"].values
+        inside = (t >= 65.0) & (t < 65.3)
+        assert inside.any()
+        assert (weight[inside] == 0).all()
+    assert all(np.isfinite(value) for value in result.metrics.values())
+
+
+@pytest.mark.parametrize("imu_hz", [25, 40])
+def test_slow_imu_gives_the_same_bits_live_and_batch(imu_hz: int) -> None:
+    scenario = Scenario.load("u_turn", ["duration_s=20", "sensors.gnss.denied=[]", f"sensors.imu.rate_hz={imu_hz}"])
+    batch = run(scenario)
+    assert same(batch.dataset, run(scenario, links=[Watcher()], realtime=1000.0).dataset)
