@@ -233,7 +233,7 @@ class ImuConfig(Section):
 
     kind: Literal["imu"] = "imu"
     grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = "mems-consumer"
-    rate_hz: float = Field(200.0, ge=20, le=10_000)
+    rate_hz: float = Field(200.0, ge=5, le=10_000)
 
     gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5)
     gyro_instability_degph: float = Field(0.0, ge=0, le=1e4)

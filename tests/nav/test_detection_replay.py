@@ -2,8 +2,8 @@
 
 216 s; a step of 5 sigma at 40-60 s, a ramp at 90-130 s (Zhou et al. 2025, with the printed slope of 0.02 sigma/s and
 with the 0.1 sigma/s that fits their other figures). The expected figures are those of an independent prototype over
-1500 seeds at 1e-3, Wald's limit 6.907 and one axis: so the rows of the sequential test are the literal ones. The slow tests
-print what they measure (pytest -m slow -s).
+1500 seeds at 1e-3, Wald's limit 6.907 and one axis: so the rows of the sequential test are the literal ones. The slow
+tests print what they measure (pytest -m slow -s).
 """
 
 import math
