@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nav import aiding
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT, AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
 from nav.earth import pressure_altitude, radii, wrap_longitude
@@ -33,7 +33,7 @@ from nav.error_model import (
     transition,
 )
 from nav.kalman import correct, innovate, predict
-from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise
+from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -590,17 +590,22 @@ def _update(
     return S, nis
 
 
-@njit
+@inlined
 def _inject(q_nb: Array, v_n: Array, lla: Array, x: Array, correction: Array) -> None:
     """Add a correction (n,) to the state: what the error state has found out, with the sign of `kalman.correct`."""
     # C_nb_hat = (I - [phi x]) C_nb, and the correction is minus phi's estimate
-    q_nb[:] = quat_normalise(quat_multiply(quat_from_rotvec(-correction[PHI : PHI + 3]), q_nb))
+    turn = quat_conjugate(quat_from_rotvec(correction[PHI : PHI + 3]))
+    turned = quat_normalise(quat_multiply(turn, q_nb))
+    for i in range(4):
+        q_nb[i] = turned[i]
+    for i in range(3):
+        v_n[i] += correction[VEL + i]
     R_M, R_N = radii(lla[0])
-    v_n += correction[VEL : VEL + 3]
     lla[1] = wrap_longitude(lla[1] + correction[POS + 1] / ((R_N + lla[2]) * math.cos(lla[0])))
     lla[0] += correction[POS] / (R_M + lla[2])
     lla[2] -= correction[POS + 2]
-    x[MOTION:] += correction[MOTION:]
+    for i in range(MOTION, len(x)):
+        x[i] += correction[i]
 
 
 @njit
@@ -648,7 +653,8 @@ def _propagate(
         for i in range(3):
             angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
             push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
-        before[:] = q_nb
+        for i in range(4):
+            before[i] = q_nb[i]
         step(q_nb, v_n, lla, angle, push, T)
         _integrate(sums, before, q_nb, angle, push, T)
         elapsed[0] += T
@@ -661,7 +667,7 @@ def _propagate(
     return bad
 
 
-@njit
+@inlined
 def _integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
     """Add one interval to the integrals of `error_model.transition`, with C_nb in its middle: of the mean quaternion.
 
