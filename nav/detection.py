@@ -51,7 +51,7 @@ class Decision(NamedTuple):
     """A detector's word on one look."""
 
     alarm: bool  # the sensor is taken for faulty
-    statistic: float  # NaN when the look could not be judged: a value that is no number, or S not positive definite
+    statistic: float  # NaN or infinite when the look can't be judged: no number, or S not positive definite
     threshold: float
     axis_mask: Mask  # (m,) True where the axis may be used, all True without an alarm
     event: Event
@@ -354,8 +354,8 @@ class Sprt:
     estimated, not Wald's test. ``signed`` form: ``E <- decay E + mean' r - |mean|^2 / 2`` with the mean *before* r; it
     can fall below zero, and as exp(E) has expectation of at most one, ``-ln(false_alarm)`` bounds the alarms per look.
 
-    ``end_test`` is what the look alone must pass for a reset. ``axis_mask`` takes out
-    the axes whose own mean is beyond its limit, or all if none is.
+    ``end_test`` is what the look alone must pass for a reset. ``axis_mask`` takes out the axes whose own mean is beyond
+    its limit, or all if none is.
 
     ``literal`` is Zhou et al. as printed: n |mean|^2 / 2 whatever the weights (Eq 17), the signed form with the mean
     that includes r (drifts upwards: alarms without a fault), and Wald's limit (Eq 18, p_m = p_f) for any m.
@@ -381,8 +381,8 @@ class Sprt:
         m = len(nu)
         r, gamma2 = whiten(nu, S)
         threshold = self.threshold(m)
-        if math.isnan(gamma2):
-            return self._alarm.decide(math.nan, threshold, m, np.full(m, False))
+        if not math.isfinite(gamma2):
+            return self._alarm.decide(gamma2, threshold, m, np.full(m, False))
         before, self._evidence = self._evidence, self._gather(r, t)
         over = self._evidence > threshold
         if over and self._evidence < before and self.reset is not Reset.NONE and self.end_test.passes(gamma2, m):
@@ -425,9 +425,9 @@ def glr_false_alarm(threshold: float, m: int, n: int) -> float:
 def glr_threshold(false_alarm: float, m: int, n: int) -> float:
     """The limit that `glr_false_alarm` meets with ``n`` looks of ``m`` axes [nats]."""
     low = 0.5 * chi_square_threshold(false_alarm, m)
-    high = low + math.log(2.0 + 4.0 * low * (1.0 + math.log(n)))
     if n == 1:
         return low
+    high = 0.5 * chi_square_threshold(0.1 * false_alarm / n, m)  # beyond the limit of n independent looks
     return float(brentq(lambda T: math.log(glr_false_alarm(T, m, n) / false_alarm), low, high))
 
 
@@ -478,8 +478,8 @@ class Glr:
         """Judge one look; see `Detector`."""
         m = len(nu)
         r, gamma2 = whiten(nu, S)
-        if math.isnan(gamma2):
-            return self._alarm.decide(math.nan, glr_threshold(self.false_alarm, m, 1), m, np.full(m, False))
+        if not math.isfinite(gamma2):
+            return self._alarm.decide(gamma2, glr_threshold(self.false_alarm, m, 1), m, np.full(m, False))
         rows = self._window.push(r, t)
         statistic, length = _largest_evidence(rows)
         threshold = glr_threshold(self.false_alarm, m, len(rows))
