@@ -185,7 +185,6 @@ class Scenario(Section):
     """One run, described. Made by `Scenario.load`; a changed one comes from loading with overrides."""
 
     title: str = Field(min_length=1)
-    description: str = ""
     seed: int = Field(default=0, ge=0, lt=2**63)
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S)
     date: Date = dt.date(2026, 1, 1)

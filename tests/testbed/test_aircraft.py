@@ -69,10 +69,9 @@ def test_mass_and_inertia_are_the_published_ones(aircraft: Aircraft) -> None:
 @pytest.mark.parametrize("airspeed", AIRSPEEDS)
 def test_modes_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
     found = {mode.name: mode for mode in modes(airspeed, 0.0)}
-    for name in ("short period", "phugoid", "Dutch roll", "roll"):
-        assert found[name].eigenvalue.real < 0
-    # The spiral may be slow: MIL-F-8785C level 1 asks that it takes at least 20 s to double.
-    assert found["spiral"].eigenvalue.real < math.log(2) / 20
+    for mode in found.values():
+        assert mode.eigenvalue.real < 0
+    assert found["spiral"].time_constant > 15  # slow, or there would be too much dihedral
     q, half = 0.5 * 1.225 * airspeed**2, 2 * airspeed
     # Roll subsidence, p alone.
     assert found["roll"].eigenvalue.real == pytest.approx(-0.5051 * q * S * B**2 / half / JX, rel=0.2)

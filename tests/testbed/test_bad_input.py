@@ -39,7 +39,7 @@ def line_of(text: str, start: str) -> int:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('title = "A', 'titel = "A', "titel: unknown key: did you mean title? Choose from title, description, seed"),
+        ('title = "A', 'titel = "A', "titel: unknown key: did you mean title? Choose from title, seed"),
         ("seed = 1", "seed = 1.5", "seed: must be a whole number, not 1.5"),
         ("seed = 1", "seed = -1", "seed: must be greater than or equal to 0, not -1"),
         ("duration_s = 200", "duration_s = 0", "duration_s: must be greater than 0, not 0"),

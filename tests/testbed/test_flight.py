@@ -7,6 +7,7 @@ import math
 import subprocess
 import sys
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
+import testbed
 from nav import earth, strapdown
+from testbed.data import data_dir
 from testbed.flight import Flight
 from testbed.guidance import Feedback, Leg, check_plan
 from testbed.scenario import FlightTruth
@@ -397,3 +400,10 @@ def test_every_column_is_finite() -> None:
     block = fly(flight([LOITER], wind=GUSTY), 20.0)
     for name in COLUMNS:
         assert np.isfinite(getattr(block, name)).all(), name
+
+
+def test_specific_force_is_not_taken_from_the_simulator() -> None:
+    """Increments come from the motion itself; JSBSim's accelerometer properties sit at another point and time."""
+    sources = [*Path(testbed.__file__).parent.rglob("*.py"), *data_dir("aircraft").rglob("*.xml")]
+    assert len(sources) > 20
+    assert not [path.name for path in sources if "a-pilot" in path.read_text(encoding="utf-8")]

@@ -68,7 +68,10 @@ def test_a_body_at_rest(tmp_path: Path) -> None:
     truth.v_n[:] = 0.0
     truth.airspeed[:] = 0.0
     synthetic_run.record(recorder, truth, {"ins": Errors()})
-    report.write_report(recorder.dataset(), {}, tmp_path)
+    page = report.write_report(recorder.dataset(), {}, tmp_path)
+    images = {path.name for path in tmp_path.glob("*.png")}
+    assert {"flight.png", "ground_track.png", "ins_position_errors.png"} <= images
+    assert page.read_text(encoding="utf-8").count("data:image/png;base64,") == len(images)
 
 
 def test_table_sets_gnss_and_outage_side_by_side() -> None:
