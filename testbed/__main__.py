@@ -1,4 +1,4 @@
-"""The command line: ``testbed scenarios | run | check | report | export | campaign | bench``.
+"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | bench``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -212,6 +212,29 @@ def campaign(
         case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()
         print(f"testbed: {case}: {failure.message}", file=sys.stderr)
     if result.failures:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def papers(
+    ids: Annotated[list[str] | None, typer.Argument(metavar="[ID...]", help="Which papers; all of them.")] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for papers.json and figures.")] = RUNS / "papers",
+) -> None:
+    """Reproduce the papers: every claim beside what comes out here; exit code 1 if one is missed."""
+    from testbed import papers as library
+    from testbed import progress
+
+    found = library.find(ids or [])
+    with (
+        _output_folder(out),
+        _keeping("nothing was written"),
+        progress.shown(_console(stderr=True), "papers") as tell,
+    ):
+        claims = library.reproduce(found, out, tell)
+    for name, own in claims.items():
+        _console().print(library.table(found[name].title, own))
+    print(f"{out / library.RESULTS} and figures beside it")
+    if any(claim.verdict == "missed" for own in claims.values() for claim in own):
         raise typer.Exit(EXIT_FAILED)
 
 
