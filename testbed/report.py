@@ -525,7 +525,8 @@ def innovations(run: _Run, name: str) -> Figure | None:
             normalised = z / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
         limit = 1.6 * float(np.nanmax(gate)) if np.isfinite(gate).any() else 6.0
         shown = np.clip(normalised, -0.97 * limit, 0.97 * limit)
-        labels = ("north", "east", "down") if aid.startswith("gnss") else ("forward", "right", "down")
+        ned, body = ("north", "east", "down"), ("forward", "right", "down")
+        labels = ned if aid.startswith(("gnss", "position")) else body[1:] if aid == "nonholonomic" else body
         some = slice(None, None, max(1, len(t) // 4000))
         for k in range(z.shape[1]):
             label = labels[k] if z.shape[1] > 1 else None
