@@ -417,6 +417,7 @@ class Recorder:
             "estimated_point_b_m": json.dumps(
                 {own.name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m for own in scenario.estimator}
             ),
+            "estimator_imus": json.dumps({own.name: own.imu for own in scenario.estimator}),
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }

@@ -60,7 +60,7 @@ class BodyVelocityConfig(InterruptedTiming):
     grade: Literal["perfect", "odometer", "dvl", "doppler"] = "doppler"
     rate_hz: float = Field(1.0, gt=0, le=10_000)
 
-    axes: tuple[Axis, ...] = Field(AXES, min_length=1, max_length=3, description="that are measured")
+    axes: tuple[Axis, ...] = Field(AXES, description="that are measured")
     noise_mps: float = Field(0.0, ge=0, le=100)
     correlated_mps: float = Field(0.0, ge=0, le=100)
     correlation_time_s: float = Field(300.0, gt=0, le=1e6)
@@ -74,8 +74,8 @@ class BodyVelocityConfig(InterruptedTiming):
     @field_validator("axes")
     @classmethod
     def _each_once(cls, axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
-        if len(set(axes)) < len(axes):
-            raise ValueError("names an axis twice: give each once")
+        if not axes or len(set(axes)) < len(axes):
+            raise ValueError("must name each measured axis once: one or more of forward, right, down")
         return axes
 
     def errors(self) -> BodyVelocityErrors:

@@ -1,4 +1,9 @@
-"""Body velocity, star tracker and position fixes: what they measure, how wrong they are, when they are silent."""
+"""Body velocity, star tracker and position fixes: what they measure, how wrong they are, when they are silent.
+
+And several sensors of a kind side by side, in a whole run.
+"""
+
+import json
 
 import numpy as np
 import pymap3d
@@ -8,6 +13,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from sensor_truth import RATE_HZ, lively, still
 
+from testbed import Scenario, run
+from testbed.export import export
+from testbed.report import write_report
 from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
 from testbed.sensors.position_fix import PositionFix, PositionFixConfig
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
@@ -256,3 +264,109 @@ def test_dropouts_come_at_their_rate_one_by_one_and_move_no_other_number(kind):
 def test_bad_windows_are_refused(kind):
     with pytest.raises(ValueError, match="overlap"):
         kind(denied=[[10, 50], [40, 60]])
+
+
+# --- several of a kind, by name
+
+TWINS = """
+title = "Two of each at rest"
+seed = 3
+duration_s = 130
+[truth]
+source = "kinematic"
+rate_hz = 50
+start = { lat_deg = 30.5, lon_deg = 114.3, alt_m = 20, heading_deg = 40 }
+[sensors.imu]
+rate_hz = 50
+[sensors.imu2]
+kind = "imu"
+rate_hz = 50
+gyro_turn_on_degph = 4000
+[sensors.gnss]
+rate_hz = 2
+[sensors.gnss2]
+kind = "gnss"
+rate_hz = 2
+denied = [[50, 70]]
+[sensors.magnetometer]
+rate_hz = 5
+[sensors.radar]
+kind = "body_velocity"
+[sensors.radar2]
+kind = "body_velocity"
+[sensors.odometer]
+kind = "body_velocity"
+grade = "odometer"
+[sensors.star_tracker]
+[sensors.star_tracker2]
+kind = "star_tracker"
+[sensors.beacon]
+kind = "position_fix"
+transponder = { lat_deg = 30.5, lon_deg = 114.3, range_m = 500 }
+[sensors.beacon2]
+kind = "position_fix"
+transponder = { lat_deg = 30.5, lon_deg = 114.3, range_m = 500 }
+[sensors.far]
+kind = "position_fix"
+transponder = { lat_deg = 31.5, lon_deg = 114.3, range_m = 500 }
+[[estimator]]
+name = "first"
+aids = ["gnss", "magnetometer"]
+[[estimator]]
+name = "second"
+imu = "imu2"
+aids = ["gnss2", "magnetometer"]
+"""
+
+
+@pytest.fixture(scope="module")
+def twins(tmp_path_factory):
+    return run(Scenario.parse(TWINS), out=tmp_path_factory.mktemp("twins"))
+
+
+@pytest.mark.parametrize(("name", "what"), [
+    ("imu", "dtheta"), ("gnss", "lat"), ("radar", "v_b"), ("star_tracker", "q_ib"), ("beacon", "lat"),
+])  # fmt: skip
+def test_twins_are_recorded_by_name_with_errors_of_their_own(twins, name, what):
+    one, two = (twins.dataset[f"sensors/{sensor}"] for sensor in (name, f"{name}2"))
+    assert np.array_equal(one["time"], two["time"])
+    assert len(one["time"]) >= 10
+    same = np.isclose(one[what].values, two[what].values, rtol=1e-15, atol=0) & np.isfinite(two[what].values)
+    assert same.mean() < 0.1
+
+
+def test_recorded_columns_say_what_they_are(twins):
+    q_ib, v_b = twins.dataset["sensors/star_tracker/q_ib"], twins.dataset["sensors/odometer/v_b"]
+    assert "ECEF at time 0" in q_ib.attrs["frame"]
+    assert v_b.attrs["units"] == "m/s"
+    assert np.isfinite(v_b.sel(body="forward")).all()
+    assert np.isnan(v_b.sel(body="right")).all()
+    assert "far" not in twins.dataset["sensors"].children
+
+
+def test_twins_in_export_and_report(twins):
+    folder = export(twins.path / "run.nc", "csv")
+    for name in ("imu2", "gnss2", "radar2", "star_tracker2", "beacon2"):
+        assert (folder / f"sensors.{name}.csv").exists()
+    page = write_report(twins.dataset, twins.metrics, twins.path).read_text("utf-8")
+    assert "gnss2 denied" in page
+    assert "gnss2 reacquired" in page
+
+
+def test_each_estimator_uses_the_sensors_that_it_names(twins):
+    fused = {
+        name: twins.dataset[f"estimators/{name}/innovations/gnss_position/sample_time"].values
+        for name in ("first", "second")
+    }
+    assert ((fused["first"] > 51) & (fused["first"] < 69)).any()
+    assert not ((fused["second"] >= 50) & (fused["second"] < 70)).any()
+    assert json.loads(twins.dataset.attrs["estimator_imus"]) == {"first": "imu", "second": "imu2"}
+    bias = {n: np.abs(twins.dataset[f"estimators/{n}/gyro_bias"].values[-1]).max() for n in ("first", "second")}
+    assert bias["second"] > 5 * bias["first"]  # 4000 deg/h against 40
+
+
+def test_the_report_compares_biases_with_the_estimators_own_imu(twins):
+    from testbed import report
+
+    seen = {name: report._imu_error(report._Run(twins.dataset), name) for name in ("first", "second")}
+    assert np.abs(seen["second"][1]).max() > 5 * np.abs(seen["first"][1]).max()
