@@ -290,11 +290,12 @@ def body_velocity(
     nu = np.empty(len(axes))
     H = np.zeros((len(axes), len(x)))
     for row in range(len(axes)):
-        along_n = C_nb[:, axes[row]]
+        axis = axes[row]
+        along_n = np.array([C_nb[0, axis], C_nb[1, axis], C_nb[2, axis]])
         speed = along_n[0] * v_n[0] + along_n[1] * v_n[1] + along_n[2] * v_n[2]
         gain = 1 + x[scale + row] if scale >= 0 else 1.0
         turned = cross(v_n, along_n)
-        nu[row] = v_b[axes[row]] - gain * speed
+        nu[row] = v_b[axis] - gain * speed
         for i in range(3):
             H[row, PHI + i], H[row, VEL + i] = gain * turned[i], gain * along_n[i]
         if scale >= 0:
@@ -305,7 +306,6 @@ def body_velocity(
     return nu, H
 
 
-@njit
 def nonholonomic(q_nb: Array, v_n: Array, x: Array) -> tuple[Array, Array]:
     """The constraint of wheels, neither sideways nor off the ground: 0 = (e_y, e_z) . C_nb' v [m/s]."""
     return body_velocity(q_nb, v_n, x, SIDEWAYS, -1, -1, np.zeros(3))
