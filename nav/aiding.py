@@ -13,10 +13,29 @@ import math
 import numpy as np
 
 from nav._jit import njit
-from nav.earth import SEA_LEVEL_DENSITY, displacement_n, earth_rate_n, isa_density
+from nav.earth import (
+    SEA_LEVEL_DENSITY,
+    displacement_n,
+    earth_rate_n,
+    isa_density,
+    quat_en,
+    quat_ie,
+    radii,
+    wrap_longitude,
+)
 from nav.error_model import PHI, POS, VEL, Drive, Indices
-from nav.rotation import cross, dcm_from_quat, quat_rotate
-from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, MagnetometerSample, Sample
+from nav.rotation import cross, dcm_from_quat, quat_conjugate, quat_multiply, quat_rotate, rotvec_from_quat
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    BodyVelocitySample,
+    GnssSample,
+    MagnetometerSample,
+    PositionSample,
+    Sample,
+    StarSample,
+)
 
 # What an instrument could possibly report; beyond it the sample is broken.
 HEIGHT_LIMITS = (-1000.0, 50_000.0)  # [m]
@@ -24,6 +43,9 @@ SPEED_LIMIT = 600.0  # over ground [m/s]
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # [Pa]
 FIELD_LIMITS = (5e-6, 200e-6)  # magnitude; the Earth's is 22 to 67 uT [T]
 AIRSPEED_LIMITS = (-10.0, 300.0)  # [m/s]
+NORM_LIMITS = (0.999, 1.001)  # of an attitude quaternion
+
+SIDEWAYS = np.array([1, 2])  # the body axes along which a wheeled vehicle does not move
 
 
 def problem(sample: Sample) -> str:
@@ -39,6 +61,12 @@ def problem(sample: Sample) -> str:
             return _range_problem("field", float(np.sqrt(sample.field_b @ sample.field_b)), FIELD_LIMITS)
         case AirspeedSample():
             return _range_problem("airspeed", sample.eas, AIRSPEED_LIMITS)
+        case BodyVelocitySample():
+            return _body_velocity_problem(sample.v_b)
+        case StarSample():
+            return _range_problem("norm of the quaternion", math.hypot(*sample.q_ib.tolist()), NORM_LIMITS)
+        case PositionSample():
+            return _position_problem(sample.lat, sample.lon, 0.0 if math.isnan(sample.h) else sample.h)
 
 
 def _range_problem(what: str, value: float, limits: tuple[float, float]) -> str:
@@ -47,13 +75,30 @@ def _range_problem(what: str, value: float, limits: tuple[float, float]) -> str:
     return "" if limits[0] <= value <= limits[1] else f"{what} {value:.6g} is out of range"
 
 
-def _gnss_problem(sample: GnssSample) -> str:
-    if not (math.isfinite(sample.lat) and math.isfinite(sample.lon) and math.isfinite(sample.h)):
+def _position_problem(lat: float, lon: float, h: float) -> str:
+    if not (math.isfinite(lat) and math.isfinite(lon) and math.isfinite(h)):
         return "position is not finite"
-    if abs(sample.lat) > math.pi / 2 or abs(sample.lon) > 2 * math.pi:
+    if abs(lat) > math.pi / 2 or abs(lon) > 2 * math.pi:
         return "position is out of range"
-    if not HEIGHT_LIMITS[0] <= sample.h <= HEIGHT_LIMITS[1]:
-        return f"height {sample.h:.6g} is out of range"
+    return "" if HEIGHT_LIMITS[0] <= h <= HEIGHT_LIMITS[1] else f"height {h:.6g} is out of range"
+
+
+def _body_velocity_problem(v_b: Array) -> str:
+    """Axes that are not measured are NaN; which they may be, only the filter knows (`measures`)."""
+    measured = [v for v in v_b.tolist() if not math.isnan(v)]
+    if not measured:
+        return "velocity is not finite"
+    return _range_problem("speed", math.hypot(*measured), (0.0, SPEED_LIMIT))
+
+
+def measures(sample: BodyVelocitySample, axes: Indices) -> bool:
+    """Whether a sound sample has a number on each of the body ``axes``."""
+    return all(math.isfinite(v) for v in sample.v_b[axes].tolist())
+
+
+def _gnss_problem(sample: GnssSample) -> str:
+    if trouble := _position_problem(sample.lat, sample.lon, sample.h):
+        return trouble
     if not _positive(sample.sigma_position_n):
         return "reported accuracy of position is not a positive number"
     speed2 = float(sample.v_n @ sample.v_n)
@@ -230,6 +275,104 @@ def _air_velocity(C_nb: Array, v_n: Array, x: Array, wind: int, gust: int, axis:
         H[0, PHI + i], H[0, VEL + i] = turned[i], along_n[i]
         nu[0] -= along_n[i] * air_n[i]
     return nu, H
+
+
+@njit
+def body_velocity(
+    q_nb: Array, v_n: Array, x: Array, axes: Indices, scale: int, error: int, v_b: Array
+) -> tuple[Array, Array]:
+    """Velocity over ground along the m body ``axes`` [m/s]: (1 + scale) e . C_nb' v + error, one row for each axis.
+
+    ``v_b`` (3,) is what was measured. The blocks ``scale`` and ``error`` have a state for each row, in the same order.
+    By an odometer, axes = [0]: forward speed. Cui et al. 2022, equations 50-52, with the difference taken in body axes.
+    """
+    C_nb = dcm_from_quat(q_nb)
+    nu = np.empty(len(axes))
+    H = np.zeros((len(axes), len(x)))
+    for row in range(len(axes)):
+        axis = axes[row]
+        along_n = np.array([C_nb[0, axis], C_nb[1, axis], C_nb[2, axis]])
+        speed = along_n[0] * v_n[0] + along_n[1] * v_n[1] + along_n[2] * v_n[2]
+        gain = 1 + x[scale + row] if scale >= 0 else 1.0
+        turned = cross(v_n, along_n)
+        nu[row] = v_b[axis] - gain * speed
+        for i in range(3):
+            H[row, PHI + i], H[row, VEL + i] = gain * turned[i], gain * along_n[i]
+        if scale >= 0:
+            H[row, scale + row] = speed
+        if error >= 0:
+            H[row, error + row] = 1.0
+            nu[row] -= x[error + row]
+    return nu, H
+
+
+def nonholonomic(q_nb: Array, v_n: Array, x: Array) -> tuple[Array, Array]:
+    """The constraint of wheels, neither sideways nor off the ground: 0 = (e_y, e_z) . C_nb' v [m/s]."""
+    return body_velocity(q_nb, v_n, x, SIDEWAYS, -1, -1, np.zeros(3))
+
+
+@njit
+def star_attitude(q_nb: Array, lla: Array, x: Array, t: float, q_ib: Array) -> tuple[Array, Array]:
+    """Rotation (3,) [rad], body axes, from the estimated to the measured attitude in i, which was e at t = 0.
+
+    nu = log(C_ib_hat' C_ib) = C_nb' (phi - dtheta) with C_ib_hat = C_ie(t) C_en_hat C_nb_hat, where the position error
+    turns n by dtheta = (dE / (R_N + h), -dN / (R_M + h), -dE tan(lat) / (R_N + h)). Cui et al. 2022,
+    equations 17-33 (their C_dP, here for metres north-east-down and our phi).
+    """
+    predicted = quat_multiply(quat_ie(t), quat_multiply(quat_en(lla[0], lla[1]), q_nb))
+    nu = rotvec_from_quat(quat_multiply(quat_conjugate(predicted), q_ib))
+    C_nb = dcm_from_quat(q_nb)
+    R_M, R_N = radii(lla[0])
+    north, east = 1 / (R_M + lla[2]), 1 / (R_N + lla[2])
+    H = np.zeros((3, len(x)))
+    for i in range(3):
+        for j in range(3):
+            H[i, PHI + j] = -C_nb[j, i]
+        H[i, POS] = -C_nb[1, i] * north
+        H[i, POS + 1] = (C_nb[0, i] - C_nb[2, i] * math.tan(lla[0])) * east
+    return nu, H
+
+
+@njit
+def position_fix(lla: Array, x: Array, lat: float, lon: float, h: float) -> tuple[Array, Array]:
+    """Position [m], north, east and, unless ``h`` is NaN, down."""
+    rows = 2 if math.isnan(h) else 3
+    nu = displacement_n(lat, lon, lla[2] if rows == 2 else h, lla[0], lla[1], lla[2])[:rows]
+    H = np.zeros((rows, len(x)))
+    for i in range(rows):
+        H[i, POS + i] = 1.0
+    return nu, H
+
+
+@njit
+def gnss_course(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int, antenna_v_n: Array) -> tuple[Array, Array]:
+    """Course over ground, clockwise from north [rad]: heading + drift, nu in (-pi, pi].
+
+    The measured course is atan2(vE, vN) of the receiver's velocity. Drift is the angle from the velocity through the
+    air, v - wind - gust, to v, both horizontal: of an aircraft that does not slip. Without wind states it is zero and
+    course is taken for heading, as on a road (Cheng et al. 2020, equation 22; their z = heading - course is -nu).
+
+    Sign: phi down turns the estimate anticlockwise, so H[PHI + 2] is -1, and the rest of phi counts with the tangent
+    of pitch. Course is worth sigma_v / speed and nothing near rest: gate the speed.
+    """
+    C_nb = dcm_from_quat(q_nb)
+    fwd_n, fwd_e, fwd_d = C_nb[0, 0], C_nb[1, 0], C_nb[2, 0]
+    level = fwd_n * fwd_n + fwd_e * fwd_e
+    H = np.zeros((1, len(x)))
+    H[0, PHI], H[0, PHI + 1], H[0, PHI + 2] = fwd_n * fwd_d / level, fwd_e * fwd_d / level, -1.0
+    predicted = math.atan2(fwd_e, fwd_n)
+    if wind >= 0 or gust >= 0:
+        air_n, air_e = v_n[0], v_n[1]
+        for start in (wind, gust):
+            if start >= 0:
+                air_n, air_e = air_n - x[start], air_e - x[start + 1]
+        ground2, air2 = v_n[0] * v_n[0] + v_n[1] * v_n[1], air_n * air_n + air_e * air_e
+        predicted += math.atan2(v_n[1], v_n[0]) - math.atan2(air_e, air_n)
+        H[0, VEL], H[0, VEL + 1] = air_e / air2 - v_n[1] / ground2, v_n[0] / ground2 - air_n / air2
+        for start in (wind, gust):
+            if start >= 0:
+                H[0, start], H[0, start + 1] = -air_e / air2, air_n / air2
+    return np.array([wrap_longitude(math.atan2(antenna_v_n[1], antenna_v_n[0]) - predicted)]), H
 
 
 @njit

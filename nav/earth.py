@@ -141,6 +141,13 @@ def quat_en(lat: float, lon: float) -> Array:
 
 
 @njit
+def quat_ie(t: float) -> Array:
+    """q_ie (4,), the turn of the Earth since i coincided with e: by OMEGA_IE ``t`` about the polar axis."""
+    half = 0.5 * OMEGA_IE * t
+    return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
+@njit
 def displacement_n(lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float) -> Array:
     """Position minus reference position (3,) in metres north-east-down.
 

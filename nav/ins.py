@@ -38,12 +38,15 @@ from nav.samples import (
     AirspeedSample,
     Array,
     BarometerSample,
+    BodyVelocitySample,
     Estimate,
     FixType,
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    PositionSample,
     Sample,
+    StarSample,
     Status,
     UpdateReport,
 )
@@ -68,6 +71,9 @@ KINDS = {
     BarometerSample: "barometer",
     MagnetometerSample: "magnetometer",
     AirspeedSample: "airspeed",
+    BodyVelocitySample: "body_velocity",
+    StarSample: "star_tracker",
+    PositionSample: "position_fix",
 }
 
 FieldModel = Callable[[float, float, float], Array]
@@ -344,6 +350,8 @@ class Ins:
                 return self._update_magnetometer(state, sample)
             case AirspeedSample():
                 return self._update_airspeed(state, sample)
+            case BodyVelocitySample() | StarSample() | PositionSample():  # never among the aids
+                return []
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
@@ -366,6 +374,8 @@ class Ins:
                 return [("magnetometer", 3)]
             case AirspeedSample():
                 return [("airspeed", 1)] + [("sideslip", 1)] * (self.config.sideslip_sigma is not None)
+            case BodyVelocitySample() | StarSample() | PositionSample():
+                return []
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""

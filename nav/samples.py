@@ -107,7 +107,47 @@ class AirspeedSample:
     sensor: str = "airspeed"
 
 
-Sample: TypeAlias = GnssSample | BarometerSample | MagnetometerSample | AirspeedSample
+@dataclass(frozen=True, slots=True)
+class BodyVelocitySample:
+    """Velocity over ground in body axes (3,) [m/s], NaN on the axes that the instrument does not measure."""
+
+    t: float
+    t_arrival: float
+    v_b: Array
+    sensor: str = "body_velocity"
+
+
+@dataclass(frozen=True, slots=True)
+class StarSample:
+    """Attitude against the stars: ``q_ib`` (4,) takes b to the inertial frame i, which coincides with e at t = 0."""
+
+    t: float
+    t_arrival: float
+    q_ib: Array
+    sensor: str = "star_tracker"
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSample:
+    """A position found by other means than GNSS: latitude, longitude [rad], ``h`` [m], NaN when not measured."""
+
+    t: float
+    t_arrival: float
+    lat: float
+    lon: float
+    h: float
+    sensor: str = "position_fix"
+
+
+Sample: TypeAlias = (
+    GnssSample
+    | BarometerSample
+    | MagnetometerSample
+    | AirspeedSample
+    | BodyVelocitySample
+    | StarSample
+    | PositionSample
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import Array, ImuSamples
-from testbed.scenario import EstimatorConfig, Scenario
+from testbed.scenario import AIDS, EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -111,7 +111,7 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     offered = {scenario.sensors[name].kind: name for name in config.aids}
     aids = tuple(offered)
     for name, section in scenario.sensors.items():
-        if not isinstance(section, ImuConfig):
+        if section.kind in AIDS[config.kind]:
             offered.setdefault(section.kind, name)
     kinds: Mapping[str, SensorConfig] = {kind: scenario.sensors[name] for kind, name in offered.items()}
     told: dict[str, object] = {}

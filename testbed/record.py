@@ -59,6 +59,7 @@ AXES: dict[str, tuple[str, ...]] = {
     "body": ("forward", "right", "down"),
     "north_east": ("north", "east"),
     "quaternion": ("w", "x", "y", "z"),
+    "inertial_quaternion": ("w", "x", "y", "z"),
     "surface": ("aileron", "elevator", "rudder", "throttle"),
     "command": ("bank", "altitude", "airspeed"),
     "error": tuple(
@@ -71,6 +72,7 @@ _FRAME = {
     "north_east": "n: local north-east-down",
     "body": "b: forward-right-down",
     "quaternion": "from b (forward-right-down) to n (north-east-down)",
+    "inertial_quaternion": "from b (forward-right-down) to i (ECEF at time 0)",
     "error": "n: local north-east-down",
 }
 
@@ -113,9 +115,9 @@ IMU = {
 
 SAMPLE = {
     "t_arrival": Variable("s", "when the sample could first be used"),
-    "lat": Variable("rad", "geodetic latitude of the antenna, WGS84"),
-    "lon": Variable("rad", "longitude of the antenna, WGS84"),
-    "h": Variable("m", "height of the antenna above the ellipsoid"),
+    "lat": Variable("rad", "measured geodetic latitude, WGS84; GNSS: of the antenna"),
+    "lon": Variable("rad", "measured longitude, WGS84; GNSS: of the antenna"),
+    "h": Variable("m", "measured height above the ellipsoid; GNSS: of the antenna"),
     "v_n": Variable("m/s", "velocity of the antenna over ground", ("ned",)),
     "sigma_position_n": Variable("m", "reported 1-sigma of position", ("ned",)),
     "sigma_velocity_n": Variable("m/s", "reported 1-sigma of velocity", ("ned",)),
@@ -134,6 +136,8 @@ SAMPLE = {
     "pressure": Variable("Pa", "measured static pressure"),
     "field_b": Variable("T", "measured magnetic flux density", ("body",)),
     "eas": Variable("m/s", "measured equivalent airspeed along body x"),
+    "v_b": Variable("m/s", "measured velocity over ground, NaN on axes that are not measured", ("body",)),
+    "q_ib": Variable("1", "measured attitude quaternion, scalar first", ("inertial_quaternion",)),
 }
 
 ESTIMATE = {
@@ -181,6 +185,8 @@ EXTRA = {
     "wind": Variable("m/s", "estimated velocity of the air over ground, without gusts", ("north_east",)),
     "gust": Variable("m/s", "estimated gust beside the steady wind", ("north_east",)),
     "airspeed_scale": Variable("1", "estimated scale factor error of the airspeed sensor"),
+    "body_velocity_scale": Variable("1", "estimated scale factor error of the body velocity sensor", ("body_axis",)),
+    "body_velocity_error": Variable("m/s", "estimated correlated error of body velocity", ("body_axis",)),
 }
 
 # Unit of the innovation of each aid, and its components.
@@ -191,6 +197,11 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "barometer": ("m", ("component",)),
     "airspeed": ("m/s", ("component",)),
     "sideslip": ("m/s", ("component",)),
+    "body_velocity": ("m/s", ("component",)),
+    "nonholonomic": ("m/s", ("component",)),
+    "star_attitude": ("rad", ("body",)),
+    "position_fix": ("m", ("component",)),
+    "gnss_course": ("rad", ("component",)),
 }
 REPORT = {
     "nis": Variable("1", "normalised innovation squared"),
@@ -406,6 +417,7 @@ class Recorder:
             "estimated_point_b_m": json.dumps(
                 {own.name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m for own in scenario.estimator}
             ),
+            "estimator_imus": json.dumps({own.name: own.imu for own in scenario.estimator}),
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -454,7 +455,7 @@ def _euler_deg(q: Array) -> Array:
 def biases(run: _Run, name: str) -> Figure:
     """Estimated biases with ±3 sigma, over what the IMU's error really was where the record tells."""
     figure, axes = _figure(3, 2, head=0.75)
-    real = _imu_error(run)
+    real = _imu_error(run, name)
     scale = (np.rad2deg(3600.0), 1000 / earth.STANDARD_GRAVITY)
     t = run.estimate(name, "time")
     some = _stride(len(t))
@@ -485,11 +486,10 @@ def _focus_bias(ax: Axes, value: Array, real: Array) -> None:
         ax.set_ylim(low - margin, high + margin)
 
 
-def _imu_error(run: _Run) -> tuple[Array, Array, Array] | None:
-    """Times and mean error of rate [rad/s] and specific force [m/s^2] of the first recorded IMU, in steps of 10 s."""
-    sensors = run.dataset["sensors"].children if run.has("sensors") else {}
-    imu = next((name for name, node in sensors.items() if "dtheta" in node.data_vars), None)
-    if imu is None or len(run.t) < 3:
+def _imu_error(run: _Run, estimator: str) -> tuple[Array, Array, Array] | None:
+    """Times and mean error of rate [rad/s] and specific force [m/s^2] of an estimator's IMU, in steps of 10 s."""
+    imu = json.loads(run.dataset.attrs.get("estimator_imus", "{}")).get(estimator)
+    if imu is None or not run.has(f"sensors/{imu}") or len(run.t) < 3:
         return None
     t = column(run.dataset, f"sensors/{imu}/time")
     edges = np.arange(run.t[0], run.t[-1], 10.0)
@@ -525,7 +525,8 @@ def innovations(run: _Run, name: str) -> Figure | None:
             normalised = z / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
         limit = 1.6 * float(np.nanmax(gate)) if np.isfinite(gate).any() else 6.0
         shown = np.clip(normalised, -0.97 * limit, 0.97 * limit)
-        labels = ("north", "east", "down") if aid.startswith("gnss") else ("forward", "right", "down")
+        ned, body = ("north", "east", "down"), ("forward", "right", "down")
+        labels = ned if aid.startswith(("gnss", "position")) else body[1:] if aid == "nonholonomic" else body
         some = slice(None, None, max(1, len(t) // 4000))
         for k in range(z.shape[1]):
             label = labels[k] if z.shape[1] > 1 else None

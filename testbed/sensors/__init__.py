@@ -11,9 +11,12 @@ from typing import TypeAlias
 from testbed.schema import Section
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
 from testbed.sensors.barometer import Barometer, BarometerConfig
+from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
 from testbed.sensors.gnss import Gnss, GnssConfig
 from testbed.sensors.imu import Imu, ImuConfig
 from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig, Site, geomagnetic_field_n
+from testbed.sensors.position_fix import PositionFix, PositionFixConfig
+from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
 
 __all__ = [
     "CONFIGS",
@@ -26,8 +29,17 @@ __all__ = [
     "geomagnetic_field_n",
 ]
 
-SensorConfig: TypeAlias = ImuConfig | GnssConfig | MagnetometerConfig | BarometerConfig | AirspeedConfig
-AidingSensor: TypeAlias = Gnss | Magnetometer | Barometer | Airspeed
+SensorConfig: TypeAlias = (
+    ImuConfig
+    | GnssConfig
+    | MagnetometerConfig
+    | BarometerConfig
+    | AirspeedConfig
+    | BodyVelocityConfig
+    | StarTrackerConfig
+    | PositionFixConfig
+)
+AidingSensor: TypeAlias = Gnss | Magnetometer | Barometer | Airspeed | BodyVelocity | StarTracker | PositionFix
 Sensor: TypeAlias = Imu | AidingSensor
 
 # by kind
@@ -37,6 +49,9 @@ CONFIGS: dict[str, type[Section]] = {
     "magnetometer": MagnetometerConfig,
     "barometer": BarometerConfig,
     "airspeed": AirspeedConfig,
+    "body_velocity": BodyVelocityConfig,
+    "star_tracker": StarTrackerConfig,
+    "position_fix": PositionFixConfig,
 }
 
 
@@ -53,3 +68,9 @@ def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site:
             return Barometer(name, config, tick_rate_hz, seed)
         case AirspeedConfig():
             return Airspeed(name, config, tick_rate_hz, seed)
+        case BodyVelocityConfig():
+            return BodyVelocity(name, config, tick_rate_hz, seed)
+        case StarTrackerConfig():
+            return StarTracker(name, config, tick_rate_hz, seed)
+        case PositionFixConfig():
+            return PositionFix(name, config, tick_rate_hz, seed)

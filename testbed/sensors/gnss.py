@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from nav._jit import njit
 from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
@@ -21,7 +20,7 @@ from nav.samples import Array, FixType, GnssSample
 from testbed.schema import Section
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
-from testbed.sensors.timing import AidingTiming, Schedule
+from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
 from testbed.truth import TruthBlock
 
@@ -146,27 +145,13 @@ class GnssConfig(AidingTiming):
     reacquire_s: float = Field(0.0, ge=0, le=3600, description="from the end of denial to the first fix")
     settle_factor: float = Field(2.0, ge=1, le=100, description="errors and reported accuracy at the first fix")
     settle_s: float = Field(5.0, gt=0, le=3600, description="time constant of their return to normal")
-    denied: tuple[tuple[float, float], ...] = Field((), description="windows of simulated time without signals")
+    denied: Windows = Field((), description="windows of simulated time without signals")
     jammers: tuple[Jammer, ...] = ()
 
     @model_validator(mode="before")
     @classmethod
     def _on_top_of_grade(cls, data: Any) -> Any:
         return with_grade(data, GRADES, "standalone")
-
-    @field_validator("denied")
-    @classmethod
-    def _windows_in_order(cls, windows: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-        for start, end in windows:
-            if start < 0:
-                raise ValueError(f"window [{start:g}, {end:g}] starts before the run; times are seconds from its start")
-            if end <= start:
-                raise ValueError(f"window [{start:g}, {end:g}] ends before it starts; write [start, end] in seconds")
-        ordered = tuple(sorted(windows))
-        for (a, b), (c, d) in pairwise(ordered):
-            if c < b:
-                raise ValueError(f"windows [{a:g}, {b:g}] and [{c:g}, {d:g}] overlap; join them into one")
-        return ordered
 
     def errors(self) -> GnssErrors:
         """The same in SI."""
@@ -245,7 +230,7 @@ class Gnss:
             -(t - self._denied_until - config.reacquire_s) / config.settle_s
         )
         noise = noise * unsettled
-        lat, lon, h = _displaced(antenna[0], antenna[1], antenna[2], noise)
+        lat, lon, h = displaced(antenna[0], antenna[1], antenna[2], noise)
         satellites = max(MIN_SATELLITES, round((config.satellites + sky) / unsettled))
         dilution = math.sqrt(config.satellites / satellites)
         return GnssSample(
@@ -301,7 +286,7 @@ class Gnss:
 
 
 @njit
-def _displaced(lat: float, lon: float, h: float, d_n: Array) -> tuple[float, float, float]:
+def displaced(lat: float, lon: float, h: float, d_n: Array) -> tuple[float, float, float]:
     """(lat, lon, h) of a point ``d_n`` (3,) metres north, east, down of another, for small ``d_n``."""
     R_M, R_N = radii(lat)
     east = d_n[1] / ((R_N + h) * math.cos(lat))
@@ -335,7 +320,7 @@ def _antenna(
             rate, earth = quat_rotate(q_nb[k], omega_b[k]), earth_rate_n(lat[k])
             for c in range(3):
                 rate[c] -= earth[c]
-            out[i, 0], out[i, 1], out[i, 2] = _displaced(lat[k], lon[k], h[k], arm)
+            out[i, 0], out[i, 1], out[i, 2] = displaced(lat[k], lon[k], h[k], arm)
             out[i, 3] += rate[1] * arm[2] - rate[2] * arm[1]
             out[i, 4] += rate[2] * arm[0] - rate[0] * arm[2]
             out[i, 5] += rate[0] * arm[1] - rate[1] * arm[0]

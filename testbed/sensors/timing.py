@@ -2,15 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import pairwise
+from statistics import NormalDist
+from typing import Annotated, TypeAlias
 
-from pydantic import Field
+import numpy as np
+import numpy.typing as npt
+from pydantic import AfterValidator, Field
 
+from nav.samples import Array
 from testbed.errors import UserError
 from testbed.schema import Section
+from testbed.sensors.noise import Process, stream
+from testbed.sensors.units import PERCENT
 from testbed.truth import TruthBlock
 
 TICK_TOLERANCE = 1e-6  # of a tick: what 1/3 Hz and 0.1 s lose as decimal numbers
+
+
+def _in_order(windows: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    for start, end in windows:
+        if start < 0:
+            raise ValueError(f"window [{start:g}, {end:g}] starts before the run; times are seconds from its start")
+        if end <= start:
+            raise ValueError(f"window [{start:g}, {end:g}] ends before it starts; write [start, end] in seconds")
+    ordered = tuple(sorted(windows))
+    for (a, b), (c, d) in pairwise(ordered):
+        if c < b:
+            raise ValueError(f"windows [{a:g}, {b:g}] and [{c:g}, {d:g}] overlap; join them into one")
+    return ordered
+
+
+# Windows [start, end) of simulated time, sorted, apart from each other.
+Windows: TypeAlias = Annotated[tuple[tuple[float, float], ...], AfterValidator(_in_order)]
 
 
 def ticks_per_sample(name: str, rate_hz: float, tick_rate_hz: float) -> int:
@@ -57,3 +83,27 @@ class Schedule:
         """The rows of ``block`` on which the sensor reports."""
         wait = self.first - block.tick
         return range(wait if wait > 0 else wait % self.every, len(block), self.every)
+
+
+class InterruptedTiming(AidingTiming):
+    """The timing keys of a sensor that is silent at times: then it delivers nothing."""
+
+    denied: Windows = Field((), description="windows of simulated time without samples")
+    dropout_percent: float = Field(0.0, ge=0, lt=100, description="of the samples that are lost, each by itself")
+
+
+class Interruptions:
+    """Which samples of one sensor come through. ``kept`` is asked about every scheduled sample, once and in order."""
+
+    def __init__(self, name: str, timing: InterruptedTiming, seed: int) -> None:
+        share = timing.dropout_percent * PERCENT
+        self._denied = timing.denied
+        self._lost_below = NormalDist().inv_cdf(share) if share else -math.inf
+        self._luck = Process.white(stream(seed, name, "dropout"), [1.0 if share else 0.0])
+
+    def kept(self, t: Array) -> npt.NDArray[np.bool_]:
+        """Whether the samples at ``t`` (n,) [s] are delivered."""
+        kept: npt.NDArray[np.bool_] = self._luck.take(len(t))[:, 0] >= self._lost_below
+        for start, end in self._denied:
+            kept &= (t < start) | (t >= end)
+        return kept

@@ -10,6 +10,7 @@ from pydantic import Field
 from nav.earth import STANDARD_GRAVITY
 
 DEG = math.pi / 180  # rad
+ARCSEC = DEG / 3600  # rad
 DEG_PER_H = DEG / 3600  # rad/s
 DEG_PER_ROOT_H = DEG / 60  # rad/sqrt(s), angle random walk
 DEG_PER_H_PER_ROOT_H = DEG_PER_H / 60  # rad/s/sqrt(s), rate random walk

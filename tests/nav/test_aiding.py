@@ -4,14 +4,25 @@ import dataclasses
 import math
 
 import numpy as np
+import pymap3d
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nav import aiding
-from nav.earth import pressure_altitude, radii
-from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, ImuModel, sensor_errors
+from nav.earth import OMEGA_IE, pressure_altitude, quat_en, quat_ie, radii
+from nav.error_model import MOTION, PHI, POS, VEL, Block, ErrorModel, ImuModel, markov, sensor_errors
 from nav.ins import InsConfig
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise
-from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, MagnetometerSample
+from nav.samples import (
+    AirspeedSample,
+    BarometerSample,
+    BodyVelocitySample,
+    FixType,
+    GnssSample,
+    MagnetometerSample,
+    PositionSample,
+    StarSample,
+)
 
 IMU = ImuModel(1e-4, 1e-3, 1e-4, 0.05, 0, 0, 1e-5, 1e-3, 300.0, 300.0, 1e-3, 1e-3)
 CONFIG = InsConfig(
@@ -23,13 +34,14 @@ CONFIG = InsConfig(
     magnetometer_anomaly_sigma=1e-7,
     magnetometer_error_sigma=1e-7,
 )
-MODEL = ErrorModel(IMU, CONFIG.aid_blocks())
+BODY_VELOCITY = [Block("body_velocity_scale", 2, 0.01), markov("body_velocity_error", 2, 0.1, 300.0)]
+MODEL = ErrorModel(IMU, [*CONFIG.aid_blocks(), *BODY_VELOCITY])
 ARM = np.array([0.7, -0.3, -1.2])
 FIELD_N = np.array([28e-6, -2e-6, 40e-6])
 STEPS = {"phi": 1e-5, "dv": 1e-2, "dp": 1.0, "gyro_bias": 1e-3, "gyro_drift": 1e-3, "gyro_scale": 1e-3,
          "accel_bias": 1e-2, "accel_drift": 1e-2, "accel_scale": 1e-2, "magnetometer_bias": 1e-7,
          "magnetometer_anomaly": 1e-7, "magnetometer_error": 1e-7,
-         "airspeed_scale": 1e-3}  # fmt: skip
+         "airspeed_scale": 1e-3, "wind": 1e-2, "gust": 1e-2}  # fmt: skip
 
 
 def state(seed):
@@ -87,14 +99,57 @@ def sideslip(at):
     return aiding.sideslip(at[0], at[1], at[3], MODEL.start("wind"), MODEL.start("gust"))
 
 
+def body_velocity(at):
+    q, v_n, _, x, _ = at
+    starts = [MODEL.start(f"body_velocity_{name}") for name in ("scale", "error")]
+    return aiding.body_velocity(q, v_n, x, np.array([0, 2]), *starts, np.array([20.0, np.nan, 1.0]))
+
+
+def odometer(at):
+    return aiding.body_velocity(at[0], at[1], at[3], np.array([0]), -1, -1, np.array([5.0, np.nan, np.nan]))
+
+
+def nonholonomic(at):
+    return aiding.nonholonomic(at[0], at[1], at[3])
+
+
+def star_attitude(at):
+    return aiding.star_attitude(at[0], at[2], at[3], STAR_TIME, FIX["q_ib"])
+
+
+def position_fix(at):
+    return aiding.position_fix(at[2], at[3], FIX["lat"], FIX["lon"], FIX["h"])
+
+
+def flat_position_fix(at):
+    return aiding.position_fix(at[2], at[3], FIX["lat"], FIX["lon"], math.nan)
+
+
+def gnss_course(at):
+    """Course from heading and drift, near the prediction."""
+    q, v_n, _, x, _ = at
+    return aiding.gnss_course(q, v_n, x, MODEL.start("wind"), MODEL.start("gust"), FIX["course_v_n"])
+
+
+def gnss_course_as_heading(at):
+    return aiding.gnss_course(at[0], at[1], at[3], -1, -1, FIX["course_v_n"])
+
+
 FIX = {}
+STAR_TIME = 3000.0
+AIDS = [
+    gnss_position, gnss_velocity, barometer, magnetometer, airspeed, sideslip, body_velocity, odometer, nonholonomic,
+    star_attitude, position_fix, flat_position_fix, gnss_course, gnss_course_as_heading,
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("aid", [gnss_position, gnss_velocity, barometer, magnetometer, airspeed, sideslip])
+@pytest.mark.parametrize("aid", AIDS)
 @pytest.mark.parametrize("seed", range(5))
 def test_jacobian(aid, seed):
     at = state(seed)
-    FIX.update(lat=at[2][0] + 1e-6, lon=at[2][1] - 1e-6, h=at[2][2] + 3)
+    FIX.update(lat=at[2][0] + 1e-6, lon=at[2][1] - 1e-6, h=at[2][2] + 3, course_v_n=np.array([15.0, 2.0, 0.0]))
+    q_in = quat_multiply(quat_ie(STAR_TIME), quat_en(at[2][0], at[2][1]))
+    FIX["q_ib"] = quat_multiply(q_in, quat_multiply(at[0], quat_from_rotvec(np.array([1e-6, -2e-6, 3e-6]))))
     nu, H = aid(at)
     scale = max(1e-12, np.abs(H[:, :MOTION]).max())
     for block in MODEL.blocks:
@@ -119,6 +174,73 @@ def test_density_is_in_the_airspeed_jacobian():
     expected = (airspeed(displaced(at, -delta))[0] - airspeed(displaced(at, delta))[0]) / 2
     assert H[0, POS + 2] == pytest.approx(expected[0], rel=1e-3)
     assert abs(H[0, POS + 2]) > 1e-5
+
+
+def scipy_rotation(q):
+    return Rotation.from_quat(q, scalar_first=True)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_body_velocity_is_what_scipy_says(seed):
+    q, v_n, lla, x, _ = state(seed)
+    v_b = scipy_rotation(q).inv().apply(v_n)
+    scale, error = (x[MODEL.slices[f"body_velocity_{name}"]] for name in ("scale", "error"))
+    measured = (1 + scale) * v_b[[0, 2]] + error
+    nu, _ = body_velocity((q, v_n, lla, x, None))
+    np.testing.assert_allclose(nu, [20.0, 1.0] - measured, atol=1e-12)
+    assert odometer((q, v_n, lla, x, None))[0] == pytest.approx([5.0 - v_b[0]], abs=1e-12)
+    np.testing.assert_allclose(nonholonomic((q, v_n, lla, x, None))[0], -v_b[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_star_attitude_tells_tilt_and_place(seed):
+    """The truth by scipy and pymap3d; then wrong attitude and position, and what must be seen of them."""
+    q, v_n, lla, x, _ = state(seed)
+    at = pymap3d.geodetic2ecef(*lla, deg=False)
+    axes = [np.subtract(pymap3d.ned2ecef(*100 * axis, *lla, deg=False), at) / 100 for axis in np.eye(3)]
+    C_en = Rotation.from_matrix(np.array(axes).T)
+    C_ib = Rotation.from_rotvec([0, 0, OMEGA_IE * STAR_TIME]) * C_en * scipy_rotation(q)
+    FIX["q_ib"] = C_ib.as_quat(scalar_first=True)
+    np.testing.assert_allclose(star_attitude((q, v_n, lla, x, None))[0], 0.0, atol=1e-9)
+    rng = np.random.default_rng(seed)
+    delta = np.zeros(MODEL.size)
+    delta[PHI : PHI + 3], delta[POS : POS + 3] = 1e-4 * rng.normal(size=3), 300 * rng.normal(size=3)
+    nu, H = star_attitude(displaced((q, v_n, lla, x, None), delta))
+    phi = delta[PHI : PHI + 3]
+    R_M, R_N = radii(lla[0])
+    dlat, dlon = delta[POS] / (R_M + lla[2]), delta[POS + 1] / ((R_N + lla[2]) * np.cos(lla[0]))
+    # Cui 2022's dP in east-north-up is (-dL, dlon cos L, dlon sin L)
+    turned = np.array([dlon * np.cos(lla[0]), -dlat, -dlon * np.sin(lla[0])])
+    expected = scipy_rotation(q).inv().apply(phi - turned)
+    np.testing.assert_allclose(nu, expected, atol=2e-7)
+    np.testing.assert_allclose(nu, -H @ delta, atol=2e-7)
+
+
+def test_course_is_heading_and_drift():
+    """North-east by the nose at 20 m/s, wind from the west at 5: course by the wind triangle; and the sign of phi."""
+    heading, pitch, air = math.radians(45), math.radians(5), 20.0
+    q = Rotation.from_euler("ZYX", [heading, pitch, 0.1]).as_quat(scalar_first=True)
+    wind = MODEL.start("wind")
+    x = np.zeros(MODEL.size)
+    x[wind + 1] = 5.0
+    v_n = np.array([air * math.cos(heading), air * math.sin(heading) + 5, 0.0])
+    course = math.atan2(v_n[1], v_n[0])
+    assert math.degrees(course - heading) == pytest.approx(8.5, abs=0.1)
+    nu, _ = aiding.gnss_course(q, v_n, x, wind, -1, v_n)
+    assert nu[0] == pytest.approx(0, abs=1e-12)
+    nu, H = aiding.gnss_course(q, v_n, x, -1, -1, v_n)
+    assert nu[0] == pytest.approx(course - heading, abs=1e-12)  # the drift, taken for an error of heading
+    assert H[0, PHI + 2] == -1.0
+    assert not H[0, VEL : VEL + 3].any()
+    backwards = aiding.gnss_course(q, v_n, x, -1, -1, np.array([-1.0, -0.9, 0.0]))[0][0]
+    assert -math.pi < backwards <= math.pi
+    assert backwards == pytest.approx(math.atan2(-0.9, -1.0) - heading + 2 * math.pi, abs=1e-12)
+
+
+def test_axes_that_a_sample_has():
+    sample = BodyVelocitySample(1.0, 1.0, np.array([3.0, NAN, 0.0]))
+    assert aiding.measures(sample, np.array([0, 2]))
+    assert not aiding.measures(sample, np.array([0, 1]))
 
 
 GOOD = GnssSample(1.0, 1.0, 0.8, 0.2, 500.0, np.array([20.0, 1.0, 0.0]), np.ones(3), np.full(3, 0.1),
@@ -149,6 +271,21 @@ NAN = math.nan
         (AirspeedSample(1.0, 1.0, 25.0), ""),
         (AirspeedSample(1.0, 1.0, -math.inf), "airspeed is not finite"),
         (AirspeedSample(1.0, 1.0, 900.0), "airspeed 900 is out of range"),
+        (BodyVelocitySample(1.0, 1.0, np.array([20.0, 1.0, 0.5])), ""),
+        (BodyVelocitySample(1.0, 1.0, np.array([20.0, NAN, NAN])), ""),
+        (BodyVelocitySample(1.0, 1.0, np.full(3, NAN)), "velocity is not finite"),
+        (BodyVelocitySample(1.0, 1.0, np.array([NAN, math.inf, 0.0])), "speed is not finite"),
+        (BodyVelocitySample(1.0, 1.0, np.array([-700.0, NAN, NAN])), "speed 700 is out of range"),
+        (StarSample(1.0, 1.0, np.array([0.6, 0.0, -0.8, 0.0])), ""),
+        (StarSample(1.0, 1.0, np.array([0.6, 0.0, NAN, 0.0])), "norm of the quaternion is not finite"),
+        (StarSample(1.0, 1.0, np.zeros(4)), "norm of the quaternion 0 is out of range"),
+        (StarSample(NAN, 1.0, np.array([1.0, 0.0, 0.0, 0.0])), "time is not finite"),
+        (PositionSample(1.0, 1.0, 0.8, 0.2, 500.0), ""),
+        (PositionSample(1.0, 1.0, 0.8, 0.2, NAN), ""),
+        (PositionSample(1.0, 1.0, 0.8, NAN, NAN), "position is not finite"),
+        (PositionSample(1.0, 1.0, 0.8, 0.2, math.inf), "position is not finite"),
+        (PositionSample(1.0, 1.0, 0.8, 7.0, NAN), "position is out of range"),
+        (PositionSample(1.0, 1.0, 0.8, 0.2, 9e4), "height 90000 is out of range"),
     ],
 )
 def test_broken_samples_are_named(sample, reason):

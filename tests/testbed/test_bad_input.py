@@ -68,6 +68,22 @@ def line_of(text: str, start: str) -> int:
         ("[sensors.gnss]", '[sensors."a/b"]\nkind = "gnss"', 'sensors."a/b": a sensor\'s name is made of letters'),
         ("[sensors.imu]", "[sensors.imu]\ngrade_ = 3", "sensors.imu.grade_: unknown key: did you mean grade"),
         ('grade = "mems-industrial"', 'grade = "mems-industrail"', "sensors.imu.grade: can't be"),
+        ("[sensors.gnss]", "[sensors.dvl]", 'sensors.dvl: there is no sensor of kind "dvl": choose from '),
+        (
+            "[sensors.gnss]",
+            "[sensors.body_velocity]\naxes = []\n[sensors.gnss]",
+            "sensors.body_velocity.axes: must name each measured axis once",
+        ),
+        (
+            "[sensors.gnss]",
+            "[sensors.star_tracker]\nboresight = 'up'\n[sensors.gnss]",
+            'sensors.star_tracker.boresight: can\'t be "up": choose from forward, right, down',
+        ),
+        (
+            "[sensors.gnss]",
+            "[sensors.position_fix]\ntransponder = { lat_deg = 47.0, lon_deg = 8.0 }\n[sensors.gnss]",
+            "sensors.position_fix.transponder.range_m: is missing: add it",
+        ),
         ('name = "ins"', 'name = "my ins"', "estimator[0].name: is made of letters"),
         ('name = "ins"', 'name = "run"', "estimator[0].name: 'run' is reserved"),
         ('kind = "ins"', 'kind = "ukf"', 'estimator[0].kind: can\'t be "ukf": choose from ins'),
@@ -190,6 +206,11 @@ def test_same_name_for_two_estimators() -> None:
 def test_two_aids_of_a_kind() -> None:
     message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
     assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message
+
+
+def test_a_sensor_that_is_no_aid_of_the_estimator() -> None:
+    message = complaint(U_TURN, "sensors.star_tracker={}", 'estimator.ins.aids=["gnss", "star_tracker"]')
+    assert "'star_tracker' is of kind 'star_tracker', which does not aid 'ins'" in message
 
 
 def test_a_plan_belongs_to_a_flight_and_a_flight_to_a_plan() -> None:
