@@ -28,8 +28,23 @@ from nav.local_filter import (
     MagnetometerAid,
     Policy,
     aid_blocks,
+    refusals,
 )
-from nav.reference import PREDICTED_PERIODS, REPORTED, FieldModel, Reference, State, describe
+from nav.reference import (
+    BAD_SAMPLE_S,
+    FUSED,
+    PREDICTED_PERIODS,
+    RECENT_S,
+    REPORTED,
+    TIME_TOLERANCE,
+    UNAIDED,
+    FieldModel,
+    Reference,
+    State,
+    align,
+    describe,
+    forget,
+)
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -45,10 +60,6 @@ from nav.samples import (
 )
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
-RECENT_S = 2.0  # a position this fresh counts as aided
-FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
-BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
-TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 
 KINDS = {
     GnssSample: "gnss",
@@ -347,32 +358,3 @@ class Ins:
         x = state.x[0]
         x[: len(state.imu)] = state.imu
         return replace(estimate, extra={name: (x[where], sigma[where]) for name, where in self._extra})
-
-
-def align(alignment: Alignment, reference: Reference, sample: Sample) -> InitialState | None:
-    """Give a sound sample to the alignment; the initial state once it is known."""
-    if isinstance(sample, MagnetometerSample):
-        alignment.add_field(sample.field_b)
-    elif isinstance(sample, GnssSample):
-        place = np.array([sample.lat, sample.lon, sample.h])
-        return alignment.add_gnss(sample, reference.field_n(place) if reference.has_field else None)
-    return None
-
-
-def refusals(sample: Sample, aid: Aid, reason: str, now: float) -> list[UpdateReport]:
-    """Reports on a sample that is not used, without innovations (NaN): one for each part of it."""
-    t = sample.t if math.isfinite(sample.t) else now
-    return [
-        UpdateReport(
-            t, sample.sensor, part, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan, 0.0, reason
-        )
-        for part, m in aid.parts
-    ]
-
-
-def forget(P: Array, start: int, variance: Array) -> None:
-    """Give a block of states new variances, independent of all others."""
-    block = slice(start, start + len(variance))
-    P[block, :] = 0.0
-    P[:, block] = 0.0
-    P[block, block] = np.diag(variance)

@@ -14,15 +14,19 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from nav._jit import inlined, njit
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT, InitialState
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT, Alignment, InitialState
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors, transition
 from nav.kalman import correct, innovate, predict
 from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
-from nav.samples import Array, Estimate, ImuSamples, Status
+from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.strapdown import step
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
+RECENT_S = 2.0  # a position this fresh counts as aided
+FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
+BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
+TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
 
 # Order of the covariance in an estimate; and the blocks that have a place of their own there
@@ -66,7 +70,7 @@ class Reference:
     """
 
     def __init__(
-        self, models: Sequence[ErrorModel], shares: Sequence[float], period: int, field_n: FieldModel | None
+        self, models: Sequence[ErrorModel], shares: Sequence[float] | Array, period: int, field_n: FieldModel | None
     ) -> None:
         self.models, self.period = models, period
         self.common = models[0].mixing
@@ -196,6 +200,24 @@ def describe(
         extra={},
     )
     return estimate, sigma
+
+
+def align(alignment: Alignment, reference: Reference, sample: Sample) -> InitialState | None:
+    """Give a sound sample to the alignment; the initial state once it is known."""
+    if isinstance(sample, MagnetometerSample):
+        alignment.add_field(sample.field_b)
+    elif isinstance(sample, GnssSample):
+        place = np.array([sample.lat, sample.lon, sample.h])
+        return alignment.add_gnss(sample, reference.field_n(place) if reference.has_field else None)
+    return None
+
+
+def forget(P: Array, start: int, variance: Array) -> None:
+    """Give a block of states new variances, independent of all others."""
+    block = slice(start, start + len(variance))
+    P[block, :] = 0.0
+    P[:, block] = 0.0
+    P[block, block] = np.diag(variance)
 
 
 def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str) -> tuple[Array, Array]:
