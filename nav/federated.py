@@ -16,8 +16,9 @@ filter knows of its own aids given the common states is kept through any reset (
 Fusion is on the common states: the sub-block of P_i is taken, not that of its inverse, which marginalises the rest.
 
 Faults. Each part of a sensor's looks has a detector, which judges the innovation against its local filter; condemned
-axes are left out, and isolated when that lasts (`nav.local_filter.Watch`). While a part is isolated it is judged
-against the fused solution of the filters without an isolated part, since its own filter drifts, or is wrong. A fault
+axes are left out, and isolated when that lasts (`nav.local_filter.Watch`); a sensor with one part isolated on every
+axis is isolated as a whole. While any part of a sensor is isolated it is judged against the fused solution of the
+filters without an isolated part, since its own filter drifts, or is wrong. A fault
 that grows slowly has pulled its filter before it is found. Therefore on every isolation all filters start again from
 the fused solution of those without an isolated part, P_i = P_g / beta_i: what the faulty sensor told stays in none,
 nothing is counted twice, and the Markov errors of its aid go back to their first variance. With ``full_reset`` or
@@ -375,7 +376,9 @@ class Federated:
         withheld = withheld or look.withheld
         if look.withheld:
             return UpdateReport(t, sample.sensor, part, nu, S, nis, math.nan, 0.0, withheld)
-        changed_nu, changed_S = self._against_master(state, filter_, look) if watch.isolated.any() else (nu, S)
+        watches = self._parts(filter_, sample.sensor)
+        suspect = any(w.isolated.any() for w in watches)
+        changed_nu, changed_S = self._against_master(state, filter_, look) if suspect else (nu, S)
         was = watch.isolated
         decision, changed = watch.judge(changed_nu, changed_S, t)
         if changed:
@@ -383,16 +386,20 @@ class Federated:
             if (watch.isolated & ~was).any():
                 self._start_again(state, filter_, sample.sensor)
                 nu, S, nis = filter_.innovate(state, look)
+        out = any(w.isolated.all() for w in watches)
         used = decision.axis_mask & ~watch.isolated
         weight, reason = 0.0, withheld
-        if not withheld:
+        if not withheld and not out:
             weight, reason = filter_.take(self._reference, state, look, nu, S, used, watch.policy, t)
-        if watch.isolated.any():
+        if out or watch.isolated.any():
             reason = ISOLATED
         elif decision.alarm and not withheld:
             reason = OUTSIDE
         threshold = decision.threshold if math.isclose(decision.statistic, nis, rel_tol=1e-6) else math.nan
         return UpdateReport(t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
+
+    def _parts(self, filter_: LocalFilter, sensor: str) -> list[Watch]:
+        return [filter_.watches[sensor, part] for part, _ in filter_.aids[sensor].parts]
 
     def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
         """Innovation and covariance of a look against the fused solution of the healthy filters."""
