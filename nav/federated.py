@@ -25,8 +25,8 @@ nothing is counted twice, and the Markov errors of its aid go back to their firs
 ``partial`` a slow fault also reaches the other filters until it is found: where faults are to be told apart, use
 ``no_reset``. When all filters have an isolated part, they are left as they are.
 
-When no position was fused for ``patience_s`` while isolated receivers report, the filters were too sure of themselves:
-their positions and velocities are given up as in `nav.ins`, and the next fixes are believed.
+When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
+velocities are given up as in `nav.ins`, and the next fixes are believed.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from nav._jit import njit
 from nav.alignment import AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate
 from nav.error_model import POS, VEL, ImuModel
-from nav.kalman import invert
 from nav.local_filter import (
     ISOLATED,
     OUTSIDE,
     Aid,
     AirspeedAid,
+    Change,
     GnssAid,
     LocalFilter,
     Look,
@@ -87,6 +87,7 @@ Structure = Literal["no_reset", "full_reset", "partial"]
 Sharing = Literal["fixed", "by_covariance", "none"]
 Combination = Literal["information", "scalar", "covariance_intersection"]
 
+REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 LEAST_SHARE = 0.02  # of a filter when shares follow the covariances: it must be able to come back
 
 
@@ -117,7 +118,7 @@ class Config:
     fusion_period_s: float = 1.0  # at the first aiding epoch after this; 0 is at every one
     isolate_after: int = 3  # consecutive condemned looks
     readmit_after: int = 10  # consecutive sound looks
-    patience_s: float = 30.0  # without a fused position while isolated receivers report
+    patience_s: float = 30.0  # of refused positions and none fused
     covariance_period: int = 10  # IMU samples per covariance step
     mounting_sigma: float = 0.0  # between the axes of the IMU and of the body [rad]
     alignment_s: float = 2.0
@@ -187,14 +188,7 @@ class Federated:
         for local, filter_ in zip(config.locals, self.locals, strict=True):
             for watched in local.sensors:
                 self._users.setdefault(watched.aid.sensor, []).append(filter_)
-                for part, size in watched.aid.parts:
-                    filter_.watches[watched.aid.sensor, part] = Watch(
-                        watched.detector(),
-                        watched.policy() if watched.policy else None,
-                        size,
-                        config.isolate_after,
-                        config.readmit_after,
-                    )
+                filter_.watch(watched, config.isolate_after, config.readmit_after)
         self._reference = Reference(
             [f.model for f in self.locals], self._told_shares(), config.covariance_period, field_n
         )
@@ -202,6 +196,7 @@ class Federated:
         self._common = self._reference.common
         self._state: State | None = None
         self._last_bad = self._last_fused = -math.inf
+        self._refused_since = self._last_refused = -math.inf  # positions, without one fused in between
         self._fused_at = -math.inf
         self._aligning = self._alignment_aids()
         gnss = next((a for a in self._aligning.values() if isinstance(a, GnssAid)), GnssAid())
@@ -267,7 +262,7 @@ class Federated:
             (local.name, *key)
             for local, filter_ in zip(self.config.locals, self.locals, strict=True)
             for key, watch in filter_.watches.items()
-            if watch.isolated.any()
+            if watch.suspect
         ]
 
     def start(self, initial: InitialState) -> None:
@@ -361,7 +356,7 @@ class Federated:
             report = self._use_look(state, filter_, sample, part, look, withheld)
             if part == "gnss_position":
                 if report.weight > 0:
-                    self._last_fused = sample.t
+                    self._last_fused, self._last_refused = sample.t, -math.inf
                 else:
                     withheld = f"position {report.reason}"
                     self._recover(state, sample)
@@ -376,30 +371,25 @@ class Federated:
         withheld = withheld or look.withheld
         if look.withheld:
             return UpdateReport(t, sample.sensor, part, nu, S, nis, math.nan, 0.0, withheld)
-        watches = self._parts(filter_, sample.sensor)
-        suspect = any(w.isolated.any() for w in watches)
-        changed_nu, changed_S = self._against_master(state, filter_, look) if suspect else (nu, S)
-        was = watch.isolated
-        decision, changed = watch.judge(changed_nu, changed_S, t)
+        watches = filter_.of_sensor[sample.sensor]
+        suspect = any(w.suspect for w in watches)
+        decision, changed = watch.judge(*(self._against_master(state, filter_, look) if suspect else (nu, S)), t)
         if changed:
             self._note(t, filter_, sample.sensor, part, watch)
-            if (watch.isolated & ~was).any():
+            if changed is Change.ISOLATED:
                 self._start_again(state, filter_, sample.sensor)
                 nu, S, nis = filter_.innovate(state, look)
-        out = any(w.isolated.all() for w in watches)
-        used = decision.axis_mask & ~watch.isolated
+        suspect, out = any(w.suspect for w in watches), any(w.out for w in watches)
         weight, reason = 0.0, withheld
         if not withheld and not out:
+            used = decision.axis_mask & ~watch.isolated if suspect else decision.axis_mask
             weight, reason = filter_.take(self._reference, state, look, nu, S, used, watch.policy, t)
-        if out or watch.isolated.any():
+        if out or watch.suspect:
             reason = ISOLATED
         elif decision.alarm and not withheld:
             reason = OUTSIDE
         threshold = decision.threshold if math.isclose(decision.statistic, nis, rel_tol=1e-6) else math.nan
         return UpdateReport(t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
-
-    def _parts(self, filter_: LocalFilter, sensor: str) -> list[Watch]:
-        return [filter_.watches[sensor, part] for part, _ in filter_.aids[sensor].parts]
 
     def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
         """Innovation and covariance of a look against the fused solution of the healthy filters."""
@@ -413,7 +403,7 @@ class Federated:
 
     def _healthy(self) -> Array:
         """1 for each local filter without an isolated part, 0 for the others."""
-        return np.array([not any(w.isolated.any() for w in f.watches.values()) for f in self.locals], dtype=float)
+        return np.array([not any(w.suspect for w in f.watches.values()) for f in self.locals], dtype=float)
 
     def _note(self, t: float, filter_: LocalFilter, sensor: str, part: str, watch: Watch) -> None:
         name = self.config.locals[filter_.row].name
@@ -435,21 +425,21 @@ class Federated:
             reset(state.x[i], state.P[i], master.x, master.P / share)
 
     def _recover(self, state: State, sample: Sample) -> None:
-        """Give up positions and velocities when nothing but an isolated receiver has told any for long."""
+        """Give up positions and velocities when every fix was refused for long."""
         config = self.config
-        if sample.t - self._last_fused < config.patience_s:
+        if sample.t - self._last_refused > REFUSAL_GAP_S:
+            self._refused_since = sample.t
+        self._last_refused = sample.t
+        if sample.t - self._refused_since < config.patience_s:
             return
-        for filter_ in self.locals:
-            for (sensor, part), watch in list(filter_.watches.items()):
-                aid = filter_.aids[sensor]
-                if isinstance(aid, GnssAid) and watch.isolated.any():
-                    detector = next(w.detector for w in config.locals[filter_.row].sensors if w.aid.sensor == sensor)
-                    fresh = replace(watch, detector=detector())
-                    filter_.watches[sensor, part] = fresh
-                    self._note(sample.t, filter_, sensor, part, fresh)
-        # from here on by the sample itself
+        for filter_, local in zip(self.locals, config.locals, strict=True):
+            for watched in local.sensors:
+                if isinstance(watched.aid, GnssAid) and any(w.suspect for w in filter_.of_sensor[watched.aid.sensor]):
+                    filter_.watch(watched, config.isolate_after, config.readmit_after)
+                    for part, watch in zip(watched.aid.parts, filter_.of_sensor[watched.aid.sensor], strict=True):
+                        self._note(sample.t, filter_, watched.aid.sensor, part[0], watch)
         self._widen(state, sample)
-        self._last_fused = sample.t
+        self._last_refused = -math.inf
 
     def _widen(self, state: State, sample: Sample) -> None:
         filter_ = self._users[sample.sensor][0]
@@ -564,18 +554,34 @@ def weights_eq13(P: Array, common: int, members: Array) -> Array:
 
 @njit
 def _scaled_inverse(P: Array, common: int) -> tuple[Array, bool]:
-    """Inverse (common, common) of the common block, through one with unit diagonal: its units differ by 1e12."""
-    scaled, scale = np.empty((common, common)), np.empty(common)
+    """Inverse (common, common) of the common block, and whether it was positive definite.
+
+    By Gauss and Jordan in place, which needs no pivoting then, on the block scaled to a unit diagonal: the units of the
+    states differ by 1e12.
+    """
+    A, scale = np.empty((common, common)), np.empty(common)
     for i in range(common):
         scale[i] = 1.0 / math.sqrt(P[i, i]) if P[i, i] > 0.0 else 0.0
     for i in range(common):
         for j in range(common):
-            scaled[i, j] = P[i, j] * scale[i] * scale[j]
-    inverse, definite = invert(scaled)
-    for i in range(common):
+            A[i, j] = P[i, j] * scale[i] * scale[j]
+    for k in range(common):
+        if not A[k, k] > 0.0:
+            return A, False
+        over = 1.0 / A[k, k]
+        A[k, k] = 1.0
         for j in range(common):
-            inverse[i, j] *= scale[i] * scale[j]
-    return inverse, definite
+            A[k, j] *= over
+        for i in range(common):
+            if i != k:
+                a = A[i, k]
+                A[i, k] = 0.0
+                for j in range(common):
+                    A[i, j] -= a * A[k, j]
+    for i in range(common):
+        for j in range(i + 1):
+            A[i, j] = A[j, i] = 0.5 * (A[i, j] + A[j, i]) * scale[i] * scale[j]
+    return A, True
 
 
 @njit

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import Enum
 from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias
 
@@ -302,39 +303,49 @@ class Watched:
     policy: Callable[[], Policy] | None = None
 
 
-@dataclass
+class Change(Enum):
+    """What a look changed in the isolation of its sensor; NONE is false."""
+
+    NONE = ""
+    ISOLATED = "isolated"
+    READMITTED = "readmitted"
+
+    def __bool__(self) -> bool:
+        return self is not Change.NONE
+
+
 class Watch:
     """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
     consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
+    ``suspect`` says that some axis is isolated, ``out`` that every one is.
     """
 
-    detector: Detector
-    policy: Policy | None
-    size: int
-    isolate_after: int
-    readmit_after: int
-    isolated: Mask = field(init=False)
-    _bad: Array = field(init=False)
-    _good: Array = field(init=False)
+    def __init__(
+        self, detector: Detector, policy: Policy | None, size: int, isolate_after: int, readmit_after: int
+    ) -> None:
+        self.detector, self.policy = detector, policy
+        self._isolate_after, self._readmit_after = isolate_after, readmit_after
+        self.isolated: Mask = np.full(size, False)
+        self.suspect = self.out = False
+        self._bad, self._good = np.zeros(size), np.zeros(size)
+        self._clean = True
 
-    def __post_init__(self) -> None:
-        self.isolated = np.full(self.size, False)
-        self._bad, self._good = np.zeros(self.size), np.zeros(self.size)
-
-    def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, bool]:
-        """The detector's decision on one look, and whether the isolated axes are others than before."""
+    def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
+        """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
         decision = self.detector.step(nu, S, t)
-        if not decision.alarm and not self.isolated.any():
-            self._bad[:] = 0.0
-            return decision, False
-        sound = decision.axis_mask
+        if not decision.alarm and self._clean:
+            return decision, Change.NONE
+        sound, before = decision.axis_mask, self.isolated
         self._bad = np.where(sound, 0.0, self._bad + 1.0)
         self._good = np.where(sound, self._good + 1.0, 0.0)
-        before = self.isolated
-        self.isolated = np.where(before, self._good < self.readmit_after, self._bad >= self.isolate_after)
-        return decision, bool((before != self.isolated).any())
+        self.isolated = np.where(before, self._good < self._readmit_after, self._bad >= self._isolate_after)
+        self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
+        self._clean = not self.suspect and not self._bad.any()
+        if (self.isolated & ~before).any():
+            return decision, Change.ISOLATED
+        return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
 
 
 class LocalFilter:
@@ -352,8 +363,18 @@ class LocalFilter:
         self.model = ErrorModel(imu, aid_blocks(aids))
         self.gate, self.row, self.closed = gate, row, closed
         self.watches: dict[tuple[str, str], Watch] = {}
+        self.of_sensor: dict[str, list[Watch]] = {}
         self.policies: Mapping[str, Policy] = {}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
+
+    def watch(self, watched: Watched, isolate_after: int, readmit_after: int) -> None:
+        """Watch each part of a sensor's looks, from a clean record."""
+        sensor, policy = watched.aid.sensor, watched.policy
+        for part, size in watched.aid.parts:
+            self.watches[sensor, part] = Watch(
+                watched.detector(), policy() if policy else None, size, isolate_after, readmit_after
+            )
+        self.of_sensor[sensor] = [self.watches[sensor, part] for part, _ in watched.aid.parts]
 
     def look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
         """One part of a sample at the nominal state and the filter's own errors of aids."""
@@ -404,18 +425,18 @@ class LocalFilter:
         t: float,
     ) -> tuple[float, str]:
         """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason)."""
+        if policy is None and used.all():
+            self.absorb(reference, state, nu, look.H, look.R, math.inf)
+            return 1.0, ""
         R = look.R
         if policy is not None and used.any():
             R = policy.adapt(nu, S, R, t)
             used = used & np.isfinite(R)
             if not used.any():
                 return 0.0, LEFT_OUT
-        if used.all():
-            self.absorb(reference, state, nu, look.H, R, math.inf)
-        elif used.any():
+        if used.any():
             self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf)
-        weight = 1.0 if R is look.R and used.all() else float(np.mean(np.where(used, look.R / R, 0.0)))
-        return weight, ""
+        return float(np.mean(np.where(used, look.R / R, 0.0))), ""
 
 
 @njit
