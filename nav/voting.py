@@ -86,8 +86,8 @@ class Voter:
         gyro, accel = imu.gyro_bias_sigma**2 + imu.gyro_noise**2 / T, imu.accel_bias_sigma**2 + imu.accel_noise**2 / T
         variance = np.repeat([gyro, accel], 3)
         threshold = chi_square_threshold(self.false_alarm, 6)
-        finite = np.isfinite(y).all(axis=1)
-        failed: Mask = np.logical_or(self._failed, ~finite)
+        finite: Mask = np.isfinite(y).all(axis=1)
+        failed: Mask = self._failed | ~finite
         if failed.all():  # whatever still gives numbers is better than nothing
             failed = ~finite
         if failed.all():
