@@ -86,7 +86,7 @@ class Voter:
         gyro, accel = imu.gyro_bias_sigma**2 + imu.gyro_noise**2 / T, imu.accel_bias_sigma**2 + imu.accel_noise**2 / T
         variance = np.repeat([gyro, accel], 3)
         threshold = chi_square_threshold(self.false_alarm, 6)
-        finite: Mask = np.isfinite(y).all(axis=1)
+        finite = np.array([bool(np.isfinite(row).all()) for row in y])
         failed: Mask = self._failed | ~finite
         if failed.all():  # whatever still gives numbers is better than nothing
             failed = ~finite
