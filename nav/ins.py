@@ -127,11 +127,13 @@ class InsConfig:
         if self.covariance_period < 1:
             raise ValueError("covariance_period is a number of samples, at least 1")
 
-    def aid_of(self, kind: str) -> Aid:
-        """An aid as a filter is told of it, its sensor by the name of its kind."""
+    def aid_of(self, kind: str, sensor: str = "") -> Aid:
+        """An aid as a filter is told of it, its sensor by the name of its kind unless it has another."""
+        name = sensor or kind
         match kind:
             case "gnss":
                 return GnssAid(
+                    name,
                     arm_b=self.gnss_arm_b,
                     use_velocity=self.gnss_use_velocity,
                     position_error_sigma=self.gnss_position_error_sigma,
@@ -141,10 +143,14 @@ class InsConfig:
                 )
             case "barometer":
                 return BarometerAid(
-                    sigma=self.barometer_sigma, bias_sigma=self.barometer_bias_sigma, bias_walk=self.barometer_bias_walk
+                    name,
+                    sigma=self.barometer_sigma,
+                    bias_sigma=self.barometer_bias_sigma,
+                    bias_walk=self.barometer_bias_walk,
                 )
             case "magnetometer":
                 return MagnetometerAid(
+                    name,
                     sigma=self.magnetometer_sigma,
                     bias_sigma=self.magnetometer_bias_sigma,
                     anomaly_sigma=self.magnetometer_anomaly_sigma,
@@ -152,6 +158,7 @@ class InsConfig:
                     error_correlation_s=self.magnetometer_error_correlation_s,
                 )
         return AirspeedAid(
+            name,
             sigma=self.airspeed_sigma,
             scale_sigma=self.airspeed_scale_sigma,
             minimum=self.airspeed_min,
