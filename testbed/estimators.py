@@ -11,12 +11,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+from nav.detection import ChiSquare, Detector, Eraim, Glr, Reset, Sprt, exponential
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
+from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.local_filter import Aid, Watched
 from nav.samples import Array, ImuSamples
-from testbed.scenario import AIDS, EstimatorConfig, Scenario
+from testbed.scenario import AIDS, DetectorConfig, EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -36,6 +39,7 @@ GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
+SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +67,8 @@ def _turned_back(C_sb: Array, x_s: Array) -> Array:
 
 def build(scenario: Scenario) -> dict[str, Running]:
     """The scenario's estimators by name, not yet aligned."""
-    return {config.name: _ins(config, scenario) for config in scenario.estimator}
+    kinds = {"ins": _ins, "federated": _federated}
+    return {config.name: kinds[config.kind](config, scenario) for config in scenario.estimator}
 
 
 def imu_model(errors: ImuErrors) -> ImuModel:
@@ -114,13 +119,29 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
         if section.kind in AIDS[config.kind]:
             offered.setdefault(section.kind, name)
     kinds: Mapping[str, SensorConfig] = {kind: scenario.sensors[name] for kind, name in offered.items()}
-    told: dict[str, object] = {}
     errors = imu.errors()
+    told = _told(kinds, errors, config.gust_mps)
+    ins = Ins(
+        InsConfig(imu_model(errors), aids, mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
+        partial(geomagnetic_field_n, date=scenario.date),
+    )
+    lag_s = max((section.latency_s for section in kinds.values() if not isinstance(section, ImuConfig)), default=0.0)
+    return Running(
+        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        config.imu,
+        errors.C_sb,
+        tuple(offered.values()),
+    )
+
+
+def _told(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float) -> dict[str, object]:
+    """The keys of `InsConfig` that one sensor of each kind decides on."""
+    told: dict[str, object] = {}
     gnss = kinds.get("gnss")
     if isinstance(gnss, GnssConfig):
         e = gnss.errors()
         told |= {
-            "gnss_arm_b": tuple(e.lever_arm_b - errors.lever_arm_b),
+            "gnss_arm_b": tuple(e.lever_arm_b - imu.lever_arm_b),
             "gnss_position_error_sigma": tuple(e.position_correlated_n),
             "gnss_position_error_correlation_s": e.position_tau,
             "gnss_velocity_error_sigma": tuple(e.velocity_correlated_n),
@@ -146,21 +167,77 @@ def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
     if isinstance(airspeed, AirspeedConfig):
         a = airspeed.errors()
         told |= {
-            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * config.gust_mps),
+            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * gust_mps),
             "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
-            "gust_sigma": config.gust_mps,
+            "gust_sigma": gust_mps,
             "gust_correlation_s": GUST_TIME_S,
             "wind_walk": WIND_WALK,
-            "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * config.gust_mps),
+            "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
         }
-    ins = Ins(
-        InsConfig(imu_model(errors), aids, mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
+    return told
+
+
+def _federated(config: EstimatorConfig, scenario: Scenario) -> Running:
+    """Local filters, each told of its own sensors as an INS would be."""
+    imu = scenario.sensors[config.imu]
+    assert isinstance(imu, ImuConfig)  # the scenario was checked
+    errors = imu.errors()
+
+    def aid(name: str) -> Aid:
+        section = scenario.sensors[name]
+        told = _told({section.kind: section}, errors, config.gust_mps)
+        return InsConfig(imu_model(errors), (section.kind,), **told).aid_of(section.kind, name)  # type: ignore[arg-type]
+
+    used = dict.fromkeys(name for local in config.locals for name in local.aids)
+    # Without a receiver or magnetometer among the aids, the first in the file serves the alignment.
+    for kind in ("gnss", "magnetometer"):
+        if all(scenario.sensors[name].kind != kind for name in used):
+            used |= dict.fromkeys([name for name, s in scenario.sensors.items() if s.kind == kind][:1])
+    aids = {name: aid(name) for name in used}
+    local_filters = tuple(
+        Local(
+            local.name,
+            tuple(Watched(aids[name], partial(_detector, local.detector)) for name in local.aids),
+            local.share,
+        )
+        for local in config.locals
+    )
+    federated = Federated(
+        Config(
+            imu_model(errors),
+            local_filters,
+            structure=config.structure,
+            sharing=config.sharing,
+            combination=config.combination,
+            retention=config.retention,
+            literal=config.literal,
+            fusion_period_s=config.fusion_period_s,
+            isolate_after=config.isolate_after,
+            readmit_after=config.readmit_after,
+            mounting_sigma=errors.accel_misalignment,
+            alignment_aids=tuple(aids.values()),
+        ),
         partial(geomagnetic_field_n, date=scenario.date),
     )
-    lag_s = max((section.latency_s for section in kinds.values() if not isinstance(section, ImuConfig)), default=0.0)
+    sections = [scenario.sensors[name] for name in used]
+    lag_s = max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)
     return Running(
-        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        FusionHorizon(federated, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
         config.imu,
         errors.C_sb,
-        tuple(offered.values()),
+        tuple(used),
     )
+
+
+def _detector(config: DetectorConfig) -> Detector:
+    """A detector as the scenario says. Evidence over looks is correlated: its alarms must be rarer."""
+    match config.kind:
+        case "chi_square":
+            return ChiSquare(config.false_alarm or SNAPSHOT_FALSE_ALARM)
+        case "eraim":
+            return Eraim(config.false_alarm or SNAPSHOT_FALSE_ALARM)
+        case "sprt":
+            mean = exponential(config.forgetting)
+            return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, mean, Reset(config.reset))
+        case "glr":
+            return Glr(config.false_alarm or GATHERED_FALSE_ALARM, config.window_s)

@@ -139,10 +139,11 @@ class _EventWatch:
 
     def report(self, estimator: str, report: UpdateReport) -> None:
         """An unsound sample is an event; the gate turns a sound one away now and then, so only a run of those is."""
-        key = (estimator, report.aid)
+        what = report.aid if report.aid.startswith(report.sensor) else f"{report.aid} of {report.sensor}"
+        key = (estimator, what)
         if report.weight > 0.0:
             if self.refusals.pop(key, 0) >= REFUSALS:
-                self.emit(report.t, "info", f"{estimator}: {report.aid} accepted again")
+                self.emit(report.t, "info", f"{estimator}: {what} accepted again")
         elif math.isnan(report.nis):
             key = (estimator, report.sensor)  # a sample may serve several aids
             if report.t - self.unsound.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
@@ -151,7 +152,7 @@ class _EventWatch:
         else:
             self.refusals[key] = self.refusals.get(key, 0) + 1
             if self.refusals[key] == REFUSALS:
-                text = f"{estimator}: {report.aid} refused {REFUSALS} times in a row, {report.reason}"
+                text = f"{estimator}: {what} refused {REFUSALS} times in a row, {report.reason}"
                 self.emit(report.t, "warning", text)
 
     def estimate(self, estimator: str, estimate: Estimate) -> None:

@@ -46,7 +46,15 @@ TickRate: TypeAlias = Annotated[float, Field(ge=50, le=1000)]
 Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt.date(WMM_YEARS[1], 1, 1))]
 
 # What each kind of estimator can be aided by.
-AIDS: Mapping[str, frozenset[str]] = {"ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"})}
+AIDS: Mapping[str, frozenset[str]] = {
+    "ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
+    "federated": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
+}
+# What no other kind of estimator has.
+FEDERATED_KEYS = (
+    "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after", "readmit_after",
+    "literal",
+)  # fmt: skip
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
@@ -125,14 +133,59 @@ def _sensor(table: object) -> Section:
     return CONFIGS[kind].model_validate(table, strict=True)
 
 
-class EstimatorConfig(Section):
-    """One ``[[estimator]]``: which IMU it integrates and which sensors aid it."""
+class DetectorConfig(Section):
+    """What judges the samples of a local filter; ``false_alarm`` is the probability per look (`nav.detection`)."""
+
+    kind: Literal["chi_square", "eraim", "sprt", "glr"] = "chi_square"
+    false_alarm: float | None = Field(default=None, gt=0, lt=0.5)
+    forgetting: float = Field(default=0.95, gt=0, lt=1, description="sprt: what a look leaves of the weight before it")
+    reset: Literal["none", "fast", "complete"] = "complete"
+    window_s: float = Field(default=40.0, gt=0, le=600, description="glr: how long ago the fault may have begun")
+
+    @model_validator(mode="after")
+    def _own_keys(self) -> Self:
+        for key, kind in (("forgetting", "sprt"), ("reset", "sprt"), ("window_s", "glr")):
+            if key in self.model_fields_set and kind != self.kind:
+                raise ValueError(f"{key} is a key of kind {kind!r}, not of {self.kind!r}: leave it out")
+        return self
+
+
+class LocalConfig(Section):
+    """One local filter of a federated estimator."""
 
     name: str
-    kind: Literal["ins"] = "ins"
+    aids: Annotated[tuple[str, ...], Field(min_length=1)]
+    share: float | None = Field(default=None, gt=0, le=1, description="of the information; all alike without")
+    detector: DetectorConfig = DetectorConfig()
+
+
+class EstimatorConfig(Section):
+    """One ``[[estimator]]``: which IMU it integrates and which sensors aid it.
+
+    A federated one lists its aids by local filter instead (`nav.federated.Config` explains its keys).
+    """
+
+    name: str
+    kind: Literal["ins", "federated"] = "ins"
     imu: str = "imu"
     aids: tuple[str, ...]
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
+    locals: tuple[LocalConfig, ...] = ()
+    structure: Literal["no_reset", "full_reset", "partial"] = "no_reset"
+    sharing: Literal["fixed", "by_covariance", "none"] = "fixed"
+    combination: Literal["information", "scalar", "covariance_intersection"] = "information"
+    retention: float = Field(default=0.5, ge=0, le=1, description="of a partial reset: 0 is none, 1 a full one")
+    fusion_period_s: float = Field(default=1.0, ge=0, le=60)
+    isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
+    readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
+    literal: bool = Field(default=False, description="weights of Zhu et al. 2020, equation 13, as they are printed")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _aids_by_local(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("kind") == "federated" and "aids" not in value:
+            return value | {"aids": ()}
+        return value
 
 
 class AutopilotConfig(Section):
@@ -397,15 +450,57 @@ def _estimator_faults(
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
     usable = [name for name, kind in kinds.items() if kind in AIDS[config.kind]]
+    if config.kind == "federated":
+        yield from _federated_faults(path, config, kinds, usable)
+        return
+    for key in FEDERATED_KEYS:
+        if key in config.model_fields_set:
+            yield (*path, key), f"is a key of kind 'federated', not of {config.kind!r}: leave it out"
+    yield from _aid_faults(path, config.kind, config.aids, kinds, usable)
     for index, aid in enumerate(config.aids):
-        if aid in sensors and aid not in usable:
-            yield (*path, "aids", index), f"{aid!r} is of kind {kinds[aid]!r}, which does not aid {config.kind!r}"
-        elif aid not in sensors:
-            yield (*path, "aids", index), _unknown("sensor", aid, usable)
-        elif aid in config.aids[:index]:
-            yield (*path, "aids", index), f"{aid!r} is listed twice"
-        elif kinds[aid] in [kinds.get(before) for before in config.aids[:index]]:
+        if aid in config.aids[:index] or aid not in usable:
+            continue
+        if kinds[aid] in [kinds.get(before) for before in config.aids[:index]]:
             yield (*path, "aids", index), f"{aid!r} is a second {kinds[aid]!r}: {config.kind!r} takes one of each kind"
+
+
+def _aid_faults(
+    path: KeyPath, kind: str, aids: Sequence[str], kinds: Mapping[str, str], usable: Sequence[str]
+) -> Iterator[tuple[KeyPath, str]]:
+    for index, aid in enumerate(aids):
+        if aid in kinds and aid not in usable:
+            yield (*path, "aids", index), f"{aid!r} is of kind {kinds[aid]!r}, which does not aid {kind!r}"
+        elif aid not in kinds:
+            yield (*path, "aids", index), _unknown("sensor", aid, usable)
+        elif aid in aids[:index]:
+            yield (*path, "aids", index), f"{aid!r} is listed twice"
+
+
+def _federated_faults(
+    path: KeyPath, config: EstimatorConfig, kinds: Mapping[str, str], usable: Sequence[str]
+) -> Iterator[tuple[KeyPath, str]]:
+    if "aids" in config.model_fields_set and config.aids:
+        yield (*path, "aids"), "a federated estimator lists its aids by local filter: move them into its locals"
+    if not config.locals:
+        yield (*path, "locals"), 'is missing: add local filters, such as [{ name = "gnss", aids = ["gnss"] }]'
+    names = [local.name for local in config.locals]
+    for index, local in enumerate(config.locals):
+        where = (*path, "locals", index)
+        if not _IDENTIFIER.fullmatch(local.name):
+            yield (*where, "name"), "is made of letters, digits and _, and does not begin with a digit"
+        elif local.name in names[:index]:
+            yield (*where, "name"), f"{local.name!r} is taken by a local filter above: give each its own name"
+        yield from _aid_faults(where, config.kind, local.aids, kinds, usable)
+    shares = [local.share for local in config.locals if local.share is not None]
+    if shares and (len(shares) < len(names) or abs(sum(shares) - 1) > 1e-6):
+        yield (*path, "locals"), f"the shares of all local filters must add up to 1, not {sum(shares):g}: or give none"
+    if config.combination == "information" and config.sharing == "none" and config.structure != "no_reset":
+        yield (
+            (*path, "sharing"),
+            f"structure {config.structure!r} would count the same information again and again: share it",
+        )
+    if config.combination != "information" and config.sharing != "none":
+        yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
 
 
 def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:

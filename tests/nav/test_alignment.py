@@ -66,7 +66,7 @@ def test_sigmas_are_honest_over_many_alignments(arm_b):
         state = ins._state
         where = np.r_[0:3, ins.model.slices["accel_bias"]]
         both = np.r_[wrong[6:9], estimate.accel_bias - accel_bias]
-        joint += both @ np.linalg.solve(state.P[np.ix_(where, where)], both) / runs
+        joint += both @ np.linalg.solve(state.P[0][np.ix_(where, where)], both) / runs
     low, high = chi2.ppf([0.005, 0.995], 3 * runs) / runs
     print("position, velocity, attitude", nees, "bounds", low, high, "attitude with accelerometer bias", joint)
     assert ((low < nees) & (nees < high)).all()

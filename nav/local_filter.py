@@ -1,0 +1,450 @@
+"""A local filter: aids with the states of their errors, a detector and a measurement policy for each kind of look.
+
+An aid is one sensor as the filter is told of it. A sample gives one or more looks (`Aid.parts`: a GNSS sample tells a
+position and a velocity), and each look goes the same way: innovation at the filter's own estimate, detector, policy,
+update. `nav.ins` closes a strapdown with one such filter, `nav.federated` with several.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from typing import NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from nav import aiding
+from nav._jit import njit
+from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask
+from nav.earth import pressure_altitude
+from nav.error_model import Block, ErrorModel, ImuModel, markov
+from nav.kalman import innovate
+from nav.reference import Reference, State, absorb
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    GnssSample,
+    MagnetometerSample,
+    Sample,
+    UpdateReport,
+)
+
+Axes: TypeAlias = tuple[float, float, float]
+
+WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+OUTSIDE, ISOLATED, LEFT_OUT = "outside the gate", "isolated", "left out by the measurement policy"
+
+
+class Policy(Protocol):
+    """What the variances of a look are worth: called after the detector and before the update."""
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """Variances (m,) to use for innovation ``nu`` (m,), S (m, m) = H P H' + diag(R); inf leaves an axis out."""
+        ...
+
+
+class Look(NamedTuple):
+    """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,), why it must not be used."""
+
+    nu: Array
+    H: Array
+    R: Array
+    withheld: str = ""
+
+
+class Seat(NamedTuple):
+    """Where an aid is looked at from: the nominal state, the filter's own states ``x`` (n,), where the aid's begin."""
+
+    reference: Reference
+    state: State
+    x: Array
+    starts: tuple[int, ...]
+
+
+class Aid(Protocol):
+    """One sensor as a filter is told of it."""
+
+    @property
+    def sensor(self) -> str:
+        """The sensor's name."""
+        ...
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """The looks that a sample gives, in their order, and the number of axes of each."""
+        ...
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The blocks that `look` needs the places of."""
+        ...
+
+    def blocks(self) -> list[Block]:
+        """The error states; one whose sigma is zero is left out."""
+        ...
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """One part of a sound sample, None when it has no such part."""
+        ...
+
+
+@dataclass(frozen=True)
+class GnssAid:
+    """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)."""
+
+    sensor: str = "gnss"
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to antenna [m]
+    use_velocity: bool = True
+    position_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m]
+    position_error_correlation_s: float = 100.0
+    velocity_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m/s]
+    velocity_error_correlation_s: float = 20.0
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        return (("gnss_position", 3), ("gnss_velocity", 3)) if self.use_velocity else (("gnss_position", 3),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return f"{self.sensor}_position_error", f"{self.sensor}_velocity_error"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        position, velocity = self.states
+        return [
+            markov(position, 3, self.position_error_sigma, self.position_error_correlation_s),
+            markov(velocity, 3, self.velocity_error_sigma, self.velocity_error_correlation_s),
+        ]
+
+    @cached_property
+    def arm(self) -> Array:
+        """IMU to antenna (3,) [m]."""
+        return np.array(self.arm_b, dtype=float)
+
+    @cached_property
+    def _correlated(self) -> tuple[Array, Array]:
+        return np.array(self.position_error_sigma) ** 2, np.array(self.velocity_error_sigma) ** 2
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, GnssSample)
+        state = seat.state
+        if part == "gnss_position":
+            nu, H = aiding.gnss_position(
+                state.q_nb, state.lla, seat.x, self.arm, seat.starts[0], sample.lat, sample.lon, sample.h
+            )
+            return Look(nu, H, _white(sample.sigma_position_n, self._correlated[0]))
+        if not aiding.has_velocity(sample):
+            return None
+        nu, H = aiding.gnss_velocity(
+            state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven,
+            self.arm, seat.starts[1], sample.v_n,
+        )  # fmt: skip
+        return Look(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]))
+
+
+@dataclass(frozen=True)
+class BarometerAid:
+    """Pressure altitude with a walking bias: weather and geoid, before the first GNSS height tells."""
+
+    sensor: str = "barometer"
+    sigma: float = 0.5  # [m]
+    bias_sigma: float = 300.0  # [m]
+    bias_walk: float = 0.03  # [m/sqrt(s)]
+
+    parts = (("barometer", 1),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return (f"{self.sensor}_bias",)
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        return [Block(self.states[0], 1, self.bias_sigma, self.bias_walk)]
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.array([self.sigma**2])
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, BarometerSample)
+        nu, H = aiding.barometer(seat.state.lla, seat.x, seat.starts[0], pressure_altitude(sample.pressure))
+        return Look(nu, H, self._R)
+
+
+@dataclass(frozen=True)
+class MagnetometerAid:
+    """Three axes; without a reference field it is not used."""
+
+    sensor: str = "magnetometer"
+    sigma: float = 0.5e-6  # [T]
+    bias_sigma: float = 1.0e-6  # hard iron left after calibration [T]
+    anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
+    error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
+    error_correlation_s: float = 30.0
+
+    parts = (("magnetometer", 3),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return f"{self.sensor}_bias", f"{self.sensor}_anomaly", f"{self.sensor}_error"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        bias, anomaly, error = self.states
+        return [
+            Block(bias, 3, self.bias_sigma),
+            Block(anomaly, 3, self.anomaly_sigma),
+            markov(error, 3, self.error_sigma, self.error_correlation_s),
+        ]
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.full(3, self.sigma**2)
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, MagnetometerSample)
+        state, (bias, anomaly, error) = seat.state, seat.starts
+        if not seat.reference.has_field:
+            return None
+        field_n = seat.reference.field_n(state.lla)
+        nu, H = aiding.magnetometer(state.q_nb, seat.x, bias, error, anomaly, field_n, sample.field_b)
+        return Look(nu, H, self._R)
+
+
+@dataclass(frozen=True)
+class AirspeedAid:
+    """Airspeed along body x, and the constraint of no sideslip (None leaves it out); a filter has one wind."""
+
+    sensor: str = "airspeed"
+    sigma: float = 0.5  # [m/s]
+    scale_sigma: float = 0.0  # [1]
+    minimum: float = 10.0  # equivalent; below it neither airspeed nor sideslip is used [m/s]
+    sideslip_sigma: float | None = 1.0  # [m/s]
+    wind_sigma: float = 8.0  # per horizontal axis, before anything is known [m/s]
+    wind_walk: float = 0.03  # [m/s/sqrt(s)]
+    gust_sigma: float = 0.0  # turbulence as a Markov part of the wind [m/s]
+    gust_correlation_s: float = 5.0
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        return (("airspeed", 1),) if self.sideslip_sigma is None else (("airspeed", 1), ("sideslip", 1))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return "wind", "gust", f"{self.sensor}_scale"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        wind, gust, scale = self.states
+        return [
+            Block(wind, 2, self.wind_sigma, self.wind_walk),
+            markov(gust, 2, self.gust_sigma, self.gust_correlation_s),
+            Block(scale, 1, self.scale_sigma),
+        ]
+
+    @cached_property
+    def _R(self) -> tuple[Array, Array]:
+        return np.array([self.sigma**2]), np.array([(self.sideslip_sigma or 0.0) ** 2])
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, AirspeedSample)
+        state, (wind, gust, scale) = seat.state, seat.starts
+        slow = "" if sample.eas >= self.minimum else "too slow for the pitot tube"
+        if part == "airspeed":
+            nu, H = aiding.airspeed(state.q_nb, state.v_n, state.lla, seat.x, wind, gust, scale, sample.eas)
+            return Look(nu, H, self._R[0], slow)
+        nu, H = aiding.sideslip(state.q_nb, state.v_n, seat.x, wind, gust)
+        return Look(nu, H, self._R[1], slow)
+
+
+def _white(sigma: Array, correlated_variance: Array) -> Array:
+    """The white part of a receiver's reported variance, when the correlated part is a state of the filter."""
+    reported = sigma * sigma
+    return np.maximum(reported - correlated_variance, WHITE_SHARE * reported)
+
+
+def aid_blocks(aids: Sequence[Aid]) -> list[Block]:
+    """The error states of several aids, each name once, none of sigma zero."""
+    blocks = {block.name: block for aid in aids for block in aid.blocks()}
+    return [block for block in blocks.values() if np.any(block.sigma)]
+
+
+def refusals(sample: Sample, aid: Aid, reason: str, now: float) -> list[UpdateReport]:
+    """Reports on a sample that is not used, without innovations (NaN): one for each part of it."""
+    t = sample.t if math.isfinite(sample.t) else now
+    return [
+        UpdateReport(
+            t, sample.sensor, part, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan, 0.0, reason
+        )
+        for part, m in aid.parts
+    ]
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A sensor of a local filter; detector and policy are made anew for each part of its looks."""
+
+    aid: Aid
+    detector: Callable[[], Detector] = lambda: ChiSquare(1e-3)
+    policy: Callable[[], Policy] | None = None
+
+
+class Change(Enum):
+    """What a look changed in the isolation of its sensor; NONE is false."""
+
+    NONE = ""
+    ISOLATED = "isolated"
+    READMITTED = "readmitted"
+
+    def __bool__(self) -> bool:
+        return self is not Change.NONE
+
+
+class Watch:
+    """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
+
+    A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
+    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
+    ``suspect`` says that some axis is isolated, ``out`` that every one is.
+    """
+
+    def __init__(
+        self, detector: Detector, policy: Policy | None, size: int, isolate_after: int, readmit_after: int
+    ) -> None:
+        self.detector, self.policy = detector, policy
+        self._isolate_after, self._readmit_after = isolate_after, readmit_after
+        self.isolated: Mask = np.full(size, False)
+        self.suspect = self.out = False
+        self._bad, self._good = np.zeros(size), np.zeros(size)
+        self._clean = True
+
+    def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
+        """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
+        decision = self.detector.step(nu, S, t)
+        if not decision.alarm and self._clean:
+            return decision, Change.NONE
+        sound, before = decision.axis_mask, self.isolated
+        self._bad = np.where(sound, 0.0, self._bad + 1.0)
+        self._good = np.where(sound, self._good + 1.0, 0.0)
+        self.isolated = np.where(before, self._good < self._readmit_after, self._bad >= self._isolate_after)
+        self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
+        self._clean = not self.suspect and not self._bad.any()
+        if (self.isolated & ~before).any():
+            return decision, Change.ISOLATED
+        return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
+
+
+class LocalFilter:
+    """One filter's aids and what becomes of their looks; the numbers are rows ``row`` of a `State`.
+
+    ``closed`` filters put each correction into the nominal state at once. Parts without a `Watch` pass the ``gate``.
+    """
+
+    def __init__(
+        self, imu: ImuModel, aids: Sequence[Aid], gate: ChiSquareGate, row: int = 0, closed: bool = True
+    ) -> None:
+        self.aids = {aid.sensor: aid for aid in aids}
+        if len(self.aids) < len(aids):
+            raise ValueError(f"a sensor is listed twice: {[aid.sensor for aid in aids]}")
+        self.model = ErrorModel(imu, aid_blocks(aids))
+        self.gate, self.row, self.closed = gate, row, closed
+        self.watches: dict[tuple[str, str], Watch] = {}
+        self.of_sensor: dict[str, list[Watch]] = {}
+        self.policies: Mapping[str, Policy] = {}
+        self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
+
+    def watch(self, watched: Watched, isolate_after: int, readmit_after: int) -> None:
+        """Watch each part of a sensor's looks, from a clean record."""
+        sensor, policy = watched.aid.sensor, watched.policy
+        for part, size in watched.aid.parts:
+            self.watches[sensor, part] = Watch(
+                watched.detector(), policy() if policy else None, size, isolate_after, readmit_after
+            )
+        self.of_sensor[sensor] = [self.watches[sensor, part] for part, _ in watched.aid.parts]
+
+    def look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
+        """One part of a sample at the nominal state and the filter's own errors of aids."""
+        return aid.look(part, sample, Seat(reference, state, state.x[self.row], self._starts[aid.sensor]))
+
+    def innovate(self, state: State, look: Look) -> tuple[Array, Array, float]:
+        """(nu, S, nis) of a look at the filter's own estimate."""
+        return _innovate(state.P[self.row], state.x[self.row], len(state.imu), look.H, look.R, look.nu)
+
+    def absorb(
+        self, reference: Reference, state: State, nu: Array, H: Array, R: Array, threshold: float
+    ) -> tuple[Array, float]:
+        """Correct if nis is at most ``threshold``; (S, nis). ``nu`` is at the filter's own estimate."""
+        s = state
+        return absorb(
+            s.q_nb, s.v_n, s.lla, s.imu, s.x[self.row], s.P[self.row], s.errors, reference.driven,
+            nu, H, R, threshold, self.closed,
+        )  # fmt: skip
+
+    def fuse(
+        self, reference: Reference, state: State, sample: Sample, part: str, look: Look, withheld: str = ""
+    ) -> UpdateReport:
+        """Gate, policy and correction of a closed filter, whatever ``withheld`` says against its use."""
+        withheld = withheld or look.withheld
+        threshold = self.gate.threshold(len(look.nu))
+        policy = self.policies.get(part)
+        if policy is not None:
+            S, nis = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf)
+            sound = not withheld and nis <= threshold
+            weight, reason = self.take(
+                reference, state, look, look.nu, S, np.full(len(look.nu), sound), policy, sample.t
+            )
+            reason = withheld or ("" if nis <= threshold else OUTSIDE) or reason
+            return UpdateReport(sample.t, sample.sensor, part, look.nu, S, nis, threshold, weight, reason)
+        S, nis = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf if withheld else threshold)
+        reason = withheld or ("" if nis <= threshold else OUTSIDE)
+        return UpdateReport(sample.t, sample.sensor, part, look.nu, S, nis, threshold, 0.0 if reason else 1.0, reason)
+
+    def take(
+        self,
+        reference: Reference,
+        state: State,
+        look: Look,
+        nu: Array,
+        S: Array,
+        used: Mask,
+        policy: Policy | None,
+        t: float,
+    ) -> tuple[float, str]:
+        """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason)."""
+        if policy is None and used.all():
+            self.absorb(reference, state, nu, look.H, look.R, math.inf)
+            return 1.0, ""
+        R = look.R
+        if policy is not None and used.any():
+            R = policy.adapt(nu, S, R, t)
+            used = used & np.isfinite(R)
+            if not used.any():
+                return 0.0, LEFT_OUT
+        if used.any():
+            self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf)
+        return float(np.mean(np.where(used, look.R / R, 0.0))), ""
+
+
+@njit
+def _innovate(P: Array, x: Array, common: int, H: Array, R: Array, nu: Array) -> tuple[Array, Array, float]:
+    """(innovation, S, nis) at nominal state plus ``x[:common]``, from the innovation ``nu`` (m,) at the nominal one."""
+    own = nu.copy()
+    for k in range(len(nu)):
+        for j in range(common):
+            own[k] -= H[k, j] * x[j]
+    S, _, _, nis = innovate(P, H, R, own)
+    return own, S, nis

@@ -1,0 +1,375 @@
+"""The strapdown that filters correct, and the covariances that ride on it.
+
+`Reference` integrates the increments of one IMU and takes any number of filters' covariances along with the same
+transition, formed once for all of them. The motion and the errors of the IMU are the *common* states, the first
+``common`` of every filter; behind them each filter has states of its own, the errors of its aids.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from nav._jit import inlined, njit
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT, Alignment, InitialState
+from nav.earth import radii, wrap_longitude
+from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors, transition
+from nav.kalman import correct, innovate, predict
+from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
+from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
+from nav.strapdown import step
+
+FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
+RECENT_S = 2.0  # a position this fresh counts as aided
+FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
+BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
+TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
+PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
+
+# Order of the covariance in an estimate; and the blocks that have a place of their own there
+ESTIMATE_ORDER = np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]
+REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
+
+FieldModel = Callable[[float, float, float], Array]
+
+
+@dataclass
+class State:
+    """Everything that moves: nominal motion and sensor errors, what the filters hold, and integrals still to be used.
+
+    ``x[i, :common]`` is what filter i would add to the nominal state, the estimated error with its sign turned; behind
+    that are the estimated errors of its own aids, whole values.
+    """
+
+    q_nb: Array
+    v_n: Array
+    lla: Array
+    imu: Array  # (common,) estimated sensor errors, the motion's own entries zero
+    x: Array  # (filters, n)
+    P: Array  # (filters, n, n)
+    errors: Array  # (4, 3) nominal sensor errors by kind
+    sums: Array  # (3, 3, 3), see `error_model.transition`
+    elapsed: Array  # (2,) seconds and samples since the last covariance step
+    rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
+
+    def copy(self) -> State:
+        """The same in arrays of its own."""
+        return State(*(getattr(self, field.name).copy() for field in fields(self)))
+
+
+class Reference:
+    """One strapdown and the growth of the covariances of the filters of ``models``.
+
+    Filter i is told ``1 / shares[i]`` times the noise and the initial covariance of the common states, so that a fusion
+    of all may add up their information as if they were independent (Cui et al. 2022, Eq 7). Filters with fewer states
+    than the largest have dead ones behind. ``field_n`` gives the reference magnetic field (3,) [T], NED, at (lat, lon,
+    h). A covariance step takes ``period`` samples.
+    """
+
+    def __init__(
+        self, models: Sequence[ErrorModel], shares: Sequence[float] | Array, period: int, field_n: FieldModel | None
+    ) -> None:
+        self.models, self.period = models, period
+        self.common = models[0].mixing
+        self.driven = models[0].driven
+        self.size = max(model.size for model in models)
+        self.has_field = field_n is not None
+        self._field_model = field_n
+        self._field_at = (math.nan, math.nan, math.nan)
+        self._field_value = np.zeros(3)
+        filters, n = len(models), self.size
+        self._decay_rate, self._noise = np.zeros((filters, n)), np.zeros((filters, n))
+        for i, model in enumerate(models):
+            self._decay_rate[i, : model.size] = model.decay_rate
+            self._noise[i, : model.size] = model.density**2
+        self._variance_rate = self._noise.copy()
+        self._scratch = (
+            np.zeros((MOTION, self.common)),
+            np.zeros((MOTION, self.common)),
+            np.ones(n),
+            np.zeros(n),
+            np.zeros((MOTION, n)),
+        )
+        self.share_noise(shares)
+
+    def share_noise(self, shares: Sequence[float] | Array) -> None:
+        """New shares of the noise of the common states."""
+        self._variance_rate[:, : self.common] = self._noise[:, : self.common] / np.array(shares)[:, None]
+
+    def start(self, initial: InitialState, names: Sequence[Mapping[str, str]] | None = None) -> State:
+        """A given state with its covariance, not yet shared; ``names[i]`` renames correlated blocks for filter i."""
+        filters, n = len(self.models), self.size
+        P = np.zeros((filters, n, n))
+        for i, model in enumerate(self.models):
+            P[i, range(model.size), range(model.size)] = model.sigma**2
+            P[i, :MOTION, :MOTION] = initial.covariance
+            for given, covariance in initial.correlated.items():
+                name = names[i].get(given, given) if names else given
+                if name in model.slices:
+                    block = model.slices[name]
+                    P[i, :MOTION, block] = covariance
+                    P[i, block, :MOTION] = covariance.T
+        return State(
+            q_nb=np.array(initial.q_nb, dtype=float),
+            v_n=np.array(initial.v_n, dtype=float),
+            lla=np.array([initial.lat, initial.lon, initial.h]),
+            imu=np.zeros(self.common),
+            x=np.zeros((filters, n)),
+            P=P,
+            errors=np.zeros((4, 3)),
+            sums=np.zeros((3, 3, 3)),
+            elapsed=np.zeros(2),
+            rates=np.zeros((2, 3)),
+        )
+
+    def run(self, state: State, imu: ImuSamples, periods: int = 1) -> float:
+        """Propagate by a block of increments, a covariance step every ``periods`` of the usual ones.
+
+        The time of the last increment that was not usable, -inf when all were: it is bridged with the last sound rates.
+        """
+        s = state
+        bad = _propagate(
+            s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
+            self.driven, self._decay_rate, self._variance_rate, *self._scratch,
+            self.period * periods, imu.dtheta, imu.dv, imu.dt,
+        )  # fmt: skip
+        return float(imu.t[bad]) if bad >= 0 else -math.inf
+
+    def settle(self, state: State) -> None:
+        """Bring the covariances up to the time of the motion."""
+        s = state
+        if s.elapsed[0] > 0:
+            _covariance_step(
+                s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed,
+                self.driven, self._decay_rate, self._variance_rate, *self._scratch,
+            )  # fmt: skip
+
+    def correct(self, state: State, correction: Array) -> None:
+        """Put a correction (common,) of the common states into the nominal ones and take it from every filter's."""
+        s = state
+        inject(s.q_nb, s.v_n, s.lla, s.imu, correction)
+        sensor_errors(s.errors, s.imu, self.driven)
+        s.x[:, : self.common] -= correction
+
+    def field_n(self, lla: Array) -> Array:
+        """The reference field, looked up again only after the place has changed."""
+        assert self._field_model is not None
+        (lat, lon, h), (lat0, lon0, h0) = lla.tolist(), self._field_at
+        if not (
+            abs(lat - lat0) < FIELD_PATCH_RAD and abs(lon - lon0) < FIELD_PATCH_RAD and abs(h - h0) < FIELD_PATCH_M
+        ):
+            self._field_at = (lat, lon, h)
+            self._field_value = np.array(self._field_model(lat, lon, h), dtype=float)
+        return self._field_value
+
+
+def describe(
+    state: State | None, P: Array, model: ErrorModel, t: float, status: Status, mounting_sigma: float
+) -> tuple[Estimate, Array]:
+    """The estimate of a settled nominal state with covariance ``P`` (n, n), laid out as ``model``, and each 1-sigma.
+
+    Without a state every number is NaN. ``mounting_sigma`` [rad] is between the axes of the IMU and of the body.
+    """
+    if state is None:
+        nothing = np.full(3, np.nan)
+        estimate = Estimate(
+            t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, np.full((9, 9), np.nan),
+            nothing, nothing, status,
+        )  # fmt: skip
+        return estimate, np.empty(0)
+    covariance, sigma = _spread(P, mounting_sigma**2)
+    gyro_bias, sigma_gyro = _with_drift(state.imu, P, model, sigma, "gyro")
+    accel_bias, sigma_accel = _with_drift(state.imu, P, model, sigma, "accel")
+    lat, lon, h = state.lla.tolist()
+    estimate = Estimate(
+        t=t,
+        lat=lat,
+        lon=lon,
+        h=h,
+        v_n=state.v_n,
+        q_nb=state.q_nb,
+        gyro_bias=gyro_bias,
+        accel_bias=accel_bias,
+        covariance=covariance,
+        sigma_gyro_bias=sigma_gyro,
+        sigma_accel_bias=sigma_accel,
+        status=status,
+        extra={},
+    )
+    return estimate, sigma
+
+
+def align(alignment: Alignment, reference: Reference, sample: Sample) -> InitialState | None:
+    """Give a sound sample to the alignment; the initial state once it is known."""
+    if isinstance(sample, MagnetometerSample):
+        alignment.add_field(sample.field_b)
+    elif isinstance(sample, GnssSample):
+        place = np.array([sample.lat, sample.lon, sample.h])
+        return alignment.add_gnss(sample, reference.field_n(place) if reference.has_field else None)
+    return None
+
+
+def forget(P: Array, start: int, variance: Array) -> None:
+    """Give a block of states new variances, independent of all others."""
+    block = slice(start, start + len(variance))
+    P[block, :] = 0.0
+    P[:, block] = 0.0
+    P[block, block] = np.diag(variance)
+
+
+def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str) -> tuple[Array, Array]:
+    """Bias of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
+    bias = model.slices[f"{sensor}_bias"]
+    drift = model.slices.get(f"{sensor}_drift")
+    if drift is None:
+        return x[bias], sigma[bias]
+    variance = sigma[bias] ** 2 + sigma[drift] ** 2 + 2 * P[bias, drift].diagonal()
+    return x[bias] + x[drift], np.sqrt(variance)
+
+
+@njit
+def _spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
+    """Covariance (9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (n,) of every state."""
+    covariance, sigma = np.empty((MOTION, MOTION)), np.empty(len(P))
+    for i in range(MOTION):
+        for j in range(MOTION):
+            covariance[i, j] = P[ESTIMATE_ORDER[i], ESTIMATE_ORDER[j]]
+        if ESTIMATE_ORDER[i] < PHI + 3:
+            covariance[i, i] += mounting_variance
+    for i in range(len(P)):
+        sigma[i] = math.sqrt(P[i, i])
+    return covariance, sigma
+
+
+@njit
+def absorb(
+    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, driven: Indices,
+    nu: Array, H: Array, R: Array, threshold: float, close: bool,
+) -> tuple[Array, float]:  # fmt: skip
+    """One measurement into one filter, ``x`` (n,) and ``P`` (n, n), if its nis is at most ``threshold``; (S, nis).
+
+    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.innovate`.
+    """
+    S, S_inverse, HP, nis = innovate(P, H, R, nu)
+    if nis <= threshold:
+        correction = correct(P, H, R, HP, S_inverse, nu)
+        for i in range(len(x)):
+            x[i] += correction[i]
+        if close:
+            inject(q_nb, v_n, lla, imu, x)
+            for i in range(len(imu)):
+                x[i] = 0.0
+            sensor_errors(errors, imu, driven)
+    return S, nis
+
+
+@njit
+def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -> None:
+    """Add a correction (of the common states at least) to the nominal state, with the sign of `kalman.correct`."""
+    # C_nb_hat = (I - [phi x]) C_nb, and the correction is minus phi's estimate
+    turn = quat_conjugate(quat_from_rotvec(correction[PHI : PHI + 3]))
+    turned = quat_normalise(quat_multiply(turn, q_nb))
+    for i in range(4):
+        q_nb[i] = turned[i]
+    for i in range(3):
+        v_n[i] += correction[VEL + i]
+    R_M, R_N = radii(lla[0])
+    lla[1] = wrap_longitude(lla[1] + correction[POS + 1] / ((R_N + lla[2]) * math.cos(lla[0])))
+    lla[0] += correction[POS] / (R_M + lla[2])
+    lla[2] -= correction[POS + 2]
+    for i in range(MOTION, len(imu)):
+        imu[i] += correction[i]
+
+
+@njit
+def _covariance_step(
+    v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
+    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
+    work: Array,
+) -> None:  # fmt: skip
+    """Take every filter's covariance and states over the time in ``elapsed``, and empty the integrals."""
+    T = elapsed[0]
+    transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
+    common = len(imu)
+    for f in range(len(x)):
+        for i in range(x.shape[1]):
+            half_noise[i] = 0.5 * T * variance_rate[f, i]
+            decay[i] = math.exp(-T * decay_rate[f, i]) if decay_rate[f, i] > 0.0 else 1.0
+        if np.any(x[f, :common]):
+            for i in range(MOTION):
+                work[i, 0] = 0.0
+                for j in range(common):
+                    work[i, 0] += Phi[i, j] * x[f, j]
+            for i in range(MOTION):
+                x[f, i] = work[i, 0]
+        for i in range(MOTION, x.shape[1]):
+            x[f, i] *= decay[i]
+        if f == 0:
+            for i in range(MOTION, common):
+                imu[i] *= decay[i]
+        predict(P[f], Phi, decay, half_noise, work)
+    sensor_errors(errors, imu, driven)
+    sums[:] = 0.0
+    elapsed[:] = 0.0
+
+
+@njit
+def _propagate(
+    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
+    rates: Array, driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array,
+    half_noise: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array,
+) -> int:  # fmt: skip
+    """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none."""
+    bad = -1
+    angle, push, before = np.empty(3), np.empty(3), np.empty(4)
+    for k in range(len(dt)):
+        T = dt[k]
+        if not T > 0.0:
+            continue
+        sound = True
+        for i in range(3):
+            if not (abs(dtheta[k, i]) <= RATE_LIMIT * T and abs(dv[k, i]) <= FORCE_LIMIT * T):
+                sound = False
+        if sound:
+            for i in range(3):
+                rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
+        else:
+            bad = k
+        for i in range(3):
+            angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
+            push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
+        for i in range(4):
+            before[i] = q_nb[i]
+        step(q_nb, v_n, lla, angle, push, T)
+        _integrate(sums, before, q_nb, angle, push, T)
+        elapsed[0] += T
+        elapsed[1] += 1.0
+        if elapsed[1] >= period:
+            _covariance_step(
+                v_n, lla, imu, x, P, errors, sums, elapsed,
+                driven, decay_rate, variance_rate, Phi, FT, decay, half_noise, work,
+            )  # fmt: skip
+    return bad
+
+
+@inlined
+def _integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
+    """Add one interval to the integrals of `error_model.transition`, with C_nb in its middle: of the mean quaternion.
+
+    Written out in scalars: a matrix made for every increment would take as long as the strapdown.
+    """
+    w, x, y, z = before[0] + after[0], before[1] + after[1], before[2] + after[2], before[3] + after[3]
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    C_nb = (
+        (1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
+        (s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)),
+        (s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)),
+    )
+    for i in range(3):
+        for j in range(3):
+            sums[0, i, j] += C_nb[i][j] * T
+            sums[1, i, j] += C_nb[i][j] * angle[j]
+            sums[2, i, j] += C_nb[i][j] * push[j]

@@ -1,0 +1,534 @@
+"""The federated filter: against a centralised one, honest with itself, safe from a faulty sensor."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from ins_world import CONSUMER, DEG, DT, FIELD_N, barometer, error, feed, flight, gnss, imu, magnetometer
+from scipy.stats import chi2
+
+from nav.alignment import InitialState
+from nav.detection import ChiSquare, Eraim, Glr, Reset, Sprt, exponential
+from nav.error_model import POS, VEL
+from nav.federated import (
+    Config,
+    Federated,
+    Local,
+    blend,
+    combine,
+    reset,
+    weights_by_covariance,
+    weights_eq13,
+)
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
+from nav.samples import BarometerSample, FixType, ImuSamples, Status
+
+INFORMATION = Config(CONSUMER, (Local("only", ()),))
+SCALAR = Config(CONSUMER, (Local("only", ()),), sharing="none", combination="scalar")
+INTERSECTION = Config(CONSUMER, (Local("only", ()),), sharing="none", combination="covariance_intersection")
+
+
+def field(*_):
+    return FIELD_N
+
+
+# --- the arithmetic, against oracles written here
+
+
+def spread(rng, n):
+    A = rng.normal(size=(n, n))
+    return A @ A.T + 0.1 * np.eye(n)
+
+
+def kalman(x, P, H, R, z):
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+    return x + K @ (z - H @ x), P - K @ H @ P
+
+
+def test_full_reset_is_the_centralised_filter():
+    """Position and velocity driven by noise, a fix of each by two filters: shares 0.3 and 0.7, reset at each step."""
+    rng = np.random.default_rng(0)
+    Phi, Q = np.array([[1.0, 0.2], [0.0, 1.0]]), np.diag([1e-3, 0.02])
+    H = [np.array([[1.0, 0.0]]), np.array([[0.3, 1.0]])]
+    R = [np.array([[4.0]]), np.array([[0.25]])]
+    shares = np.array([0.3, 0.7])
+    central = np.zeros(2), np.diag([100.0, 4.0])
+    x, P = np.zeros((2, 2)), np.stack([central[1] / share for share in shares])
+    for _ in range(200):
+        z = [rng.normal(size=1) for _ in H]
+        central = Phi @ central[0], Phi @ central[1] @ Phi.T + Q
+        for i in range(2):
+            central = kalman(*central, H[i], R[i], z[i])
+            x[i], P[i] = Phi @ x[i], Phi @ P[i] @ Phi.T + Q / shares[i]
+            x[i], P[i] = kalman(x[i], P[i], H[i], R[i], z[i])
+        master = combine(x, P, 2, np.ones(2), INFORMATION)
+        for i in range(2):
+            reset(x[i], P[i], master.x, master.P / shares[i])
+        np.testing.assert_allclose(master.x, central[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(master.P, central[1], rtol=1e-9)
+
+
+def test_what_a_filter_knows_of_its_aid_survives_a_reset():
+    """Four common states, an aid error in each of two filters, no process noise: still the centralised filter."""
+    rng = np.random.default_rng(1)
+    P0, x0 = spread(rng, 4), rng.normal(size=4)
+    aid = [2.0, 0.5]  # variances
+    central = np.r_[x0, 0.0, 0.0], np.zeros((6, 6))
+    central[1][:4, :4], central[1][4, 4], central[1][5, 5] = P0, *aid
+    x, P = np.zeros((2, 5)), np.zeros((2, 5, 5))
+    for i in range(2):
+        x[i, :4], P[i, :4, :4], P[i, 4, 4] = x0, 2 * P0, aid[i]
+    for k in range(60):
+        i = k % 2
+        H_c, z, R = rng.normal(size=(2, 4)), rng.normal(size=2), np.diag([0.3, 0.1])
+        local = np.c_[H_c, [1.0, 0.0]]
+        whole = np.zeros((2, 6))
+        whole[:, :4], whole[0, 4 + i] = H_c, 1.0
+        central = kalman(*central, whole, R, z)
+        x[i], P[i] = kalman(x[i], P[i], local, R, z)
+        if k % 3 == 2:
+            master = combine(x, P, 4, np.ones(2), INFORMATION)
+            for f in range(2):
+                reset(x[f], P[f], master.x, 2 * master.P)
+            np.testing.assert_allclose(master.x, central[0][:4], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(master.P, central[1][:4, :4], rtol=1e-9, atol=1e-12)
+            # The common states that a filter holds are told with its share; given them, the aid's error is whole.
+            for f in range(2):
+                G = np.linalg.solve(P[f, :4, :4], P[f, :4, 4])
+                mean, variance = x[f, 4], P[f, 4, 4] - G @ P[f, :4, :4] @ G + G @ master.P @ G
+                assert mean == pytest.approx(central[0][4 + f], abs=1e-9)
+                assert variance == pytest.approx(central[1][4 + f, 4 + f], rel=1e-9)
+
+
+def toy_covariances(shared, steps=60):
+    """(claimed, actual) covariance of two filters' fusion without resets: both are linear in the noise."""
+    Phi, Q, R = np.array([[1.0, 1.0], [0.0, 1.0]]), np.diag([0.01, 0.02]), (4.0, 1.0)
+    H, inflation = np.array([[1.0, 0.0]]), 2.0 if shared else 1.0
+    P0 = np.diag([25.0, 1.0])
+    P = np.stack([P0 * inflation] * 2)
+    joint = np.kron(np.ones((2, 2)), P0)  # both filters begin with the same error
+    for _ in range(steps):
+        joint = np.kron(np.eye(2), Phi) @ joint @ np.kron(np.eye(2), Phi).T + np.kron(np.ones((2, 2)), Q)
+        for i in range(2):
+            P[i] = Phi @ P[i] @ Phi.T + Q * inflation
+            K = P[i] @ H.T / (H @ P[i] @ H.T + R[i])
+            P[i] = P[i] - K @ H @ P[i]
+            L = np.eye(4)
+            L[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] -= K @ H
+            joint = L @ joint @ L.T
+            joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += R[i] * K @ K.T
+    claimed = combine(np.zeros((2, 2)), P, 2, np.ones(2), INFORMATION).P
+    gain = np.hstack([claimed @ np.linalg.inv(p) for p in P])
+    return claimed, gain @ joint @ gain.T
+
+
+def test_without_resets_the_noise_must_be_shared():
+    """Exact covariance of the fused error against the claimed one: at least as large in every direction, or not."""
+    claimed, actual = toy_covariances(shared=True)
+    assert np.linalg.eigvalsh(claimed - actual).min() > 0
+    assert np.trace(np.linalg.solve(claimed, actual)) / 2 > 0.7  # and not by much
+    claimed, actual = toy_covariances(shared=False)
+    assert np.trace(np.linalg.solve(claimed, actual)) / 2 > 1.15
+    assert math.sqrt(actual[1, 1] / claimed[1, 1]) > 1.1
+
+
+def test_marginalises_to_the_common_states():
+    """The sub-block of P is taken and inverted; the sub-block of the inverse would take the aid's error for known."""
+    rng = np.random.default_rng(3)
+    P, x = np.stack([spread(rng, 6), spread(rng, 6)]), rng.normal(size=(2, 6))
+    master = combine(x, P, 4, np.ones(2), INFORMATION)
+    inverses = [np.linalg.inv(p[:4, :4]) for p in P]
+    P_g = np.linalg.inv(sum(inverses))
+    np.testing.assert_allclose(master.P, P_g, rtol=1e-9)
+    np.testing.assert_allclose(master.x, P_g @ sum(i @ v[:4] for i, v in zip(inverses, x, strict=True)), rtol=1e-9)
+    wrong = np.linalg.inv(sum(np.linalg.inv(p)[:4, :4] for p in P))
+    assert np.linalg.eigvalsh(P_g - wrong).min() > 0
+
+
+def test_units_that_differ_by_twelve_orders_are_no_trouble():
+    rng = np.random.default_rng(4)
+    unit = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.1), np.full(3, 1e3), np.full(3, 1e-7), np.full(3, 1e-2)])
+    correlation = [np.eye(15) + 0.05 * spread(rng, 15) / 15 for _ in range(3)]
+    P = np.stack([unit @ c @ unit for c in correlation])
+    master = combine(np.zeros((3, 15)), P, 15, np.ones(3), INFORMATION)
+    units = np.outer(unit.diagonal(), unit.diagonal())
+    expected = np.linalg.inv(sum(np.linalg.inv(c) for c in correlation))
+    np.testing.assert_allclose(master.P / units, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_a_member_with_weight_zero_is_left_out():
+    rng = np.random.default_rng(5)
+    P, x = np.stack([spread(rng, 9), spread(rng, 9)]), rng.normal(size=(2, 9))
+    for config in (INFORMATION, SCALAR, INTERSECTION):
+        master = combine(x, P, 9, np.array([0.0, 1.0]), config)
+        np.testing.assert_allclose(master.x, x[1], rtol=1e-9)
+        np.testing.assert_allclose(master.P, P[1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("config", [SCALAR, INTERSECTION])
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_scalar_weights_and_intersection_hold_for_any_correlation(config, correlation):
+    """Two errors of known covariance and cross-covariance: the claim is never below what the fused error has."""
+    rng = np.random.default_rng(6)
+    P = np.stack([spread(rng, 9), spread(rng, 9)])
+    cross = correlation * np.linalg.cholesky(P[0]) @ np.linalg.cholesky(P[1]).T
+    joint = np.block([[P[0], cross], [cross.T, P[1]]])
+    claimed, weights = (lambda m: (m.P, m.weights))(combine(np.zeros((2, 9)), P, 9, np.ones(2), config))
+    assert weights.sum() == pytest.approx(1.0)
+    if config is SCALAR:
+        gain = np.hstack([w * np.eye(9) for w in weights])
+    else:
+        gain = np.hstack([w * claimed @ np.linalg.inv(p) for w, p in zip(weights, P, strict=True)])
+    assert np.linalg.eigvalsh(claimed - gain @ joint @ gain.T).min() > -1e-9
+
+
+def test_blend_goes_from_own_to_shared():
+    rng = np.random.default_rng(7)
+    (P, P_g), (x, x_g) = (spread(rng, 4), spread(rng, 4)), rng.normal(size=(2, 4))
+    np.testing.assert_allclose(blend(x, P, x_g, P_g, 0.0)[1], P, rtol=1e-9)
+    np.testing.assert_allclose(blend(x, P, x_g, P_g, 1.0)[0], x_g, rtol=1e-9)
+    half = np.linalg.inv(0.5 * np.linalg.inv(P) + 0.5 * np.linalg.inv(P_g))
+    np.testing.assert_allclose(blend(x, P, x_g, P_g, 0.5)[1], half, rtol=1e-9)
+
+
+def lost_position():
+    """A Doppler filter with 10 m, and one that lost its transponder and drifted to 185 m, alike in all else."""
+    sigma = np.r_[np.full(3, 1e-4), np.full(3, 0.05), np.full(3, 10.0), np.full(3, 5e-8), np.full(3, 2e-4)]
+    other = sigma.copy()
+    other[POS : POS + 3], other[VEL : VEL + 3] = 185.0, 0.3
+    return np.stack([np.diag(sigma**2), np.diag(other**2)])
+
+
+def test_printed_weights_do_not_see_a_lost_position():
+    """Zhu et al. 2020, Eq 13: the gyro biases decide, so a filter 185 m off keeps half; by the traces it keeps 1 %."""
+    P = lost_position()
+    assert weights_eq13(P, 15, np.ones(2))[1] > 0.45
+    assert weights_by_covariance(P, 15, np.ones(2))[1] < 0.02
+    literal = dataclasses.replace(SCALAR, literal=True)
+    x = np.zeros((2, 15))
+    x[1, POS] = 185.0
+    assert combine(x, P, 15, np.ones(2), literal).x[POS] > 80.0
+    assert combine(x, P, 15, np.ones(2), SCALAR).x[POS] < 4.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"locals": ()}, "needs local filters"),
+        ({"locals": (Local("a", ()), Local("a", ()))}, "a name of its own"),
+        ({"locals": (Local("a", (), 0.5), Local("b", ()))}, "add up to 1"),
+        ({"locals": (Local("a", (), 0.5), Local("b", (), 0.4))}, "add up to 1"),
+        ({"retention": 1.5}, "fraction"),
+        ({"imu": dataclasses.replace(CONSUMER, gyro_bias_sigma=0.0)}, "sigma above zero"),
+        ({"sharing": "none", "structure": "full_reset"}, "again and again"),
+        ({"combination": "scalar"}, "sharing must be 'none'"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(INFORMATION, **wrong)
+
+
+# --- in flight
+
+
+def true_start(truth, sigma=(0.1 * DEG, 0.1, 1.0)):
+    covariance = np.diag(np.repeat(sigma, 3) ** 2)
+    return InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0], covariance)
+
+
+def named(fixes, sensor):
+    return [dataclasses.replace(f, sensor=sensor) for f in fixes]
+
+
+@functools.cache
+def world(duration=120, seed=2):
+    truth = flight(duration)
+    rng = np.random.default_rng(seed)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    one, two = gnss(truth, rng, 5.0), named(gnss(truth, rng, 5.0), "gnss2")
+    return truth, increments, one, two, barometer(truth, rng, 40.0, rate_hz=5.0) + magnetometer(truth, rng, rate_hz=5.0)
+
+
+def three(detector=lambda: ChiSquare(1e-3)):
+    return (
+        Local("one", (Watched(GnssAid(), detector),)),
+        Local("two", (Watched(GnssAid("gnss2"), detector),)),
+        Local("air", (Watched(BarometerAid(), detector), Watched(MagnetometerAid(), detector))),
+    )
+
+
+def fly(config, samples, increments, seconds=1.0):
+    federated = Federated(config, field)
+    estimates, reports = feed(FusionHorizon(federated), increments, samples, seconds)
+    return federated, estimates, reports
+
+
+def horizontal(estimates, truth, after=0.0):
+    return {
+        round(e.t, 3): float(np.hypot(*error(e, truth)[:2]))
+        for e in estimates
+        if e.t > after and e.status & Status.ALIGNED
+    }
+
+
+def differ(a, b, truth):
+    """Largest difference of two estimates in sigmas of the second, and of the sigmas themselves."""
+    sigma = np.sqrt(np.diag(b.covariance))
+    shift = np.abs(error(a, truth) - error(b, truth)) / sigma
+    return shift.max(), np.abs(np.sqrt(np.diag(a.covariance)) / sigma - 1).max()
+
+
+def test_one_local_filter_is_the_ins():
+    """Corrected every second instead of at once: only linearisation differs."""
+    truth, increments, one, _, others = world()
+    sensors = (Watched(GnssAid()), Watched(BarometerAid()), Watched(MagnetometerAid()))
+    _, estimates, _ = fly(Config(CONSUMER, (Local("only", sensors),)), one + others, increments)
+    config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"))
+    central, _ = feed(FusionHorizon(Ins(config, field)), increments, one + others)
+    for t in (20, 60, 119):
+        shift, ratio = differ(estimates[t], central[t], truth)
+        assert shift < 0.05
+        assert ratio < 5e-3
+
+
+def test_full_reset_reproduces_one_filter_with_every_aid():
+    """Shares, resets and marginalised aid errors lose nothing: a tenth of a sigma, a fiftieth of the sigmas."""
+    truth, increments, one, two, others = world()
+    samples = one + two + others
+    everything = (Local("only", tuple(w for local in three() for w in local.sensors)),)
+    _, central, _ = fly(Config(CONSUMER, everything), samples, increments)
+    shares = tuple(dataclasses.replace(f, share=s) for f, s in zip(three(), (0.5, 0.3, 0.2), strict=True))
+    for locals_ in (three(), shares):
+        _, estimates, _ = fly(Config(CONSUMER, locals_, structure="full_reset"), samples, increments)
+        for t in (20, 60, 119):
+            shift, ratio = differ(estimates[t], central[t], truth)
+            assert shift < 0.1
+            assert ratio < 0.02
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"structure": "partial"},
+        {"sharing": "by_covariance"},
+        {"sharing": "by_covariance", "structure": "full_reset"},
+        {"sharing": "none", "combination": "scalar"},
+        {"sharing": "none", "combination": "covariance_intersection"},
+        {"sharing": "none", "combination": "covariance_intersection", "structure": "full_reset"},
+        {"fusion_period_s": 0.0, "structure": "full_reset"},
+        {"fusion_period_s": 7.0},
+    ],
+)
+def test_every_way_of_fusing_is_sound(options):
+    truth, increments, one, two, others = world()
+    federated, estimates, reports = fly(Config(CONSUMER, three(), **options), one + two + others, increments)
+    wrong, sigma = error(estimates[-1], truth), np.sqrt(np.diag(estimates[-1].covariance))
+    assert (np.abs(wrong) < 4 * sigma).all()
+    assert np.hypot(*wrong[:2]) < 1.5
+    assert sigma[6] < 0.15 * DEG
+    assert federated.shares.sum() == pytest.approx(1.0)
+    assert federated.events == []
+    assert np.mean([r.weight for r in reports]) > 0.99
+    assert estimates[-1].status == Status.ALIGNED | Status.GNSS_FUSED
+    assert estimates[-1].extra["barometer_bias"][0][0] == pytest.approx(40.0, abs=2.0)
+
+
+def test_claims_without_resets():
+    """Shared noise claims a little more than the centralised sigma; unshared noise claims less than can be."""
+    _, increments, one, two, others = world()
+    sigma = {}
+    for name, options in (
+        ("central", {"structure": "full_reset"}),
+        ("shared", {}),
+        ("unshared", {"sharing": "none"}),
+    ):
+        estimates = fly(Config(CONSUMER, three(), **options), one + two + others, increments)[1]
+        sigma[name] = np.sqrt(np.diag(estimates[-1].covariance))
+    assert (sigma["shared"] > 0.999 * sigma["central"]).all()
+    assert (sigma["shared"] < 1.25 * sigma["central"]).all()
+    assert (sigma["unshared"][3:8] < 0.95 * sigma["central"][3:8]).all()
+
+
+@pytest.mark.slow
+def test_nees_over_many_flights():
+    """Mean of nine states' NEES over 40 flights, against the one-sided 99 % bound of a consistent filter."""
+    runs, nees = 40, {"fixed": 0.0, "none": 0.0}
+    for seed in range(runs):
+        truth, increments, one, two, others = world.__wrapped__(60, 1000 + seed)
+        for sharing in nees:
+            _, estimates, _ = fly(Config(CONSUMER, three(), sharing=sharing), one + two + others, increments)
+            wrong = error(estimates[-1], truth)
+            nees[sharing] += wrong @ np.linalg.solve(estimates[-1].covariance, wrong) / runs
+    bound = chi2.ppf(0.99, 9 * runs) / runs
+    print("mean NEES", nees, "bound", bound)
+    assert nees["fixed"] < bound < nees["none"]
+
+
+def ramp(fixes, start, stop, slope, with_velocity):
+    """Spoofed northwards: the position runs away, and the velocity with it or not."""
+    spoofed = []
+    for fix in fixes:
+        if start <= fix.t < stop:
+            v_n = fix.v_n + np.array([slope * with_velocity, 0.0, 0.0])
+            fix = dataclasses.replace(fix, lat=fix.lat + slope * (fix.t - start) / 6.37e6, v_n=v_n)
+        spoofed.append(fix)
+    return spoofed
+
+
+DETECTORS = {
+    "chi_square": lambda: ChiSquare(1e-3),
+    "eraim": lambda: Eraim(1e-3),
+    "sprt": lambda: Sprt(1e-6, exponential(0.95), Reset.COMPLETE),
+    "glr": lambda: Glr(1e-6),
+}
+
+
+@pytest.mark.parametrize("with_velocity", [False, True])
+@pytest.mark.parametrize("kind", DETECTORS)
+def test_a_spoofed_receiver_is_isolated_and_readmitted(kind, with_velocity):
+    """A ramp of 0.5 m/s from 100 to 220 s on the first of two receivers: 60 m, of which under 2 m reach the fusion."""
+    truth, increments, one, two, others = world(260)
+    spoofed = ramp(one, 100, 220, 0.5, with_velocity)
+    federated, estimates, reports = fly(Config(CONSUMER, three(DETECTORS[kind])), spoofed + two + others, increments)
+    errors = horizontal(estimates, truth, 50)
+    assert max(errors.values()) < 2.0  # the requirement is 10 m
+    assert {(e.local, e.sensor) for e in federated.events} == {("one", "gnss")}
+    first, last = federated.events[0], federated.events[-1]
+    assert 100 < first.t < 116
+    assert any(first.isolated)
+    assert 221 < last.t < 224
+    assert federated.isolated() == []
+    north = [r for r in reports if r.sensor == "gnss" and r.aid == "gnss_position" and 120 < r.t < 220]
+    assert all(r.reason == "isolated" and r.weight < 1 for r in north)
+    assert all(r.weight == 1 for r in reports if r.sensor == "gnss" and r.t > 224 and not r.reason)
+    assert np.mean([r.weight for r in reports if r.sensor == "gnss2"]) > 0.995
+    wrong, sigma = error(estimates[-1], truth), np.sqrt(np.diag(estimates[-1].covariance))
+    assert (np.abs(wrong) < 4 * sigma).all()
+
+
+def test_the_single_filter_follows_the_spoofer():
+    """The same ramp and sensors in one unprotected filter, and in the federation without detectors that see it."""
+    truth, increments, one, _, others = world(260)
+    spoofed = ramp(one, 100, 220, 0.5, True)
+    config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"), false_rejection=1e-300)
+    estimates, _ = feed(FusionHorizon(Ins(config, field)), increments, spoofed + others)
+    assert max(horizontal(estimates, truth, 50).values()) > 50
+
+
+def test_nothing_of_the_spoofed_fixes_stays():
+    """At the isolation the spoofed filter goes back to the others' solution, with their covariance over its share."""
+    _, increments, one, two, others = world(260)
+    federated = Federated(Config(CONSUMER, three(DETECTORS["glr"])), field)
+    horizon = FusionHorizon(federated)
+    rows = slice(0, round(130 / DT))
+    block = ImuSamples(increments.t[rows], increments.dt[rows], increments.dtheta[rows], increments.dv[rows])
+    samples = [s for s in ramp(one, 100, 220, 0.5, True) + two + others if s.t <= 130]
+    horizon.push(block, samples)
+    assert federated.events
+    apart = np.abs(federated.local("one")[0][POS : POS + 3] - federated.local("two")[0][POS : POS + 3])
+    assert apart[0] < 1.0  # after 20 s, in which the spoofed receiver went 10 m
+    assert math.sqrt(federated.local("one")[1][POS, POS]) > math.sqrt(federated.local("two")[1][POS, POS])
+
+
+def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
+    """One look on every axis bad is the whole receiver bad."""
+    truth, increments, one, two, others = world(120)
+    bad = [dataclasses.replace(f, v_n=f.v_n + np.array([2.0, -2.0, 1.0])) if 60 <= f.t < 80 else f for f in one]
+    federated, estimates, reports = fly(Config(CONSUMER, three()), bad + two + others, increments)
+    assert max(horizontal(estimates, truth, 50).values()) < 2.0
+    during = [r for r in reports if r.sensor == "gnss" and 61 < r.t < 80]
+    assert len(during) > 180
+    assert all((r.weight, r.reason) == (0.0, "isolated") for r in during)
+    assert {e.part for e in federated.events} == {"gnss_velocity"}
+
+
+def test_a_faulty_axis_leaves_the_others_in_use():
+    truth, increments, one, two, others = world(120)
+    bad = [dataclasses.replace(f, h=f.h + 640.0) if 60 <= f.t < 80 else f for f in one]
+    federated, estimates, reports = fly(Config(CONSUMER, three(DETECTORS["eraim"])), bad + two + others, increments)
+    during = [r for r in reports if r.aid == "gnss_position" and r.sensor == "gnss" and 60 <= r.t < 80]
+    assert np.mean([r.weight for r in during]) == pytest.approx(2 / 3, abs=0.02)
+    assert federated.events[0].isolated == (False, False, True)
+    assert max(abs(error(e, truth)[2]) for e in estimates if e.t > 50) < 1.5
+
+
+def test_both_receivers_off_for_long_are_believed_in_the_end():
+    """A lasting jump of both by 100 m, as after a filter too sure of itself: given in to after `patience_s`."""
+    truth, increments, one, two, others = world(120)
+    jumped = [dataclasses.replace(f, lat=f.lat + 100 / 6.37e6) if f.t >= 60 else f for f in one + two]
+    _, estimates, reports = fly(Config(CONSUMER, three(), patience_s=20.0), jumped + others, increments)
+    fused = [r.t for r in reports if r.aid == "gnss_position" and r.t >= 60 and r.weight == 1]
+    assert 79.5 < fused[0] < 81
+    assert len(fused) > 350
+    errors = horizontal(estimates, truth)
+    assert errors[79.0] < 8.0
+    assert 95 < errors[119.0] < 105
+
+
+def test_an_outage_of_both_receivers_and_their_return():
+    truth, increments, one, two, others = world(120)
+    seen = [f for f in one + two if not 40 <= f.t < 70]
+    _, estimates, reports = fly(Config(CONSUMER, three()), seen + others, increments)
+    status = {round(e.t): e.status for e in estimates}
+    assert status[50] == Status.ALIGNED | Status.DEAD_RECKONING
+    assert status[72] == Status.ALIGNED | Status.GNSS_FUSED
+    assert max(e for t, e in horizontal(estimates, truth).items() if t > 75) < 1.5
+    assert np.mean([r.weight for r in reports if 70 <= r.t < 75]) > 0.95
+    at = estimates[68]
+    assert (np.abs(error(at, truth)) < 4 * np.sqrt(np.diag(at.covariance))).all()
+
+
+def test_blocks_of_any_size_give_the_same_bits():
+    _, increments, one, two, others = world(120)
+    few = ImuSamples(increments.t[:6000], increments.dt[:6000], increments.dtheta[:6000], increments.dv[:6000])
+    samples = [s for s in one + two + others if s.t < 30]
+    finals = [fly(Config(CONSUMER, three()), samples, few, seconds)[1][-1] for seconds in (0.05, 1.0, 3.0)]
+    for other in finals[1:]:
+        assert (other.lat, other.lon, other.h) == (finals[0].lat, finals[0].lon, finals[0].h)
+        np.testing.assert_array_equal(other.covariance, finals[0].covariance)
+
+
+def test_broken_samples_and_strangers():
+    truth, _, one, _, _ = world(120)
+    federated = Federated(Config(CONSUMER, three()), field)
+    federated.start(true_start(truth))
+    broken = dataclasses.replace(one[0], t=0.0, lat=math.nan)
+    reports = federated.update(broken)
+    assert [(r.aid, r.weight) for r in reports] == [("gnss_position", 0.0), ("gnss_velocity", 0.0)]
+    assert federated.estimate().status & Status.BAD_SAMPLE
+    stranger = dataclasses.replace(one[0], t=0.0, sensor="gnss9")
+    assert not federated.accepts(stranger)
+    assert federated.update(stranger) == federated.refuse(stranger, "late") == []
+    assert federated.update(dataclasses.replace(one[0], t=0.0, fix_type=FixType.NO_FIX)) == []
+    with pytest.raises(ValueError, match="the filter is at"):
+        federated.update(BarometerSample(0.5, 0.5, 95_000.0))
+
+
+def test_looking_at_an_estimate_changes_none():
+    _, increments, one, two, others = world(120)
+    federated, _, _ = fly(Config(CONSUMER, three()), [s for s in one + two + others if s.t < 119], increments)
+    before = federated.local("one")
+    few = ImuSamples(increments.t[:20], increments.dt[:20], increments.dtheta[:20], increments.dv[:20])
+    first = federated.estimate()
+    federated.predict(few)
+    second = federated.estimate()
+    assert first.lat == second.lat
+    for a, b in zip(before, federated.local("one"), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_two_filters_may_share_a_sensor_or_a_name_of_a_state():
+    _, increments, one, two, others = world(120)
+    locals_ = (
+        Local("one", (Watched(GnssAid()), Watched(BarometerAid()))),
+        Local("two", (Watched(GnssAid("gnss2")), Watched(BarometerAid()))),
+    )
+    few = ImuSamples(increments.t[:6000], increments.dt[:6000], increments.dtheta[:6000], increments.dv[:6000])
+    _, estimates, reports = fly(Config(CONSUMER, locals_), [s for s in one + two + others if s.t < 30], few)
+    assert set(estimates[-1].extra) == {"one_barometer_bias", "two_barometer_bias"}
+    assert len([r for r in reports if r.aid == "barometer" and r.t == 20.0]) == 2
