@@ -168,36 +168,35 @@ def predict(
         for j in range(CURVED):
             P[i, j] = P[j, i] = 0.0
     for i in range(CURVED, n):
-        for k in range(CURVED):
-            c = C[k, i]
-            for j in range(CURVED, n):
-                P[i, j] -= c * C[k, j]
+        a, b, c = C[0, i], C[1, i], C[2, i]
+        for j in range(CURVED, n):
+            P[i, j] -= a * C[0, j] + b * C[1, j] + c * C[2, j]
     kalman.predict(P, Phi, decay, half_noise, work)
 
     for k in range(CURVED):
         for i in range(n):
             point[i] = spread * C[k, i]
         _beyond_linear(B[k], odd, point, Phi, push_n, T)
-        for i in range(rows):
-            total = odd[i] / spread
-            for j in range(columns):
-                total += Phi[i, j] * C[k, j]
-            A[k, i] = total
+        for i in range(MOTION):
+            A[k, i] = odd[i] / spread
             B[k, i] /= spread
             mean[i] += B[k, i] / spread
         for i in range(rows, n):
             A[k, i] = decay[i] * C[k, i]
-    for k in range(CURVED):
-        for i in range(n):
-            a = A[k, i]
-            for j in range(n):
-                P[i, j] += a * A[k, j]
+    for i in range(rows):
+        for j in range(columns):
+            step = Phi[i, j]
+            if step != 0.0:
+                for k in range(CURVED):
+                    A[k, i] += step * C[k, j]
+    for i in range(n):
+        a, b, c = A[0, i], A[1, i], A[2, i]
+        for j in range(n):
+            P[i, j] += a * A[0, j] + b * A[1, j] + c * A[2, j]
     for i in range(MOTION):
+        a, b, c, shift = B[0, i], B[1, i], B[2, i], excess * mean[i]
         for j in range(MOTION):
-            total = excess * mean[i] * mean[j]
-            for k in range(CURVED):
-                total += B[k, i] * B[k, j]
-            P[i, j] += total
+            P[i, j] += a * B[0, j] + b * B[1, j] + c * B[2, j] + shift * mean[j]
     return mean
 
 

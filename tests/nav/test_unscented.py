@@ -224,7 +224,7 @@ def test_small_errors_take_the_linear_step():
 def test_time_update_is_a_strapdown_of_every_point(level):
     """All 31 points through the non-linear strapdown for a second of turning flight, summed with the printed weights.
 
-    What `predict` says beyond the linear step must be what they say beyond it, to a few per cent.
+    What `predict` says beyond the linear step must be what they say beyond it, to two per cent.
     """
     model = ErrorModel(ImuModel(0.0, 0.0, 1e-3, 0.05))
     n = model.size
@@ -264,9 +264,10 @@ def test_time_update_is_a_strapdown_of_every_point(level):
     sigma = np.sqrt(np.diag(expected))
     beyond = np.abs((expected - linear) / np.outer(sigma, sigma)).max()
     missed = np.abs((P - expected) / np.outer(sigma, sigma)).max()
-    print(level, beyond, missed, np.abs(mean / sigma).max(), np.abs((mean - shift) / sigma).max())
-    assert missed < 0.15 * beyond
-    assert np.abs((mean - shift) / sigma).max() < 0.05 * np.abs(mean / sigma).max()
+    assert beyond > 0.05
+    assert missed < 0.02 * beyond
+    assert np.abs(mean / sigma).max() > 0.1
+    assert np.abs((mean - shift) / sigma).max() < 0.005 * np.abs(mean / sigma).max()
 
 
 class Filter:
@@ -342,18 +343,17 @@ def test_small_misalignment_is_the_linear_filter():
 
 
 def test_converges_from_a_bad_alignment():
-    """8 deg of level and 60 deg of heading error (1 sigma), GNSS each second in flight: six runs with either engine.
+    """8 deg of level and 60 deg of heading error (1 sigma), GNSS each second in flight: twelve runs with either engine.
 
     After 20 s the linear filter is wrong by tens of degrees and sure of itself; the sigma points find the heading.
     """
     results = {}
     for engine in ("linear", "sigma"):
-        runs = [from_bad_alignment(engine, 8.0, 60.0, 21, seed) for seed in range(6)]
+        runs = [from_bad_alignment(engine, 8.0, 60.0, 21, seed) for seed in range(12)]
         heading = np.sqrt(np.mean([phi[-1, 2] ** 2 for phi, _, _ in runs])) / DEG
         level = np.sqrt(np.mean([phi[-1, :2] ** 2 for phi, _, _ in runs])) / DEG
         results[engine] = heading, level, np.median([nees[-1] for _, nees, _ in runs])
         assert all(smallest > 0 for _, _, smallest in runs)
-    print(results)
     assert results["sigma"][0] < 0.3 * results["linear"][0]
     assert results["sigma"][1] < 0.5 * results["linear"][1]
     assert results["sigma"][1] < 1.0
