@@ -223,10 +223,17 @@ def _points(
     columns, n = root.shape
     size = 2 * columns + 1
     q, v, place, further = np.empty((size, 4)), np.empty((size, 3)), np.empty((size, 3)), np.empty((size, n))
+    error = np.zeros(n)
     for k in range(size):
-        q[k], v[k], place[k], further[k] = q_nb, v_n, lla, x
+        for i in range(4):
+            q[k, i] = q_nb[i]
+        for i in range(3):
+            v[k, i], place[k, i] = v_n[i], lla[i]
+        for i in range(n):
+            further[k, i] = x[i]
+            if k > 0:
+                error[i] = spread * root[k - 1, i] if k <= columns else -spread * root[k - 1 - columns, i]
         if k > 0:
-            error = spread * root[k - 1] if k <= columns else -spread * root[k - 1 - columns]
             remove(q[k], v[k], place[k], further[k], error)
     return q, v, place, further
 
@@ -303,7 +310,8 @@ def correct(P: Array, root: Array, A: Array, R_curved: Array, R: Array, nu: Arra
     noise, a, y = np.empty((used, used)), np.empty((used, n)), np.empty(used)
     for i in range(used):
         y[i] = nu[kept[i]]
-        a[i] = A[kept[i]]
+        for j in range(n):
+            a[i, j] = A[kept[i], j]
         for k in range(used):
             noise[i, k] = R_curved[kept[i], kept[k]]
         noise[i, i] += R[kept[i]]
@@ -319,7 +327,8 @@ def correct(P: Array, root: Array, A: Array, R_curved: Array, R: Array, nu: Arra
     found, gain = np.zeros(n), np.empty(n)
     for i in range(used):
         total = 1.0
-        gain[:] = 0.0
+        for j in range(n):
+            gain[j] = 0.0
         for k in range(n):
             total += a[i, k] * a[i, k]
             c = a[i, k]
@@ -341,9 +350,10 @@ def correct(P: Array, root: Array, A: Array, R_curved: Array, R: Array, nu: Arra
             for j in range(n):
                 a[k, j] -= shrink * product * a[i, j]
     _turn(root, found)
-    P[:] = 0.0
-    for k in range(n):
-        for i in range(n):
+    for i in range(n):
+        for j in range(n):
+            P[i, j] = 0.0
+        for k in range(n):
             c = root[k, i]
             for j in range(n):
                 P[i, j] += c * root[k, j]
