@@ -68,7 +68,9 @@ def test_ranks():
     still, turned = Segment(paper_F(), ALL, 60.0), Segment(paper_F(np.pi / 2), ALL, 60.0)
 
     def rank(Q):
-        return analyse(Q, 1e-8).rank
+        found = analyse(Q, 1e-8).rank
+        assert found == np.linalg.matrix_rank(Q, tol=1e-8)
+        return found
 
     assert rank(derivatives(Segment(paper_F(), VELOCITY, 60.0))) == 7
     assert rank(derivatives(Segment(paper_F(), BOTH, 60.0))) == 9

@@ -167,7 +167,7 @@ def test_normalised_weights():
 def test_normalised_weights_literal_doubles_healthy_R():
     N = normalised_weights(np.zeros(2), np.full(2, 8.0), literal=True)
     np.testing.assert_array_equal(Weight(N[0]).adapt(np.zeros(3), np.eye(3), np.ones(3), 0.0), 2.0)
-    # what that does to two filters that are reset to their fusion at each look: the sigma claimed is a fifth too large
+    # two filters that are reset to their fusion at each look: the sigma claimed is 30 % above that of the right R
     Q, R = 1.0, 1.0
 
     def steady(factor):
@@ -178,7 +178,7 @@ def test_normalised_weights_literal_doubles_healthy_R():
         return P
 
     honest, claimed = steady(1.0), steady(2.0)
-    assert 1.1 < math.sqrt(claimed / honest) < 1.42
+    assert 1.25 < math.sqrt(claimed / honest) < 1.35
     np.testing.assert_array_equal(normalised_weights(np.array([9.0, 0.0]), np.full(2, 8.0), literal=True), [0, 1])
 
 
