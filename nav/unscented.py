@@ -377,7 +377,7 @@ def update(
     q_nb: Array, v_n: Array, lla: Array, x: Array, P: Array, z: Array, h: Callable[[Points], Array], R: Array,
     H: Array | None = None, scaling: Scaling | None = None, threshold: float = math.inf,
 ) -> tuple[Array, Array, float]:  # fmt: skip
-    """One measurement into estimate and covariance, in place, if its nis is at most ``threshold``; (nu, S, nis).
+    """One measurement (``R`` finite) into the estimate and ``P`` if its nis is at most ``threshold``; (nu, S, nis).
 
     ``h`` gives the measurement at every point at once, (points, m): a plain function of arrays, or one that hands them
     to a kernel. Differences that wrap (headings) are its own affair: let it return them near ``z``. With an ``H``
