@@ -1,0 +1,284 @@
+"""What becomes of R and P when a measurement is not what the filter expects.
+
+Every policy on R has one method, ``adapt(nu, S, R, t) -> variances``: from the innovation ``nu`` (m,), its covariance
+``S = H P H' + diag(R)`` (m, m), the variances ``R`` (m,) and the time ``t`` [s], the variances to use in this update;
+an infinite one leaves its axis out. A policy holds the state of one sensor: build one for each.
+
+Order of application (`InOrder` sees to it that each policy is told the S that the one before has left):
+
+1. `SageHusa`: what R has been learned to be, so that everything after it judges by the R that is true;
+2. `Gate`: an axis that a detector has put out stays out, and nobody inflates or learns from it;
+3. `MahalanobisInflation`: what passes and is still too far off counts for less;
+4. `Weight`: what the detectors of all sensors together say (`normalised_weights`);
+5. after the update `learn` shows the residual to `SageHusa`.
+
+`Fading` is about P: it raises the gain, so it must never answer an outlier of the measurement. Gate first, then apply
+its factor to P, and form S (and the sigma points) anew before the update.
+
+Detectors must go on seeing the S of the R that was told, not of the one used here: otherwise a weight feeds back into
+the statistic that made it.
+
+Sources: Zhou et al. 2025 (normalised weights, Eq 22-26), Cheng et al. 2020 (Sage-Husa, Eq 25-30; fading, Eq 31-36),
+Zhu et al. 2020 (inflation, Eq 8-12), Chang, J. Geodesy 88 (2014) 391 (inflation by the Mahalanobis distance).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from nav._jit import njit
+from nav.detection import Detector, chi_square_threshold, whiten
+from nav.kalman import invert
+from nav.samples import Array
+
+TOLERANCE = 1e-7  # of the distance, relative to its limit
+ITERATIONS = 200  # only the literal form needs as many; the others end long before
+R_FLOOR, R_CEILING = 0.25, 100.0  # of the nominal variance, between which `SageHusa` may go
+
+
+class Policy(Protocol):
+    """Anything that decides on the variances of one sensor's measurement."""
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """Variances (m,) to use for the innovation ``nu`` (m,), S = H P H' + diag(R), at ``t`` [s]."""
+        ...
+
+
+@dataclass
+class Gate:
+    """The axes that a ``detector`` puts out are left out."""
+
+    detector: Detector
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`."""
+        return np.where(self.detector.step(nu, S, t).axis_mask, R, np.inf)
+
+
+@njit
+def inflation(nu: Array, HPH: Array, R: Array, limit: float, reciprocal: bool, literal: bool) -> tuple[float, int]:
+    """(lambda, iterations) with ``theta(lambda) = nu' (H P H' + lambda R)^-1 nu = limit``; lambda = 1 when it is less.
+
+    Newton's method from 1, with ``y = (H P H' + lambda R)^-1 nu`` and ``theta' = -y' R y``:
+
+    on theta:    lambda += (theta - limit) / (y' R y)                           (Eq 12, with its fraction put right)
+    on 1/theta:  lambda += (1/limit - 1/theta) theta^2 / (y' R y)               (``reciprocal``)
+
+    theta is convex and 1/theta concave, so both come from the left and theta stays over the limit until it is within
+    `TOLERANCE` of it. The reciprocal takes one step when H P H' is proportional to R. ``literal`` is Eq 12 as printed,
+    the fraction upside down: it ends at the root by chance only.
+    """
+    m = len(nu)
+    S = np.empty((m, m))
+    lam = 1.0
+    for iteration in range(ITERATIONS):
+        for i in range(m):
+            for j in range(m):
+                S[i, j] = HPH[i, j]
+            S[i, i] += lam * R[i]
+        inverse, definite = invert(S)
+        theta, slope = 0.0, 0.0
+        for i in range(m):
+            y = 0.0
+            for j in range(m):
+                y += inverse[i, j] * nu[j]
+            theta += nu[i] * y
+            slope += R[i] * y * y
+        if not (definite and math.isfinite(theta)):
+            return math.nan, iteration
+        excess = theta - limit
+        if excess <= (TOLERANCE * limit if lam > 1.0 else 0.0):
+            return lam, iteration
+        if literal:
+            lam += slope / excess
+        elif reciprocal:
+            lam += excess * theta / (limit * slope)
+        else:
+            lam += excess / slope
+    return lam, ITERATIONS
+
+
+@dataclass
+class MahalanobisInflation:
+    """R -> lambda R, so that the squared distance nu' S^-1 nu of a suspect measurement is at its limit.
+
+    The limit is the chi-square quantile that a sound measurement exceeds with probability ``false_alarm`` (1 % in Zhu
+    et al.). What the measurement moves then falls with its error, but never to nothing: from a squared distance of
+    ``reject_above`` on it is left out altogether. A measurement without a distance (not a number) is left out too.
+    """
+
+    false_alarm: float = 0.01
+    reject_above: float = math.inf
+    reciprocal: bool = True
+    literal: bool = False
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`."""
+        limit = chi_square_threshold(self.false_alarm, len(nu))
+        theta = whiten(nu, S)[1]
+        if theta <= limit:
+            return R
+        if not theta <= self.reject_above:
+            return np.full_like(R, np.inf)
+        lam, _ = inflation(nu, S - np.diag(R), R, limit, self.reciprocal, self.literal)
+        return lam * R if math.isfinite(lam) else np.full_like(R, np.inf)
+
+
+def normalised_weights(
+    statistics: Array, thresholds: Array, lower: float = 0.2, upper: float = 0.9, literal: bool = False
+) -> Array:
+    """Weights N of several sensors from their detectors' ``statistics`` (J,) or, axis by axis, (J, m); same shape.
+
+    B_j = 1 - statistic_j / threshold_j says how far sensor j is from an alarm (Eq 22), and
+
+    N_j = B_j / max B                                                           (Eq 24 has the sum: see below)
+
+    with N = 0 (left out) where B is at most ``lower`` or no number, and N = 1 where B is at least ``upper`` (Eq 23).
+    R_j = R0_j / N_j: see `Weight`. The best sensor keeps its R, and a sensor that is alone is never weakened.
+
+    ``literal`` is Eq 22-25 as printed, without limits: N_j = B_j / sum B is 1/J for J healthy sensors, which
+    multiplies every R by J although nothing is wrong.
+    """
+    health = 1.0 - np.asarray(statistics, dtype=float) / thresholds
+    lowest = 0.0 if literal else lower
+    health = np.where(health > lowest, health, 0.0)
+    whole = health.sum(axis=0) if literal else health.max(axis=0)
+    N: Array = health / np.where(whole > 0.0, whole, 1.0)
+    return N if literal else np.where(health < upper, N, 1.0)
+
+
+@dataclass
+class Weight:
+    """R -> R / N with the weight ``N`` of `normalised_weights`, one number or one for each axis; 0 leaves out.
+
+    For a dense R0 this would be D^-1/2 R0 D^-1/2 with D = diag(N); D^-1 R0 (Eq 26) is symmetric for diagonal R0 only.
+    Whoever fuses the sensors sets ``N`` before each update.
+    """
+
+    N: Array | float = 1.0
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`."""
+        N = np.broadcast_to(self.N, R.shape)
+        return np.where(N > 0.0, R / np.where(N > 0.0, N, 1.0), np.inf)
+
+
+@dataclass
+class SageHusa:
+    """R learned from the residuals (Cheng et al. 2020, Eq 25-30): only R, axis by axis, between floors.
+
+    R <- (1 - d_k) R + d_k (e e' + H P+ H'),  e = z - h(x+),  d_k = (1 - b) / (1 - b^(k+1))
+
+    ``b`` (0.95 to 0.99) sets the memory, 1/(1 - b) looks. k counts from one, so that the nominal R is the first
+    member of the mean (Eq 25 prints b^k with k = 0 at first: a division by zero). What is learned is the ratio to the
+    nominal variance, so a sensor that tells its own sigma is followed; it stays within `R_FLOOR` and `R_CEILING`.
+
+    ``literal`` is the mean of nu nu' - sum Wc (z - Z_j)(z - Z_j)' as printed, whose sum has the measurement where the
+    mean of the sigma points belongs: it is -H P- H' whatever was measured, and R becomes negative.
+    """
+
+    b: float = 0.98
+    literal: bool = False
+    ratio: Array | None = field(default=None, init=False)  # (m,) learned variance / nominal variance
+    _looks: int = field(default=0, init=False)
+    _R: Array = field(default_factory=lambda: np.ones(1), init=False)  # nominal, of the last look
+    _HPH: Array = field(default_factory=lambda: np.zeros(1), init=False)  # its diagonal before the update
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.b < 1.0:
+            raise ValueError(f"a forgetting factor between 0 and 1 is needed, not {self.b}")
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`."""
+        if self.ratio is None or len(self.ratio) != len(R):
+            self.ratio, self._looks = np.ones_like(R), 0
+        self._R, self._HPH = R, np.diag(S) - R
+        return self.ratio * R
+
+    def learn(self, residual: Array, HPH_after: Array) -> None:
+        """Take z - h(x+) (m,) and H P+ H' (m, m) of the look just adapted; an axis that is NaN teaches nothing."""
+        if self.ratio is None:
+            return
+        self._looks += 1
+        d = (1.0 - self.b) / (1.0 - self.b ** (self._looks + 1))
+        look = (-self._HPH if self.literal else residual**2 + np.diag(HPH_after)) / self._R
+        learned = (1.0 - d) * self.ratio + d * look
+        if not self.literal:
+            learned = np.clip(learned, R_FLOOR, R_CEILING)
+        self.ratio = np.where(np.isfinite(residual), learned, self.ratio)
+
+
+class InOrder:
+    """Policies one after the other, each with the S that belongs to the R of the one before.
+
+    An axis that one has left out is not shown to the next. `learn` goes to those that learn; a residual whose variance
+    was made k times larger after them counts as one k^-1/2 times as large, so that an outlier teaches no more than the
+    limit that it was inflated to.
+    """
+
+    def __init__(self, policies: Sequence[Policy]) -> None:
+        self.policies = tuple(policies)
+        self._told: list[tuple[SageHusa, Array]] = []
+        self._used: Array = np.empty(0)
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`; ``R`` is finite."""
+        HPH = S - np.diag(R)
+        self._told = []
+        for policy in self.policies:
+            kept = np.isfinite(R)
+            if not kept.any():
+                break
+            adapted = np.full_like(R, np.inf)
+            adapted[kept] = policy.adapt(nu[kept], HPH[np.ix_(kept, kept)] + np.diag(R[kept]), R[kept], t)
+            R = adapted
+            if isinstance(policy, SageHusa):
+                self._told.append((policy, R))
+        self._used = R
+        return R
+
+    def learn(self, residual: Array, HPH_after: Array) -> None:
+        """See `SageHusa.learn`: the residual (m,) and H P+ H' (m, m) after the update."""
+        for policy, R in self._told:
+            in_use = np.isfinite(self._used)
+            share = np.where(in_use, R / np.where(in_use, self._used, 1.0), np.nan)
+            policy.learn(residual * np.sqrt(share), HPH_after)
+
+
+@dataclass
+class Fading:
+    """The factor on P that makes it as large as the last innovations say (Cheng et al. 2020, Eq 31-36).
+
+    Divergence: nu' S^-1 nu > ``alpha`` m. Then lambda = max(1, tr(S^-1 C) / m), with C the mean of nu nu' over the
+    last ``window`` looks. Both are free of units.
+
+    ``literal`` compares nu' nu with alpha tr(S) and takes tr(C) / tr(S): sums of m^2, (m/s)^2 and rad^2, in which a
+    position hides whatever heading does.
+    """
+
+    window: int = 10
+    alpha: float = 1.5
+    literal: bool = False
+    _looks: deque[Array] = field(default_factory=deque, init=False)
+
+    def factor(self, nu: Array, S: Array) -> float:
+        """Lambda (at least 1) to multiply P with, from a gated innovation ``nu`` (m,) and its covariance ``S``."""
+        if not np.isfinite(nu).all():
+            return 1.0
+        if self._looks and len(self._looks[0]) != len(nu):
+            self._looks.clear()
+        self._looks.append(nu)
+        if len(self._looks) > self.window:
+            self._looks.popleft()
+        looks = np.array(self._looks)
+        distances = np.sum(looks**2, axis=1) if self.literal else np.sum(looks * np.linalg.solve(S, looks.T).T, axis=1)
+        expected = float(np.trace(S)) if self.literal else len(nu)
+        if not distances[-1] > self.alpha * expected:
+            return 1.0
+        return max(1.0, float(distances.mean()) / expected)
