@@ -24,7 +24,6 @@ from nav.local_filter import (
     BarometerAid,
     GnssAid,
     LocalFilter,
-    Look,
     MagnetometerAid,
     Policy,
     aid_blocks,
@@ -49,29 +48,23 @@ from nav.samples import (
     AirspeedSample,
     Array,
     BarometerSample,
-    BodyVelocitySample,
     Estimate,
     FixType,
     GnssSample,
     ImuSamples,
     MagnetometerSample,
-    PositionSample,
     Sample,
-    StarSample,
     Status,
     UpdateReport,
 )
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
 
-KINDS = {
+KINDS: dict[type[Sample], str] = {
     GnssSample: "gnss",
     BarometerSample: "barometer",
     MagnetometerSample: "magnetometer",
     AirspeedSample: "airspeed",
-    BodyVelocitySample: "body_velocity",
-    StarSample: "star_tracker",
-    PositionSample: "position_fix",
 }
 
 
@@ -79,11 +72,13 @@ KINDS = {
 class InsConfig:
     """What the filter is told: SI, radians, body axes from the IMU. A block whose sigma is zero is left out.
 
-    ``aids`` names the kinds of sample that are fused (`AIDS`); samples of other kinds serve the alignment only.
+    ``aids`` names the kinds of sample that are fused (`AIDS`), one sensor of each; samples of other kinds serve the
+    alignment only. ``others`` are further aids, by the names of their sensors.
     """
 
     imu: ImuModel
     aids: tuple[str, ...] = AIDS
+    others: tuple[Aid, ...] = ()
     mounting_sigma: float = 0.0  # between the axes of the IMU, whose attitude is found, and of the body, reported [rad]
     covariance_period: int = 10  # IMU samples per covariance step; 50 ms and less lose nothing on an aircraft
 
@@ -175,9 +170,13 @@ class InsConfig:
             gust_correlation_s=self.gust_correlation_s,
         )
 
+    def used(self) -> list[Aid]:
+        """The aids in use."""
+        return [*(self.aid_of(kind) for kind in AIDS if kind in self.aids), *self.others]
+
     def aid_blocks(self) -> list[Block]:
         """The error states of the aids in use."""
-        return aid_blocks([self.aid_of(kind) for kind in AIDS if kind in self.aids])
+        return aid_blocks(self.used())
 
 
 class Ins:
@@ -193,9 +192,10 @@ class Ins:
     ) -> None:
         self.config = config
         self.t = math.nan
-        self._aids = {kind: config.aid_of(kind) for kind in AIDS}
+        self._aids = {kind: config.aid_of(kind) for kind in config.aids}
+        self._others = {aid.sensor: aid for aid in config.others}
         self._gate = ChiSquareGate(config.false_rejection)
-        self._filter = LocalFilter(config.imu, [self._aids[kind] for kind in AIDS if kind in config.aids], self._gate)
+        self._filter = LocalFilter(config.imu, config.used(), self._gate)
         self._filter.policies = policies or {}
         self.model = self._filter.model
         self._reference = Reference([self.model], [1.0], config.covariance_period, field_n)
@@ -226,7 +226,7 @@ class Ins:
     @property
     def listening(self) -> bool:
         """Whether a sample of some kind would still be used."""
-        return self._state is None or bool(self.config.aids)
+        return self._state is None or bool(self.config.aids or self.config.others)
 
     @property
     def problem(self) -> str:
@@ -250,10 +250,14 @@ class Ins:
         self.t = float(imu.t[-1])
 
     def accepts(self, sample: Sample) -> bool:
-        """Whether the sample's kind is an aid, or it can still serve the alignment."""
+        """Whether the sample is of an aid, or can still serve the alignment."""
         if self._state is None:
             return isinstance(sample, (GnssSample, MagnetometerSample))
-        return KINDS[type(sample)] in self.config.aids
+        return self._aid(sample) is not None
+
+    def _aid(self, sample: Sample) -> Aid | None:
+        """The aid that a sample is of."""
+        return self._others.get(sample.sensor) or self._aids.get(KINDS.get(type(sample), ""))
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
@@ -275,22 +279,23 @@ class Ins:
             if initial is not None:
                 self.start(initial)
             return []
-        kind = KINDS[type(sample)]
-        if kind not in self.config.aids:
+        aid = self._aid(sample)
+        if aid is None:
             return []
         self._reference.settle(state)
         if isinstance(sample, GnssSample):
-            return self._update_gnss(state, sample)
+            return self._update_gnss(state, sample, aid)
         reports = []
-        for part, _ in self._aids[kind].parts:
-            look = self._look(state, part, sample)
+        for part, _ in aid.parts:
+            look = self._filter.look(self._reference, state, aid, part, sample)
             if look is not None:
                 reports.append(self._filter.fuse(self._reference, state, sample, part, look))
         return reports
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
-        return refusals(sample, self._aids[KINDS[type(sample)]], reason, self.t)
+        aid = self._aid(sample)
+        return [] if aid is None else refusals(sample, aid, reason, self.t)
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
@@ -304,11 +309,8 @@ class Ins:
             last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _look(self, state: State, part: str, sample: Sample) -> Look | None:
-        return self._filter.look(self._reference, state, self._aids[KINDS[type(sample)]], part, sample)
-
-    def _update_gnss(self, state: State, sample: GnssSample) -> list[UpdateReport]:
-        look = self._look(state, "gnss_position", sample)
+    def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
+        look = self._filter.look(self._reference, state, aid, "gnss_position", sample)
         assert look is not None
         nu, H, R, _ = look
         S, nis = self._filter.absorb(self._reference, state, nu, H, R, -math.inf)
@@ -322,7 +324,7 @@ class Ins:
         verdict = self._monitor.judge(sample, v_n, sigma_v, nis <= threshold)
         use_velocity = with_velocity and self.config.gnss_use_velocity
         if verdict is Verdict.RECOVER:
-            self._give_up_position(state, sample, nu, S, use_velocity)
+            self._give_up_position(state, sample, aid, nu, S, use_velocity)
         weight, reason = 0.0, verdict.value
         policy = self._filter.policies.get("gnss_position")
         if verdict is Verdict.FUSE and policy is not None:
@@ -333,19 +335,21 @@ class Ins:
         withheld = "" if weight else f"position {reason}"
         reports = [UpdateReport(sample.t, sample.sensor, "gnss_position", nu, S, nis, threshold, weight, reason)]
         if use_velocity:
-            velocity = self._look(state, "gnss_velocity", sample)
+            velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             reports.append(self._filter.fuse(self._reference, state, sample, "gnss_velocity", velocity, withheld))
         return reports
 
-    def _give_up_position(self, state: State, sample: GnssSample, nu: Array, S: Array, use_velocity: bool) -> None:
+    def _give_up_position(
+        self, state: State, sample: GnssSample, aid: Aid, nu: Array, S: Array, use_velocity: bool
+    ) -> None:
         """Make the covariance as wide as the innovation says; the rest of the state keeps what it knows.
 
         When velocity is off as well, it goes too, and with it the wind that was estimated from it.
         """
         P = state.P[0]
         if use_velocity:
-            velocity = self._look(state, "gnss_velocity", sample)
+            velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             nu_v, H, R, _ = velocity
             S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf)

@@ -20,16 +20,19 @@ from nav import aiding
 from nav._jit import njit
 from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask
 from nav.earth import pressure_altitude
-from nav.error_model import Block, ErrorModel, ImuModel, markov
+from nav.error_model import Block, ErrorModel, ImuModel, Indices, markov
 from nav.kalman import innovate
 from nav.reference import Reference, State, absorb
 from nav.samples import (
     AirspeedSample,
     Array,
     BarometerSample,
+    BodyVelocitySample,
     GnssSample,
     MagnetometerSample,
+    PositionSample,
     Sample,
+    StarSample,
     UpdateReport,
 )
 
@@ -269,6 +272,115 @@ class AirspeedAid:
             return Look(nu, H, self._R[0], slow)
         nu, H = aiding.sideslip(state.q_nb, state.v_n, seat.x, wind, gust)
         return Look(nu, H, self._R[1], slow)
+
+
+@dataclass(frozen=True)
+class BodyVelocityAid:
+    """Velocity over ground along some body ``axes`` (indices), each with a scale factor error and a Markov error.
+
+    ``nonholonomic_sigma`` adds the constraint of wheels, which neither slip sideways nor leave the ground.
+    """
+
+    sensor: str = "body_velocity"
+    axes: tuple[int, ...] = (0, 1, 2)
+    sigma: float = 0.1  # [m/s]
+    scale_sigma: float = 0.0  # [1]
+    error_sigma: float = 0.0  # [m/s]
+    error_correlation_s: float = 300.0
+    nonholonomic_sigma: float | None = None  # [m/s]
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        own = ("body_velocity", len(self.axes))
+        return (own,) if self.nonholonomic_sigma is None else (own, ("nonholonomic", 2))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return f"{self.sensor}_scale", f"{self.sensor}_error"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        scale, error = self.states
+        return [
+            Block(scale, len(self.axes), self.scale_sigma),
+            markov(error, len(self.axes), self.error_sigma, self.error_correlation_s),
+        ]
+
+    @cached_property
+    def _told(self) -> tuple[Indices, Array, Array]:
+        """Axes, and the variances of the two parts."""
+        nonholonomic = np.full(2, (self.nonholonomic_sigma or 0.0) ** 2)
+        return np.array(self.axes), np.full(len(self.axes), self.sigma**2), nonholonomic
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, BodyVelocitySample)
+        axes, R, nonholonomic = self._told
+        state, (scale, error) = seat.state, seat.starts
+        if part == "nonholonomic":
+            return Look(*aiding.nonholonomic(state.q_nb, state.v_n, seat.x), nonholonomic)
+        if not aiding.measures(sample, axes):
+            return None
+        nu, H = aiding.body_velocity(state.q_nb, state.v_n, seat.x, axes, scale, error, sample.v_b)
+        return Look(nu, H, R)
+
+
+@dataclass(frozen=True)
+class StarAid:
+    """Attitude against the stars; ``sigma`` about each body axis [rad]."""
+
+    sensor: str = "star_tracker"
+    sigma: Axes = (2.4e-5, 2.4e-5, 7.3e-5)
+
+    parts = (("star_attitude", 3),)
+    states = ()
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        return []
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.array(self.sigma) ** 2
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, StarSample)
+        nu, H = aiding.star_attitude(seat.state.q_nb, seat.state.lla, seat.x, sample.t, sample.q_ib)
+        return Look(nu, H, self._R)
+
+
+@dataclass(frozen=True)
+class PositionFixAid:
+    """Position from a transponder or from terrain; ``sigma`` north, east, down [m]; with ``height`` or without."""
+
+    sensor: str = "position_fix"
+    sigma: Axes = (10.0, 10.0, 10.0)
+    height: bool = True
+
+    states = ()
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        return (("position_fix", 3 if self.height else 2),)
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        return []
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.array(self.sigma)[: 3 if self.height else 2] ** 2
+
+    def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
+        """See `Aid`."""
+        assert isinstance(sample, PositionSample)
+        h = sample.h if self.height else math.nan
+        nu, H = aiding.position_fix(seat.state.lla, seat.x, sample.lat, sample.lon, h)
+        return Look(nu, H, self._R) if len(nu) == len(self._R) else None
 
 
 def _white(sigma: Array, correlated_variance: Array) -> Array:
