@@ -44,12 +44,14 @@ class Kinematic:
     """A body on a track, in still standard air, engine off: a `MotionSource`.
 
     It goes on straight after its last segment and never ends by itself, unless it leaves the latitudes in which
-    north-east-down navigation works. The course is that of the track less any drift; the pitch is the angle of climb,
-    the bank tan(bank) = speed rate_of_turn / g. Start's pitch and roll, and any sway, come on top.
+    north-east-down navigation works. The heading is the track's course and any drift into the turn, the pitch the angle
+    of climb, and tan(bank) = speed x rate of turn / g, with g of the start; what the Earth's turn asks for sideways,
+    2 mrad at 100 m/s, is not banked for. Start's pitch and roll, and any sway, come on top.
 
     Latitude and longitude are integrated from tick to tick (Runge-Kutta, fourth order) on speed, course and height,
-    which are exact at every time, so that position and velocity agree to rounding. The increments are `increments` of
-    the rows: strapdown leads from each row exactly to the next.
+    which are exact at every time, so that position and velocity agree to 2e-8 m. The increments are `increments` of the
+    rows, so that strapdown leads from each row to the next. From the integrals of body rate they differ by the coning
+    within a tick: below 1e-9 rad in a quick roll at 200 Hz, and with the cube of the tick.
     """
 
     def __init__(self, start: Placement, rate_hz: float, along: Track | None = None, body: Body | None = None) -> None:

@@ -150,20 +150,20 @@ class Climb(_Segment):
 
     leg: Literal["climb"]
     by_m: Annotated[float, Field(ge=-20_500, le=20_500)]
-    climb_mps: Annotated[float, Field(gt=0, le=500)] | None = None
+    rate_mps: Annotated[float, Field(gt=0, le=500)] | None = None
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
-        return _one_of(self, "climb_mps", "duration_s")
+        return _one_of(self, "rate_mps", "duration_s")
 
     def knots(self, state: State) -> Knots:
         """One change of height."""
         if self.by_m == 0:
             raise ValueError("by_m: is no climb: leave the leg out, or use straight")
-        key = "climb_mps" if self.duration_s is None else "duration_s"
+        key = "rate_mps" if self.duration_s is None else "duration_s"
         _moving(key, state.speed)
-        knots = _change(CLIMB, self.by_m, self.climb_mps, self.duration_s, state.blend, key)
+        knots = _change(CLIMB, self.by_m, self.rate_mps, self.duration_s, state.blend, key)
         climb = np.abs(knots[:, 1 + CLIMB]).max()
         steepest = state.speed * math.tan(MAX_CLIMB_ANGLE)
         if climb > steepest:

@@ -133,7 +133,7 @@ SQUARE = "body = { blend_s = 0.5 }\n" + segments(
 )
 ACCELERATED = segments('leg = "straight"\nduration_s = 100', 'leg = "accelerate"\nto_mps = 200\nduration_s = 100')
 CLIMBS = 'body = { turns = "banked", blend_s = 2 }\n' + segments(
-    'leg = "climb"\nby_m = 300\nclimb_mps = 5',
+    'leg = "climb"\nby_m = 300\nrate_mps = 5',
     'leg = "turn"\nby_deg = -400\nradius_m = 500',
     'leg = "climb"\nby_m = -200\nduration_s = 100',
 )
@@ -230,7 +230,7 @@ def test_body_rate_is_that_of_the_attitude_and_sums_to_the_increments(name: str)
 
 def test_rows_of_a_moving_body_do_not_depend_on_how_they_are_asked_for() -> None:
     truth = 'body = { turns = "banked", drift_s = 0.1 }\n' + segments(
-        'leg = "turn"\nby_deg = 9\nrate_degps = 30', 'leg = "climb"\nby_m = 9\nclimb_mps = 9'
+        'leg = "turn"\nby_deg = 9\nrate_degps = 30', 'leg = "climb"\nby_m = 9\nrate_mps = 9'
     )
     whole, pieces = source(truth).advance(999), source(truth)
     blocks = [pieces.advance(n) for n in (1, 0, 1, 7, 390, 600)]
@@ -399,9 +399,9 @@ def test_it_ends_where_there_is_no_north() -> None:
             "truth.segments[0].to_mps: the speed is 50 m/s already",
         ),
         ('leg = "accelerate"\nto_mps = 60\nduration_s = 0.1', "", "truth.segments[0].duration_s: asks for 20.4 g"),
-        ('leg = "climb"\nby_m = 100\nclimb_mps = 60', "", "truth.segments[0].climb_mps: 60 m/s is steeper than 45 deg"),
-        ('leg = "climb"\nby_m = -1600\nclimb_mps = 6', "", "truth.segments[0].by_m: ends at -600 m"),
-        ('leg = "climb"\nby_m = 0\nclimb_mps = 6', "", "truth.segments[0].by_m: is no climb"),
+        ('leg = "climb"\nby_m = 100\nrate_mps = 60', "", "truth.segments[0].rate_mps: 60 m/s is steeper than 45 deg"),
+        ('leg = "climb"\nby_m = -1600\nrate_mps = 6', "", "truth.segments[0].by_m: ends at -600 m"),
+        ('leg = "climb"\nby_m = 0\nrate_mps = 6', "", "truth.segments[0].by_m: is no climb"),
         ('leg = "weave"\nswing_deg = 120\nperiod_s = 9\nswings = 0', "", "truth.segments[0].swings: must be greater"),
         ('leg = "weave"\nswing_deg = 120\nperiod_s = 2\nswings = 2', "", "truth.segments[0].period_s: asks for"),
         ('leg = "repeat"\nlast = 1\ntimes = 1', "", "truth.segments[0].last: there are only 0 segments before it"),
