@@ -119,6 +119,7 @@ class Kinematic:
     def _path(self, t: Array) -> Array:
         """Speed, course and height (N, 3)."""
         path: Array = self._track.path(t)
+        path[:, 0] = np.maximum(path[:, 0], 0.0) + 0.0  # a rounding error of -0.0 would be a body that goes backwards
         path[:, 1] += self._start[2]
         path[:, 2] += self._height
         return path
@@ -209,8 +210,8 @@ def _rows(
         air_b = quat_rotate(q_bn, v_n[k])
         airspeed = math.sqrt(squared)
         rest[k, SPEED] = airspeed
-        rest[k, ALPHA] = math.atan2(air_b[2], air_b[0]) if airspeed > 0.0 else 0.0
-        rest[k, BETA] = math.asin(max(-1.0, min(1.0, air_b[1] / airspeed))) if airspeed > 0.0 else 0.0
+        rest[k, ALPHA] = math.atan2(air_b[2], air_b[0]) if airspeed > 1e-9 else 0.0
+        rest[k, BETA] = math.asin(max(-1.0, min(1.0, air_b[1] / airspeed))) if airspeed > 1e-9 else 0.0
         rest[k, PRESSURE], rest[k, TEMPERATURE], rest[k, DENSITY] = isa_pressure(h), isa_temperature(h), isa_density(h)
         rest[k, BANK] = euler[0]
     return v_n, q_nb, omega_b, rest

@@ -1,9 +1,9 @@
 """Segments of a kinematic motion: the keys of a ``[[truth.segments]]`` table, and the curves in time they become.
 
 A motion is three rates over time: acceleration along the track, rate of turn of the course, and climb. Each is a cubic
-Hermite spline; its integral gives speed, course and height, its slope what the body's own rates need. So whatever is
-put together, speed and course have continuous second derivatives, height, bank and pitch continuous first ones, and
-all agree to rounding. A rate goes from zero to its steady value and back by the smooth step 3x^2 - 2x^3.
+Hermite spline; its integral gives speed, course and height, its slope what the body's own rates need, so all agree to
+rounding. A rate goes from zero to its steady value and back by the smooth step 3x^2 - 2x^3, so that whatever is put
+together, acceleration, bank and pitch are continuous, and but for the ends of a weave the body's rate too.
 """
 
 from __future__ import annotations
@@ -41,22 +41,17 @@ RATES = 3
 Knots: TypeAlias = Array
 
 
-@dataclass(frozen=True, slots=True)
-class State:
-    """What a segment finds: speed [m/s], and the time that its manoeuvre takes to build up and to fade [s]."""
-
-    speed: float
-    blend: float
-
-
 AnySegment = TypeVar("AnySegment", bound=Section)
 
 
 class _Segment(Section):
-    """What the segments have in common."""
+    """What the segments have in common.
+
+    Each gives its ``knots``, told the speed [m/s] that it finds and the time [s] that a manoeuvre takes to build up.
+    """
 
     def end_speed(self, speed: float) -> float:
-        """GroundSpeed [m/s] after the segment, given that before."""
+        """Speed [m/s] after the segment, given that before."""
         return speed
 
 
@@ -66,10 +61,10 @@ class Stop(_Segment):
     leg: Literal["stop"]
     duration_s: Duration
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """No rates."""
-        if state.speed > 0:
-            raise ValueError(f"leg: the body still moves at {state.speed:g} m/s: put an accelerate leg to 0 before it")
+        if speed > 0:
+            raise ValueError(f"leg: the body still moves at {speed:g} m/s: put an accelerate leg to 0 before it")
         return _steady(self.duration_s)
 
 
@@ -84,13 +79,13 @@ class Straight(_Segment):
     def _ends(self) -> Self:
         return _one_of(self, "length_m", "duration_s")
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """No rates."""
         if self.duration_s is not None:
             return _steady(self.duration_s)
         assert self.length_m is not None
-        _moving("length_m", state.speed)
-        return _steady(_duration("length_m", self.length_m / state.speed))
+        _moving("length_m", speed)
+        return _steady(_duration("length_m", self.length_m / speed))
 
 
 class Accelerate(_Segment):
@@ -109,13 +104,11 @@ class Accelerate(_Segment):
         """The speed it leads to."""
         return self.to_mps
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """One change of speed."""
-        if self.to_mps == state.speed:
-            raise ValueError(f"to_mps: the speed is {state.speed:g} m/s already: leave the leg out, or use straight")
-        knots = _change(
-            ACCELERATION, self.to_mps - state.speed, self.accel_mps2, self.duration_s, state.blend, "accel_mps2"
-        )
+        if self.to_mps == speed:
+            raise ValueError(f"to_mps: the speed is {speed:g} m/s already: leave the leg out, or use straight")
+        knots = _change(ACCELERATION, self.to_mps - speed, self.accel_mps2, self.duration_s, blend, "accel_mps2")
         _bearable("duration_s", np.abs(knots[:, 1]).max())
         return knots
 
@@ -134,14 +127,14 @@ class Turn(_Segment):
         _turns(self.by_deg)
         return _one_of(self, "rate_degps", "radius_m", "duration_s")
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """One change of course. Where it turns steadily the track is a circle."""
         key = next(key for key in ("rate_degps", "radius_m", "duration_s") if getattr(self, key) is not None)
-        _moving(key, state.speed)
+        _moving(key, speed)
         rate = None if self.rate_degps is None else math.radians(self.rate_degps)
-        rate = rate if self.radius_m is None else state.speed / self.radius_m
-        knots = _change(TURN, math.radians(self.by_deg), rate, self.duration_s, state.blend, key)
-        _bearable(key, state.speed * np.abs(knots[:, 1 + TURN]).max())
+        rate = rate if self.radius_m is None else speed / self.radius_m
+        knots = _change(TURN, math.radians(self.by_deg), rate, self.duration_s, blend, key)
+        _bearable(key, speed * np.abs(knots[:, 1 + TURN]).max())
         return knots
 
 
@@ -157,17 +150,17 @@ class Climb(_Segment):
     def _ends(self) -> Self:
         return _one_of(self, "rate_mps", "duration_s")
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """One change of height."""
         if self.by_m == 0:
             raise ValueError("by_m: is no climb: leave the leg out, or use straight")
         key = "rate_mps" if self.duration_s is None else "duration_s"
-        _moving(key, state.speed)
-        knots = _change(CLIMB, self.by_m, self.rate_mps, self.duration_s, state.blend, key)
+        _moving(key, speed)
+        knots = _change(CLIMB, self.by_m, self.rate_mps, self.duration_s, blend, key)
         climb = np.abs(knots[:, 1 + CLIMB]).max()
-        steepest = state.speed * math.tan(MAX_CLIMB_ANGLE)
+        steepest = speed * math.tan(MAX_CLIMB_ANGLE)
         if climb > steepest:
-            raise ValueError(f"{key}: {climb:.3g} m/s is steeper than 45 deg: at {state.speed:g} m/s climb slower")
+            raise ValueError(f"{key}: {climb:.3g} m/s is steeper than 45 deg: at {speed:g} m/s climb slower")
         _bearable(key, 1.5 * climb / (knots[1, 0] - knots[0, 0]))
         return knots
 
@@ -185,20 +178,20 @@ class Weave(_Segment):
     swings: Annotated[int, Field(ge=1, le=1000)]
     to_mps: GroundSpeed | None = None
 
-    def knots(self, state: State) -> Knots:
+    def knots(self, speed: float, blend: float) -> Knots:
         """One sine of the rate of turn per period, two of the acceleration."""
         _turns(self.swing_deg)
-        _moving("swings", state.speed)
-        fastest = state.speed if self.to_mps is None else self.to_mps
+        _moving("swings", speed)
+        fastest = speed if self.to_mps is None else self.to_mps
         quarter = self.period_s / 4
         swing = np.zeros((4 * PIECES + 1, 1 + 2 * RATES))
         x = np.linspace(0.0, np.pi, 4 * PIECES + 1)
         swing[:, 0] = 2 * quarter * x / np.pi
         _sine(swing, TURN, math.radians(self.swing_deg))
-        _sine(swing[: 2 * PIECES + 1], ACCELERATION, fastest - state.speed)
-        _sine(swing[2 * PIECES :], ACCELERATION, state.speed - fastest)
+        _sine(swing[: 2 * PIECES + 1], ACCELERATION, fastest - speed)
+        _sine(swing[2 * PIECES :], ACCELERATION, speed - fastest)
         _bearable("period_s", np.abs(swing[:, 1]).max())
-        _bearable("period_s", max(fastest, state.speed) * np.abs(swing[:, 1 + TURN]).max())
+        _bearable("period_s", max(fastest, speed) * np.abs(swing[:, 1 + TURN]).max())
         back = swing.copy()
         back[:, [1 + TURN, 1 + RATES + TURN]] *= -1
         rows = [swing]
@@ -247,7 +240,7 @@ class Body(Section):
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """GroundSpeed [m/s], course less that at the start [rad] and height above it [m] as functions of time.
+    """Speed [m/s], course less that at the start [rad] and height above it [m] as functions of time.
 
     ``path(t)`` (N, 3) are these three, ``rates(t)`` (N, 3) their rates, ``rates(t, 1)`` their second derivatives.
     ``legs`` are the times at which segments begin and their indexes; the last, -1, goes on straight for ever.
@@ -273,7 +266,7 @@ def lay_track(segments: Sequence[Segment], speed: float = 0.0, height: float = 0
     start_speed, t, count = speed, 0.0, 0
     for index, segment in _unrolled(segments):
         try:
-            knots = segment.knots(State(speed, blend))
+            knots = segment.knots(speed, blend)
             height += float(np.trapezoid(knots[:, 1 + CLIMB], knots[:, 0]))  # exact for smooth steps and constants
             if not HEIGHTS[0] <= height <= HEIGHTS[1]:
                 raise ValueError(f"by_m: ends at {height:g} m: stay from {HEIGHTS[0]:g} to {HEIGHTS[1]:g} m")

@@ -302,6 +302,16 @@ def test_acceleration_within_a_time_or_at_a_rate() -> None:
     assert np.abs(standing.dv[1:, :2]).max() * 200 < 1e-9
 
 
+def test_rounding_never_lets_a_body_that_stops_go_backwards() -> None:
+    """A row just before the stop, where speed is less than its rounding."""
+    for speed in np.random.default_rng(1).uniform(0.1, 30, 60).round(3):
+        truth = segments('leg = "accelerate"\nto_mps = 0\nduration_s = 2.0000001')
+        body = source(truth, f"speed_mps = {speed}", 50).advance(102)
+        assert np.abs(euler_deg(body) - [0, 0, 30]).max() < 1e-9
+        assert not body.alpha.any()
+        assert not body.v_n[-1].any()
+
+
 def test_drift_points_the_nose_into_the_turn() -> None:
     body = rows("stop_and_go")
     k = np.flatnonzero(body.leg == 7)[350]  # to the left at 30 deg/s
