@@ -108,7 +108,8 @@ def motion(scenario: Scenario, seed: int) -> MotionSource:
         return Flight(scenario.truth, scenario.plan, seed)
     from testbed.kinematic import Kinematic
 
-    return Kinematic(scenario.truth.start, scenario.truth.rate_hz)
+    truth = scenario.truth
+    return Kinematic(truth.start, truth.rate_hz, truth.track(), truth.body)
 
 
 @dataclass(slots=True)
@@ -262,7 +263,8 @@ def run(
         behind = {
             name: one.horizon.lag_s + 1 / inertial[one.imu].rate_hz - 1 / rate_hz for name, one in filters.items()
         }
-        plan = [leg.leg for leg in scenario.plan]
+        legs = scenario.plan if isinstance(scenario.truth, FlightTruth) else scenario.truth.segments
+        plan = [leg.leg for leg in legs]
 
         pacer = Pacer(realtime) if realtime else None
         recorder = Recorder(out / "run.nc" if out else None, scenario, seed)

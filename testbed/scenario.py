@@ -26,6 +26,7 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.keypath import KeyPath
 from testbed.schema import Section
+from testbed.segments import Body, GroundSpeed, Segment, Track, lay_track
 from testbed.sensors import CONFIGS, SensorConfig, Site
 from testbed.sensors.magnetometer import WMM_YEARS
 from testbed.sensors.timing import TICK_TOLERANCE
@@ -103,8 +104,8 @@ class FlightTruth(Section):
     wind: Wind = Wind()
 
 
-class Rest(Section):
-    """Where and how a body at rest stands."""
+class KinematicStart(Section):
+    """Where a kinematic body starts and how it lies; its motion comes on top of pitch and roll."""
 
     lat_deg: Latitude
     lon_deg: Longitude
@@ -112,15 +113,25 @@ class Rest(Section):
     heading_deg: Heading = 0.0
     pitch_deg: float = Field(default=0.0, ge=-90, le=90)
     roll_deg: float = Field(default=0.0, ge=-180, le=180)
+    speed_mps: GroundSpeed = 0.0
 
 
 class KinematicTruth(Section):
-    """Motion from a formula: a body at rest on the turning Earth."""
+    """Motion from a formula: a body at rest on the turning Earth, or on segments one after the other.
+
+    After the last segment it goes straight on at the speed reached.
+    """
 
     source: Literal["kinematic"]
-    motion: Literal["static"] = "static"
+    motion: Literal["static", "segments"] = "static"
     rate_hz: TickRate = 200.0
-    start: Rest
+    start: KinematicStart
+    body: Body = Body()
+    segments: tuple[Segment, ...] = ()
+
+    def track(self) -> Track:
+        """The track along the segments. Raises ValueError with the key of the first that can't be."""
+        return lay_track(self.segments, self.start.speed_mps, self.start.alt_m, self.body.blend_s)
 
 
 def _sensor(table: object) -> Section:
@@ -402,6 +413,7 @@ def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     if not isinstance(scenario.truth, FlightTruth):
         if scenario.plan:
             yield ("plan",), f"a body of source {scenario.truth.source!r} flies no plan: leave it out"
+        yield from _track_faults(scenario.truth)
         return
     if not scenario.plan:
         yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
@@ -417,6 +429,22 @@ def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     except ValueError as error:
         key, _, what = str(error).partition(": ")
         yield keypath.read(key), what
+
+
+def _track_faults(truth: KinematicTruth) -> Iterator[tuple[KeyPath, str]]:
+    if truth.motion == "static":
+        if truth.segments:
+            yield ("truth", "segments"), 'a static body follows none: set truth.motion = "segments", or leave them out'
+        if truth.start.speed_mps > 0:
+            yield ("truth", "start", "speed_mps"), 'a static body has none: set truth.motion = "segments"'
+    elif not truth.segments:
+        yield ("truth", "segments"), "is missing: add at least one [[truth.segments]] table"
+    else:
+        try:
+            truth.track()
+        except ValueError as error:
+            key, _, what = str(error).partition(": ")
+            yield keypath.read(key), what
 
 
 def _sensor_faults(

@@ -84,10 +84,11 @@ def test_make_targets_exist() -> None:
 
 @pytest.mark.parametrize("text", blocks("toml"))
 def test_scenario_flies(text: str) -> None:
-    assert Scenario.parse(text).duration_s == 300
-    result = run(Scenario.parse(text, ["duration_s=20", "sensors.gnss.denied=[[12, 15]]"]))
-    assert result.metrics["ins.aligned_s"] < 10
-    assert result.metrics["gnss_only.aligned_s"] < 10
+    assert Scenario.parse(text).duration_s > 200
+    scenario = Scenario.parse(text, ["duration_s=20", "sensors.gnss.denied=[[12, 15]]"])
+    result = run(scenario)
+    for estimator in scenario.estimator:
+        assert result.metrics[f"{estimator.name}.aligned_s"] < 10
 
 
 @pytest.mark.parametrize("code", blocks("python"))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from testbed.kinematic import Kinematic
-from testbed.scenario import Rest
+from testbed.scenario import KinematicStart
 from testbed.sensors.imu import GRADES, Imu, ImuConfig
 
 RATE_HZ = 50.0
@@ -27,7 +27,7 @@ MG = 9.80665e-3
 
 def at_rest(config, seed):
     """Two hours of (gyro, accel) rates (2, 3, n), warm."""
-    place = Rest(lat_deg=34.0, lon_deg=108.0, alt_m=400.0, heading_deg=30.0)
+    place = KinematicStart(lat_deg=34.0, lon_deg=108.0, alt_m=400.0, heading_deg=30.0)
     body, imu = Kinematic(place, RATE_HZ), Imu("imu", config, RATE_HZ, seed)
     imu.sense(body.advance(round(WARM_UP_S * RATE_HZ) + 1))
     samples = imu.sense(body.advance(round(HOURS * 3600 * RATE_HZ)))

@@ -5,7 +5,7 @@ import pytest
 
 from nav.earth import position_difference_n
 from testbed.kinematic import Kinematic
-from testbed.scenario import Rest
+from testbed.scenario import KinematicStart
 from testbed.sensors.gnss import GRADES, Gnss, GnssConfig
 
 RATE_HZ = 0.2
@@ -16,7 +16,7 @@ REAL = [grade for grade in GRADES if grade != "perfect"]
 
 def errors(config, seed):
     """(position (n, 3) [m], velocity (n, 3) [m/s]) errors of one long stay, and the same over the reported sigma."""
-    place = Rest(lat_deg=47.0, lon_deg=-120.0, alt_m=400.0, heading_deg=0.0)
+    place = KinematicStart(lat_deg=47.0, lon_deg=-120.0, alt_m=400.0, heading_deg=0.0)
     truth = Kinematic(place, RATE_HZ).advance(round(HOURS * 3600 * RATE_HZ))
     samples = Gnss("gnss", config, RATE_HZ, seed).sense(truth)
     lat, lon, h = (np.array([getattr(s, name) for s in samples]) for name in ("lat", "lon", "h"))
