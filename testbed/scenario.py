@@ -46,7 +46,11 @@ TickRate: TypeAlias = Annotated[float, Field(ge=50, le=1000)]
 Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt.date(WMM_YEARS[1], 1, 1))]
 
 # What each kind of estimator can be aided by.
-AIDS: Mapping[str, frozenset[str]] = {"ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"})}
+AIDS: Mapping[str, frozenset[str]] = {
+    "ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
+    "ahrs": frozenset({"barometer", "magnetometer", "airspeed"}),
+}
+AHRS_KEYS = ("heading_deg", "levelling", "literal")  # which no other kind of estimator has
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
@@ -129,10 +133,18 @@ class EstimatorConfig(Section):
     """One ``[[estimator]]``: which IMU it integrates and which sensors aid it."""
 
     name: str
-    kind: Literal["ins"] = "ins"
+    kind: Literal["ins", "ahrs"] = "ins"
     imu: str = "imu"
     aids: tuple[str, ...]
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
+    heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
+    levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
+    literal: bool = Field(default=False, description="equation 10 of Jiang et al. 2021 as it is printed")
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return self.kind == "ahrs"
 
 
 class AutopilotConfig(Section):
@@ -393,6 +405,19 @@ def _estimator_faults(
     elif config.name in _RESERVED:
         yield (*path, "name"), f"{config.name!r} is reserved: choose another name"
     kinds = {name: sensor.kind for name, sensor in sensors.items()}
+    if config.kind == "ahrs":
+        blind = "magnetometer" not in [kinds.get(aid) for aid in config.aids]
+        if blind and config.heading_deg is None:
+            yield (
+                (*path, "heading_deg"),
+                "is missing: an AHRS without magnetometer is told where it points at the start",
+            )
+        elif not blind and config.heading_deg is not None:
+            yield (*path, "heading_deg"), "the magnetometer among the aids finds the heading: leave one of the two out"
+    else:
+        for key in AHRS_KEYS:
+            if key in config.model_fields_set:
+                yield (*path, key), f"is a key of kind 'ahrs', not of {config.kind!r}: leave it out"
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
