@@ -7,25 +7,37 @@ A filter knows the datasheets, never the errors that were drawn from them. Terms
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+
+from nav.ahrs import Ahrs, AhrsConfig
+from nav.alignment import InitialState
 from nav.detection import ChiSquare, Detector, Eraim, Glr, Reset, Sprt, exponential
-from nav.earth import STANDARD_GRAVITY
+from nav.earth import STANDARD_GRAVITY, radii, wrap_longitude
 from nav.error_model import ImuModel
 from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
+from nav.ins import AIDS as INS_AIDS
 from nav.ins import Ins, InsConfig
-from nav.local_filter import Aid, Watched
+from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid, Watched
+from nav.motion import LowDynamics
+from nav.rotation import quat_from_rotvec, quat_multiply, quat_rotate
 from nav.samples import Array, ImuSamples
-from testbed.scenario import AIDS, DetectorConfig, EstimatorConfig, Scenario
+from testbed.scenario import DetectorConfig, EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
+from testbed.sensors.body_velocity import BodyVelocityConfig
 from testbed.sensors.gnss import GnssConfig
 from testbed.sensors.imu import ImuConfig, ImuErrors
 from testbed.sensors.magnetometer import MagnetometerConfig
+from testbed.sensors.noise import stream
+from testbed.sensors.position_fix import PositionFixConfig
+from testbed.sensors.star_tracker import StarTrackerConfig
+from testbed.truth import TruthBlock
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 TURN_RATE = 0.06  # of a usual turn of this aircraft [rad/s]
@@ -33,6 +45,7 @@ LOAD_CHANGE = 0.1  # and the change of its load factor
 MANOEUVRE_S = 120.0  # between changes of these
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
+FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
 PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
 GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
@@ -40,6 +53,9 @@ SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
+LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
+IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
+NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +69,50 @@ class Running:
     imu: str
     C_sb: Array
     sensors: tuple[str, ...]
+    handover: Handover | None = None
 
     def in_body_axes(self, imu: ImuSamples) -> ImuSamples:
         """The increments of the IMU, turned back by its mounting."""
         return replace(imu, dtheta=_turned_back(self.C_sb, imu.dtheta), dv=_turned_back(self.C_sb, imu.dv))
+
+
+@dataclass(frozen=True, slots=True)
+class Handover:
+    """A start by somebody else's navigation: truth where the IMU sits, plus errors.
+
+    ``arm_b`` (3,) [m] points from the centre of gravity to the IMU; ``sigma`` (9,) is of attitude [rad], velocity [m/s]
+    and position [m], NED; the errors are drawn from ``random``.
+    """
+
+    estimator: Ins | Federated
+    arm_b: Array
+    sigma: Array
+    random: np.random.Generator
+
+    def take_over(self, truth: TruthBlock) -> None:
+        """Start the estimator at the first row of ``truth``."""
+        phi, v_error, p_error = (self.sigma * self.random.standard_normal(len(self.sigma))).reshape(3, 3)
+        true_q = truth.q_nb[0]
+        v_n = truth.v_n[0] + quat_rotate(true_q, np.cross(truth.omega_b[0], self.arm_b)) + v_error
+        north, east, down = quat_rotate(true_q, self.arm_b) + p_error
+        lat, lon, h = float(truth.lat[0]), float(truth.lon[0]), float(truth.h[0])
+        R_M, R_N = radii(lat)
+        # C_nb_hat = (I - [phi x]) C_nb
+        q_nb = quat_multiply(quat_from_rotvec(-phi), true_q)
+        initial = InitialState(
+            float(truth.t[0]), lat + north / (R_M + h), wrap_longitude(lon + east / ((R_N + h) * math.cos(lat))),
+            h - down, v_n, q_nb, np.diag(self.sigma**2),
+        )  # fmt: skip
+        self.estimator.start(initial)
+
+
+def _handover(config: EstimatorConfig, estimator: Ins | Federated, imu: ImuErrors, seed: int) -> Handover | None:
+    given = config.handover
+    if given is None:
+        return None
+    level, heading = math.radians(given.level_deg), math.radians(given.heading_deg)
+    sigma = np.array([level, level, heading, *[given.velocity_mps] * 3, *[given.position_m] * 3])
+    return Handover(estimator, imu.lever_arm_b, sigma, stream(seed, config.name, "handover"))
 
 
 def _turned_back(C_sb: Array, x_s: Array) -> Array:
@@ -65,10 +121,10 @@ def _turned_back(C_sb: Array, x_s: Array) -> Array:
     return x_b
 
 
-def build(scenario: Scenario) -> dict[str, Running]:
-    """The scenario's estimators by name, not yet aligned."""
-    kinds = {"ins": _ins, "federated": _federated}
-    return {config.name: kinds[config.kind](config, scenario) for config in scenario.estimator}
+def build(scenario: Scenario, seed: int) -> dict[str, Running]:
+    """The scenario's estimators by name, not yet aligned; ``seed`` is that of the run."""
+    kinds = {"ins": _ins, "federated": _federated, "ahrs": _ahrs}
+    return {config.name: kinds[config.kind](config, scenario, seed) for config in scenario.estimator}
 
 
 def imu_model(errors: ImuErrors) -> ImuModel:
@@ -109,29 +165,59 @@ def _drive(sigma: float, tau: float) -> float:
     return sigma * math.sqrt(2 / tau)
 
 
-def _ins(config: EstimatorConfig, scenario: Scenario) -> Running:
+def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     imu = scenario.sensors[config.imu]
     assert isinstance(imu, ImuConfig)  # the scenario was checked
     # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
-    offered = {scenario.sensors[name].kind: name for name in config.aids}
+    offered = {scenario.sensors[name].kind: name for name in config.aids if scenario.sensors[name].kind in INS_AIDS}
     aids = tuple(offered)
     for name, section in scenario.sensors.items():
-        if section.kind in AIDS[config.kind]:
+        if section.kind in INS_AIDS:
             offered.setdefault(section.kind, name)
     kinds: Mapping[str, SensorConfig] = {kind: scenario.sensors[name] for kind, name in offered.items()}
     errors = imu.errors()
     told = _told(kinds, errors, config.gust_mps)
+    others = {name: _other(name, scenario.sensors[name], config) for name in config.aids}
     ins = Ins(
-        InsConfig(imu_model(errors), aids, mounting_sigma=errors.accel_misalignment, **told),  # type: ignore[arg-type]
+        InsConfig(
+            imu_model(errors),
+            aids,
+            tuple(aid for aid in others.values() if aid is not None),
+            mounting_sigma=errors.accel_misalignment,
+            **told,  # type: ignore[arg-type]
+        ),
         partial(geomagnetic_field_n, date=scenario.date),
     )
-    lag_s = max((section.latency_s for section in kinds.values() if not isinstance(section, ImuConfig)), default=0.0)
+    used = dict.fromkeys((*offered.values(), *(name for name, aid in others.items() if aid is not None)))
     return Running(
-        FusionHorizon(ins, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        FusionHorizon(ins, _lag_s(scenario, used), coning=imu.rate_hz < scenario.truth.rate_hz),
         config.imu,
         errors.C_sb,
-        tuple(offered.values()),
+        tuple(used),
+        _handover(config, ins, errors, seed),
     )
+
+
+def _lag_s(scenario: Scenario, names: Iterable[str]) -> float:
+    """The largest latency of the aids of these names [s]."""
+    sections = [scenario.sensors[name] for name in names]
+    return max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)
+
+
+def _other(name: str, section: SensorConfig, config: EstimatorConfig) -> Aid | None:
+    """An aid of which a filter may have several, None for a sensor of any other kind."""
+    match section:
+        case BodyVelocityConfig():
+            v = section.errors()
+            return BodyVelocityAid(
+                name, v.axes, v.noise, v.scale, v.correlated, v.tau, nonholonomic_sigma=config.nonholonomic_mps
+            )
+        case StarTrackerConfig():
+            return StarAid(name, tuple(section.errors().noise_b))
+        case PositionFixConfig():
+            p = section.errors()
+            return PositionFixAid(name, tuple(p.position_n), p.height)
+    return None
 
 
 def _told(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float) -> dict[str, object]:
@@ -177,7 +263,7 @@ def _told(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float) ->
     return told
 
 
-def _federated(config: EstimatorConfig, scenario: Scenario) -> Running:
+def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     """Local filters, each told of its own sensors as an INS would be."""
     imu = scenario.sensors[config.imu]
     assert isinstance(imu, ImuConfig)  # the scenario was checked
@@ -185,6 +271,9 @@ def _federated(config: EstimatorConfig, scenario: Scenario) -> Running:
 
     def aid(name: str) -> Aid:
         section = scenario.sensors[name]
+        other = _other(name, section, config)
+        if other is not None:
+            return other
         told = _told({section.kind: section}, errors, config.gust_mps)
         return InsConfig(imu_model(errors), (section.kind,), **told).aid_of(section.kind, name)  # type: ignore[arg-type]
 
@@ -219,13 +308,12 @@ def _federated(config: EstimatorConfig, scenario: Scenario) -> Running:
         ),
         partial(geomagnetic_field_n, date=scenario.date),
     )
-    sections = [scenario.sensors[name] for name in used]
-    lag_s = max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)
     return Running(
-        FusionHorizon(federated, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        FusionHorizon(federated, _lag_s(scenario, used), coning=imu.rate_hz < scenario.truth.rate_hz),
         config.imu,
         errors.C_sb,
         tuple(used),
+        _handover(config, federated, errors, seed),
     )
 
 
@@ -241,3 +329,42 @@ def _detector(config: DetectorConfig) -> Detector:
             return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, mean, Reset(config.reset))
         case "glr":
             return Glr(config.false_alarm or GATHERED_FALSE_ALARM, config.window_s)
+
+
+def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
+    """Attitude alone. It is told its area of operation, and its heading where no magnetometer finds it."""
+    imu = scenario.sensors[config.imu]
+    assert isinstance(imu, ImuConfig)  # the scenario was checked
+    errors, site = imu.errors(), scenario.site()
+    aids = {scenario.sensors[name].kind: scenario.sensors[name] for name in config.aids}
+    field_n = geomagnetic_field_n(site.lat, site.lon, site.h, scenario.date)
+    told: dict[str, object] = {}
+    if not config.levelling:
+        told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
+    if config.heading_deg is not None:
+        told |= {"heading": math.radians(config.heading_deg)}
+    magnetometer = aids.get("magnetometer")
+    if isinstance(magnetometer, MagnetometerConfig):
+        m = magnetometer.errors()
+        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * PAYLOAD_CURRENT)
+        lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * IRON_TURN_S * magnetometer.rate_hz)
+        told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
+    ahrs = Ahrs(
+        AhrsConfig(
+            imu_model(errors),
+            site.lat,
+            site.h,
+            tuple(aids),
+            force_sigma=LEVELLING_FORCE,
+            airspeed_sigma=config.gust_mps,
+            literal=config.literal,
+            **told,  # type: ignore[arg-type]
+        ),
+        field_n,
+    )
+    return Running(
+        FusionHorizon(ahrs, _lag_s(scenario, config.aids), coning=imu.rate_hz < scenario.truth.rate_hz),
+        config.imu,
+        errors.C_sb,
+        config.aids,
+    )

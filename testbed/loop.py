@@ -258,7 +258,7 @@ def run(
                 inertial[name] = sensor
             else:
                 aiding[name] = sensor
-        filters = estimators.build(scenario)
+        filters = estimators.build(scenario, seed)
         # Between a tick and what a filter has surely used by then: an increment may not be complete yet.
         behind = {
             name: one.horizon.lag_s + 1 / inertial[one.imu].rate_hz - 1 / rate_hz for name, one in filters.items()
@@ -293,6 +293,10 @@ def run(
                 break
             if tick == 0 and out is not None:  # from here on what an earlier run left there would not fit the record
                 remove_derived(out)
+            if tick == 0:
+                for one in filters.values():
+                    if one.handover is not None:
+                        one.handover.take_over(block)
             imu = {name: sensor.sense(block) for name, sensor in inertial.items()}
             samples = {name: sensor.sense(block) for name, sensor in aiding.items()}
             for own in samples.values():

@@ -47,15 +47,21 @@ TickRate: TypeAlias = Annotated[float, Field(ge=50, le=1000)]
 Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt.date(WMM_YEARS[1], 1, 1))]
 
 # What each kind of estimator can be aided by.
+SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix"})  # and by several sensors of a kind
 AIDS: Mapping[str, frozenset[str]] = {
-    "ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
-    "federated": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
+    "ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}) | SEVERAL,
+    "federated": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}) | SEVERAL,
+    "ahrs": frozenset({"barometer", "magnetometer", "airspeed"}),
 }
-# What no other kind of estimator has.
-FEDERATED_KEYS = (
-    "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after", "readmit_after",
-    "literal",
-)  # fmt: skip
+# What only some kinds of estimator have.
+OWN_KEYS: Mapping[str, tuple[str, ...]] = {
+    "federated": (
+        "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
+        "readmit_after", "literal", "handover", "nonholonomic_mps",
+    ),
+    "ins": ("handover", "nonholonomic_mps"),
+    "ahrs": ("heading_deg", "levelling", "literal"),
+}  # fmt: skip
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
@@ -170,6 +176,15 @@ class LocalConfig(Section):
     detector: DetectorConfig = DetectorConfig()
 
 
+class HandoverConfig(Section):
+    """The state that somebody else's navigation hands over at the start, instead of alignment: its errors, 1 sigma."""
+
+    level_deg: float = Field(gt=0, le=20)
+    heading_deg: float = Field(gt=0, le=90)
+    velocity_mps: float = Field(gt=0, le=100)
+    position_m: float = Field(gt=0, le=1e4)
+
+
 class EstimatorConfig(Section):
     """One ``[[estimator]]``: which IMU it integrates and which sensors aid it.
 
@@ -177,10 +192,16 @@ class EstimatorConfig(Section):
     """
 
     name: str
-    kind: Literal["ins", "federated"] = "ins"
+    kind: Literal["ins", "federated", "ahrs"] = "ins"
     imu: str = "imu"
     aids: tuple[str, ...]
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
+    handover: HandoverConfig | None = Field(default=None, description="how well the start is known; none: it aligns")
+    nonholonomic_mps: float | None = Field(
+        default=None, gt=0, le=10, description="slip of wheels where body velocity aids; none: no constraint"
+    )
+    heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
+    levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
     locals: tuple[LocalConfig, ...] = ()
     structure: Literal["no_reset", "full_reset", "partial"] = "no_reset"
     sharing: Literal["fixed", "by_covariance", "none"] = "fixed"
@@ -189,7 +210,14 @@ class EstimatorConfig(Section):
     fusion_period_s: float = Field(default=1.0, ge=0, le=60)
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
-    literal: bool = Field(default=False, description="weights of Zhu et al. 2020, equation 13, as they are printed")
+    literal: bool = Field(
+        default=False, description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13"
+    )
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return self.kind == "ahrs"
 
     @model_validator(mode="before")
     @classmethod
@@ -474,6 +502,20 @@ def _estimator_faults(
     elif config.name in _RESERVED:
         yield (*path, "name"), f"{config.name!r} is reserved: choose another name"
     kinds = {name: sensor.kind for name, sensor in sensors.items()}
+    if config.kind == "ahrs":
+        blind = "magnetometer" not in [kinds.get(aid) for aid in config.aids]
+        if blind and config.heading_deg is None:
+            yield (
+                (*path, "heading_deg"),
+                "is missing: an AHRS without magnetometer is told where it points at the start",
+            )
+        elif not blind and config.heading_deg is not None:
+            yield (*path, "heading_deg"), "the magnetometer among the aids finds the heading: leave one of the two out"
+    for key in sorted(config.model_fields_set):
+        owners = [kind for kind, keys in OWN_KEYS.items() if key in keys]
+        if owners and config.kind not in owners:
+            kinds_of_it = " and ".join(map(repr, owners))
+            yield (*path, key), f"is a key of kind {kinds_of_it}, not of {config.kind!r}: leave it out"
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
@@ -481,14 +523,11 @@ def _estimator_faults(
     if config.kind == "federated":
         yield from _federated_faults(path, config, kinds, usable)
         return
-    for key in FEDERATED_KEYS:
-        if key in config.model_fields_set:
-            yield (*path, key), f"is a key of kind 'federated', not of {config.kind!r}: leave it out"
     yield from _aid_faults(path, config.kind, config.aids, kinds, usable)
     for index, aid in enumerate(config.aids):
         if aid in config.aids[:index] or aid not in usable:
             continue
-        if kinds[aid] in [kinds.get(before) for before in config.aids[:index]]:
+        if kinds[aid] not in SEVERAL and kinds[aid] in [kinds.get(before) for before in config.aids[:index]]:
             yield (*path, "aids", index), f"{aid!r} is a second {kinds[aid]!r}: {config.kind!r} takes one of each kind"
 
 

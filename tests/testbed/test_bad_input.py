@@ -266,7 +266,7 @@ def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
 
 def test_names_that_are_not_shipped() -> None:
     assert load_complaint("uturn").endswith("did you mean u_turn?")
-    assert "shipped are jammer_zone, kinematic_u_flight" in load_complaint("zzz")
+    assert "shipped are jammer_zone, kinematic_u_flight, loiter_ahrs_continuous" in load_complaint("zzz")
 
 
 # --- whatever comes

@@ -21,7 +21,7 @@ TWO_RECEIVERS = [
 
 
 def told(scenario: Scenario, name: str = "ins") -> Ins:
-    inner = estimators.build(scenario)[name].horizon.estimator
+    inner = estimators.build(scenario, 0)[name].horizon.estimator
     assert isinstance(inner, Ins)
     return inner
 
@@ -37,8 +37,8 @@ def test_datasheet_units() -> None:
 
 def test_a_receiver_that_is_no_aid_is_not_fused() -> None:
     scenario = Scenario.load("u_turn", TWO_RECEIVERS)
-    assert estimators.build(scenario)["ins"].sensors[0] == "gnss2"
-    assert "gnss" not in estimators.build(scenario)["ins"].sensors
+    assert estimators.build(scenario, 0)["ins"].sensors[0] == "gnss2"
+    assert "gnss" not in estimators.build(scenario, 0)["ins"].sensors
     fused = run(scenario).dataset["estimators/ins/innovations/gnss_position"]["sample_time"].values
     assert not ((fused > 8.05) & (fused < 14.95)).any()
     assert (fused < 8).any()
