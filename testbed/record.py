@@ -206,6 +206,7 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "gnss_course": ("rad", ("component",)),
 }
 REPORT = {
+    "sensor": Variable("", "whose sample it was", dtype="S32"),
     "nis": Variable("1", "normalised innovation squared"),
     "threshold": Variable("1", "gate for nis"),
     "weight": Variable("1", "factor on the information of the sample: 1 taken as it is, 0 rejected"),
@@ -370,6 +371,9 @@ def _pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dic
                     block["innovation"][k], block["S"][k] = report.innovation, report.S
     for name in ("nis", "threshold", "weight"):
         block[name] = _scalars(reports, name)
+    sensors = {r.sensor for r in reports}
+    names = sensors if len(sensors) == 1 else [r.sensor for r in reports]
+    block["sensor"] = np.resize(_text(list(names), REPORT["sensor"].dtype), len(reports))
     block["reason"] = _text([r.reason for r in reports], REPORT["reason"].dtype)
     return block, variables
 

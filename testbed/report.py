@@ -444,12 +444,9 @@ def attitude(run: _Run) -> Figure:
 
 def _euler_deg(q: Array) -> Array:
     """Roll, pitch, heading (N, 3) of q_nb (N, 4); heading in [0, 360)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
-    heading = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    result: Array = np.rad2deg(np.column_stack([roll, pitch, np.mod(heading, 2 * np.pi)]))
-    return result
+    angles = np.rad2deg(scores.euler(q))
+    angles[:, 2] %= 360.0
+    return angles
 
 
 def biases(run: _Run, name: str) -> Figure:

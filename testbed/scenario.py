@@ -34,6 +34,7 @@ from testbed.sensors.timing import TICK_TOLERANCE
 LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
 LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a slip of the keyboard beyond that
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
+LONGEST_NAME = 32  # as the record keeps them
 ERRORS_SHOWN = 20
 CHOICES_SHOWN = 12
 MISSING = "is missing: add it"
@@ -456,6 +457,8 @@ def _sensor_faults(
     name = str(path[-1])
     if not _IDENTIFIER.fullmatch(name):
         yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
+    elif len(name) > LONGEST_NAME:
+        yield path, f"a sensor's name has at most {LONGEST_NAME} letters"
     yield from _divides((*path, "rate_hz"), config.rate_hz, tick_hz)
     offset_s = getattr(config, "offset_s", 0.0)
     if not _whole(offset_s * tick_hz):

@@ -226,7 +226,7 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
 class _Fault(Section):
     """Keys of every ``[[fault]]``. Metrics and events know it by its name."""
 
-    name: str | None = None
+    name: str | None = Field(None, max_length=64)
     sensor: str
     window: tuple[float, float]
 

@@ -487,17 +487,6 @@ def test_statistics(tmp_path: Path) -> None:
     assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
 
 
-def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
-    dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
-    for aid in ("barometer", "gnss_position", "gnss_velocity"):
-        dataset[f"estimators/ins/innovations/{aid}"]["weight"][:] = 1.0
-    barometer = dataset["estimators/ins/innovations/barometer"]
-    for t in (30.0, 80.0, 90.2, 120.0, 190.0):  # aligned at 5 s, and settled a minute later; 120 s is in the outage
-        barometer["weight"][round(t * 5)] = 0.0
-    # From 65 s to 100 s, and from the arrival of the first fix at 150.1 s to the end.
-    assert campaigns._false_alarms_per_h(dataset, "ins") == pytest.approx(3 / (84.9 / 3600), rel=0.005)
-
-
 def test_history_is_the_error_once_a_second() -> None:
     dataset = synthetic_run.dataset(100.0, denied=((40.0, 50.0),))
     history = campaigns._history(dataset)
