@@ -36,7 +36,7 @@ LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a s
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
 LONGEST_NAME = 32  # as the record keeps them
 ERRORS_SHOWN = 20
-CHOICES_SHOWN = 12
+CHOICES_SHOWN = 16
 MISSING = "is missing: add it"
 
 Latitude: TypeAlias = Annotated[float, Field(gt=-LATITUDE_LIMIT_DEG, lt=LATITUDE_LIMIT_DEG)]
