@@ -490,21 +490,20 @@ def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, floa
     result: dict[str, float] = {}
     spans: list[Window] = []
     for fault in every:
-        window = (fault.start, fault.end)
-        score = None
+        window, score = (fault.start, fault.end), None
+        # From when on an alarm is another fault's of the same sensor.
+        until = min(
+            (max(o.start, fault.end) for o in every if o.sensor == fault.sensor and o.end > fault.end), default=np.inf
+        )
         if fault.sensor in looks:
             t, alarm, unused = looks[fault.sensor]
-            later = [other.start for other in every if other.sensor == fault.sensor and other.start >= fault.end]
             # What was refused as faulty may be on probation before it is used again.
-            score = detection(
-                t, np.where(t < fault.end - SAME_TIME_S, alarm, unused), window, min(later, default=np.inf)
-            )
+            score = detection(t, np.where(t < fault.end - SAME_TIME_S, alarm, unused), window, until)
         if score is None:
             spans.append((fault.start, fault.end + RECOVERY_WINDOW_S))
             continue
-        spans.append(
-            (fault.start, fault.end + RECOVERY_WINDOW_S + (np.inf if np.isnan(score.end_lag) else score.end_lag))
-        )
+        ceased = until if np.isnan(score.end_lag) else fault.end + score.end_lag
+        spans.append((fault.start, ceased + RECOVERY_WINDOW_S))
         at_fault = {other.sensor for other in every if other.start < fault.end and other.end > fault.start}
         others = [detection(t, alarm, window) for name, (t, alarm, _) in looks.items() if name not in at_fault]
         most = max((other.coverage for other in others if other is not None), default=0.0)

@@ -258,6 +258,21 @@ def test_faults_are_scored_by_name() -> None:
     assert found["ins.false_alarms_per_look"] == pytest.approx(1 / (3 * 5 * healthy_s), rel=5e-3)
 
 
+def test_faults_that_overlap_end_when_they_end() -> None:
+    run = faulty(("long", "gnss", 100.0, 130.0), ("short", "gnss", 105.0, 110.0), ("next", "gnss", 140.0, 150.0))
+    refuse(run, "gnss_position", 100.0, 133.0)
+    refuse(run, "gnss_velocity", 100.0, 133.0, "position outside the gate")
+    found = metrics.compute(run)
+    assert found["ins.end_lag_s.long"] == pytest.approx(3.0)
+    assert "ins.end_lag_s.short" not in found  # nobody can tell
+    assert found["ins.missed.next"] == 1
+    healthy_s = (100.0 - 60.0) + (200.1 - 160.0)
+    assert found["ins.false_alarms_per_look"] == 0.0
+    relabel(run, "barometer", 190.0, 0.0, "outside the gate")
+    relabel(run, "barometer", 158.0, 0.0, "outside the gate")
+    assert metrics.compute(run)["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
+
+
 def test_the_wrong_sensor_is_no_isolation() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0))
     refuse(run, "gnss_position", 110.0, 120.0)
