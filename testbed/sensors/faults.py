@@ -33,11 +33,13 @@ from typing import Annotated, Any, Literal, TypeAlias, overload
 import numpy as np
 from pydantic import Field, field_validator
 
-from nav.earth import isa_pressure, pressure_altitude, radii, wrap_longitude
+from nav.earth import isa_pressure, pressure_altitude
+from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
 from testbed.schema import Section
+from testbed.sensors.gnss import displaced
 from testbed.sensors.noise import stream
-from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA
+from testbed.sensors.units import ARCSEC, DEG, DEG_PER_H, MG, MICROTESLA
 
 Size: TypeAlias = Annotated[float, Field(ge=-1e9, le=1e9)]
 Seconds: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e6)]
@@ -121,17 +123,15 @@ def _rate(field: str, axis: int, units: Mapping[str, float], sigma: Callable[[An
 
 def _displaced(s: Any, north: float, east: float, down: float) -> Any:
     """A sample with ``lat``, ``lon``, ``h`` moved by metres, for moves that are small beside the Earth."""
-    if not math.isfinite(s.lat):
-        return replace(s, h=s.h - down)
-    R_M, R_N = radii(s.lat)
-    h = s.h if math.isfinite(s.h) else 0.0
-    lon = wrap_longitude(s.lon + east / ((R_N + h) * math.cos(s.lat))) if east else s.lon
-    return replace(s, lat=s.lat + north / (R_M + h), lon=lon, h=s.h - down)
+    h = s.h if math.isfinite(s.h) else 0.0  # not every position has a height
+    lat, lon, _ = displaced(s.lat, s.lon, h, np.array([north, east, down]))
+    return replace(s, lat=lat, lon=lon, h=s.h - down)
 
 
 Move: TypeAlias = Callable[[float, float], tuple[float, float, float]]  # size and bearing to north, east, down
 METRES = {"m": 1.0}
 SPEEDS = {"m/s": 1.0}
+BODY_AXES = ("forward", "right", "down")
 
 
 def _position(sigma: Callable[[Any, int], float]) -> dict[str, Channel]:
@@ -192,6 +192,19 @@ def _imu_axes(what: str, field: str, units: Mapping[str, float]) -> dict[str, Ch
     return {f"{what}_{name}": _rate(field, axis, units, sigma) for axis, name in enumerate("xyz")}
 
 
+def _turn(axis: int) -> Channel:
+    """Attitude about one body axis, of samples with ``q_ib``; what sticks or is late is the attitude as a whole."""
+    direction = np.eye(3)[axis]
+    return Channel(
+        {"arcsec": ARCSEC, "deg": DEG},
+        lambda s: tuple(s.q_ib.tolist()),
+        lambda s, values: replace(s, q_ib=np.array(values)),
+        lambda s, size, _: replace(s, q_ib=quat_multiply(s.q_ib, quat_from_rotvec(size * direction))),
+        lambda c: float(c.errors().noise_b[axis]),
+        has_zero=False,
+    )
+
+
 _HEIGHT = Channel(
     METRES,
     lambda s: (s.pressure,),
@@ -216,6 +229,11 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
         name: _component("field_b", axis, {"uT": MICROTESLA}, lambda c: c.errors().noise)
         for axis, name in enumerate("xyz")
     },
+    "body_velocity": {
+        name: _component("v_b", axis, SPEEDS, lambda c: c.errors().noise) for axis, name in enumerate(BODY_AXES)
+    },
+    "star_tracker": {name: _turn(axis) for axis, name in enumerate(BODY_AXES)},
+    "position_fix": _position(lambda c, axis: float(c.errors().position_n[axis])),
     "airspeed": {"speed": _scalar("eas", SPEEDS, lambda c: c.errors().noise)},
 }
 

@@ -12,6 +12,7 @@ import numpy as np
 import pymap3d
 import pytest
 from pydantic import TypeAdapter
+from scipy.spatial.transform import Rotation
 from sensor_truth import RATE_HZ, cut, lively, still
 
 from nav.earth import isa_pressure
@@ -22,7 +23,7 @@ from testbed.sensors.faults import CHANNELS, Faults
 
 DURATION_S = 30.0
 SITE = sensors.Site(dt.date(2026, 6, 1), 0.0, 0.0, 0.0)
-KINDS = ("imu", "gnss", "barometer", "magnetometer", "airspeed")
+KINDS = tuple(CONFIGS)
 FAULT: TypeAdapter[Any] = TypeAdapter(faults.Fault)
 G_TO_SI = 9.80665
 
@@ -175,6 +176,31 @@ def test_magnetometer_in_microtesla() -> None:
     )
     difference = np.array([b.field_b - a.field_b for a, b in zip(healthy, found, strict=True) if 10 <= a.t < 20])
     np.testing.assert_allclose(difference, np.tile([0, 0, 7e-6], (len(difference), 1)), atol=1e-15)
+
+
+def test_body_velocity_by_axis() -> None:
+    step = fault(sensor="it", channel="right", kind="step", size=0.3)
+    healthy, found = sensed(section("body_velocity", rate_hz=10.0), step, moving=True)
+    difference = np.array([b.v_b - a.v_b for a, b in zip(healthy, found, strict=True) if 10 <= a.t < 20])
+    np.testing.assert_allclose(difference, np.tile([0, 0.3, 0], (len(difference), 1)), atol=1e-12)
+
+
+def test_star_tracker_is_turned_about_a_body_axis() -> None:
+    config = section("star_tracker", rate_hz=10.0)
+    healthy, found = sensed(config, fault(sensor="it", channel="down", kind="ramp", slope=100.0), moving=True)
+    for a, b in zip(healthy, found, strict=True):
+        before, after = (Rotation.from_quat(s.q_ib, scalar_first=True) for s in (a, b))
+        expected = [0, 0, 100 * (a.t - 10) if 10 <= a.t < 20 - 1e-6 else 0]
+        np.testing.assert_allclose((before.inv() * after).as_rotvec(degrees=True) * 3600, expected, atol=1e-6)
+
+
+def test_position_fix_without_height() -> None:
+    step = fault(sensor="it", channel="east", kind="step", size=500.0)
+    healthy, found = sensed(section("position_fix", rate_hz=1.0), step, moving=True)
+    for a, b in zip(healthy, found, strict=True):
+        _, east, _ = pymap3d.geodetic2ned(b.lat, b.lon, 0.0, a.lat, a.lon, 0.0, deg=False)
+        assert east == pytest.approx(500.0 if 10 <= a.t < 20 else 0.0, abs=0.05)
+        assert math.isnan(b.h)
 
 
 def test_stuck_holds_the_last_value_before_the_window_or_the_one_given() -> None:
