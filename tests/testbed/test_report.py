@@ -111,12 +111,12 @@ def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
     assert shaded == ["gnss_position", "gnss_velocity", "barometer"]
 
 
-def test_broken_increments_leave_the_rest_of_the_bias_figure(tmp_path: Path) -> None:
+def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
     run = synthetic_run.dataset(300.0)
-    clean = report._imu_error(report._Run(run))
+    clean = report._imu_error(report._Run(run), "ins")
     increments = run["sensors/imu/dtheta"].values
     increments[200 * 100 : 200 * 100 + 3] = [[np.nan] * 3, [np.inf, 0, 0], [1e300, 0, 0]]
-    broken = report._imu_error(report._Run(run))
+    broken = report._imu_error(report._Run(run), "ins")
     assert clean is not None
     assert broken is not None
     apart = np.abs(broken[0] - 100.0) > 31
