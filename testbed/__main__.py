@@ -389,7 +389,11 @@ def _fly(
 def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool) -> None:
     from testbed import report as reports
 
-    _console().print(reports.summary_table(metrics))
+    console = _console()
+    console.print(reports.summary_table(metrics))
+    faults = reports.fault_table(metrics)
+    if faults is not None:
+        console.print(faults)
     if report:
         print(f"report: {reports.write_report(dataset, metrics, run_file.parent)}")
     print(f"record: {run_file}")

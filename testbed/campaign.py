@@ -469,8 +469,6 @@ def _fly(task: _Task) -> Outcome | Failure:
         _require_control(source)
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
-        for name in metrics.names(result.dataset):
-            kept[f"{name}.false_alarms_per_h"] = _false_alarms_per_h(result.dataset, name)
         finite = {key: value for key, value in kept.items() if math.isfinite(value)}
         return Outcome(task.combination, task.seed, finite, _history(result.dataset))
     except Exception as error:
@@ -498,22 +496,6 @@ def _history(dataset: xarray.DataTree) -> dict[str, Array]:
             kept[f"{name}.{what}"][rows] = values
     every = max(1, round(float(dataset.attrs["record_rate_hz"]) / HISTORY_HZ))
     return {name: values[::every].copy() for name, values in kept.items()}
-
-
-def _false_alarms_per_h(dataset: xarray.DataTree, estimator: str) -> float:
-    """Aiding samples that an estimator rejected while GNSS had a fix, per hour of such time once it had settled."""
-    errors = metrics.errors(dataset, estimator)
-    outages = metrics.outages(dataset)
-    counted = errors.t[errors.valid & ~metrics.inside(errors.t, outages)]
-    if not len(counted):
-        return math.nan
-    rejected = 0
-    for aid in metrics.aids(dataset, estimator):
-        own = f"estimators/{estimator}/innovations/{aid}"
-        t = metrics.column(dataset, f"{own}/sample_time")
-        refused = metrics.column(dataset, f"{own}/weight") <= 0.0
-        rejected += int(np.sum(refused & (t >= counted[0]) & ~metrics.inside(t, outages)))
-    return rejected * 3600.0 * float(dataset.attrs["record_rate_hz"]) / len(counted)
 
 
 # --- telling

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 NEES_DOF = 3  # north, east, down
 CONFIDENCE = (0.025, 0.975)
 
-# The main metrics and how tables call them. All are errors: the worst is the largest.
+# The main metrics and how tables call them. All are errors: the worst is the largest, but for `BEST_LARGE`.
 QUANTITIES: Mapping[str, str] = {
     "position_horizontal_rms_m": "horizontal rms [m]",
     "position_horizontal_max_m": "horizontal max [m]",
@@ -50,11 +50,23 @@ QUANTITIES: Mapping[str, str] = {
     "outage_position_horizontal_at_600s_m": "after 600 s of outage [m]",
     "recovery_s": "recovery [s]",
 }
+# And those of each fault, whose name follows after a dot.
+OF_FAULTS: Mapping[str, str] = {
+    "detection_delay_s": "detected after [s]",
+    "coverage": "share refused",
+    "end_lag_s": "used again after [s]",
+    "missed": "missed",
+    "isolation_correct": "isolated",
+}
+BEST_LARGE = frozenset({"coverage", "isolation_correct"})
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """One metric of one estimator over the runs of one combination; ``runs`` counts those that have a number for it."""
+    """One metric of one estimator over the runs of one combination; ``runs`` counts those that have a number for it.
+
+    ``p95`` is what 95 % of them do not exceed, or do not stay below where large is good.
+    """
 
     combination: int
     estimator: str
@@ -73,7 +85,7 @@ class Consistency:
     ``nees`` is the position NEES per degree of freedom (of an estimator of attitude alone, the attitude NEES), mean
     over runs and time; ``lower`` and ``upper`` bound the mean over runs at one instant; ``inside`` is the share of
     instants at which it keeps them, 0.95 when all is right.
-    ``false_alarms_per_h`` counts aiding samples rejected while GNSS had a fix, mean over runs.
+    ``false_alarms_per_h`` is the mean over runs of that metric.
     """
 
     combination: int
@@ -116,13 +128,17 @@ def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome])
 
 
 def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Spread]:
-    for metric in QUANTITIES:
+    every = dict.fromkeys(
+        key.partition(".")[2] for o in outcomes for key in o.metrics if key.startswith(f"{estimator}.")
+    )
+    for metric in (*QUANTITIES, *(key for key in every if key.partition(".")[0] in OF_FAULTS)):
         key = f"{estimator}.{metric}"
         found = [(o.metrics[key], o.seed) for o in outcomes if key in o.metrics]
         if found:
             values = [value for value, _ in found]
-            worst, seed = max(found, key=lambda pair: pair[0])
-            median, p95 = (float(np.percentile(values, p)) for p in (50, 95))
+            small = metric.partition(".")[0] in BEST_LARGE
+            worst, seed = (min if small else max)(found, key=lambda pair: pair[0])
+            median, p95 = (float(np.percentile(values, p)) for p in (50, 5 if small else 95))
             yield Spread(combination, estimator, metric, median, p95, worst, seed, len(found))
 
 
@@ -231,7 +247,7 @@ def tables(result: CampaignResult) -> list[Table]:
     for estimator, metric in dict.fromkeys((s.estimator, s.metric) for s in spreads):
         rows = [s for s in spreads if (s.estimator, s.metric) == (estimator, metric)]
         for i, s in enumerate(rows):
-            names = [estimator, escape(QUANTITIES[metric])] if i == 0 else ["", ""]
+            names = [estimator, escape(_called(metric))] if i == 0 else ["", ""]
             numbers = [_number(s.median), _number(s.p95), _number(s.worst), str(s.worst_seed), str(s.runs)]
             errors.add_row(*names, *values(s.combination), *numbers, end_section=bool(keys) and s is rows[-1])
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
@@ -240,6 +256,11 @@ def tables(result: CampaignResult) -> list[Table]:
         numbers = [f"{c.nees:.2f}", bounds, f"{100 * c.inside:.0f} %", _number(c.false_alarms_per_h), str(c.runs)]
         consistency.add_row(c.estimator, *values(c.combination), *numbers)
     return [errors, consistency]
+
+
+def _called(metric: str) -> str:
+    what, _, fault = metric.partition(".")
+    return f"{fault}: {OF_FAULTS[what]}" if what in OF_FAULTS else QUANTITIES[metric]
 
 
 def _number(value: float) -> str:

@@ -22,6 +22,7 @@ from testbed.errors import UserError
 from testbed.pacer import Pacer
 from testbed.record import Recorder
 from testbed.scenario import FlightTruth, Scenario
+from testbed.sensors.faults import Faults, FaultTruth
 from testbed.truth import MotionSource, TruthBlock
 
 if TYPE_CHECKING:
@@ -117,11 +118,13 @@ class _EventWatch:
     """Turns changes in samples, reports, estimates and legs into events."""
 
     emit: Callable[[float, str, str], None]
+    faults: Sequence[FaultTruth] = ()
     fix: dict[str, bool] = field(default_factory=dict)
     aligned: dict[str, bool] = field(default_factory=dict)
     refusals: dict[tuple[str, str], int] = field(default_factory=dict)  # in a row
     unsound: dict[tuple[str, str], float] = field(default_factory=dict)  # when last reported
     leg: float = -2.0
+    t: float = -math.inf
 
     @property
     def denied(self) -> bool:
@@ -166,6 +169,11 @@ class _EventWatch:
         if leg != self.leg and 0 <= leg < len(plan):
             self.emit(t, "info", f"leg {int(leg) + 1}/{len(plan)} {plan[int(leg)]}")
         self.leg = leg
+        edges = [(one.start, "begins", one) for one in self.faults] + [(one.end, "ends", one) for one in self.faults]
+        for when, what, one in sorted(edges, key=lambda edge: edge[0]):
+            if self.t < when <= t:
+                self.emit(when, "info", f"fault {one.name} {what}: {one}")
+        self.t = t
 
 
 class _Latest:
@@ -207,6 +215,9 @@ def _flown(scenario: Scenario, end: float) -> tuple[str, str]:
         for name, config in scenario.sensors.items()
         for window in getattr(config, "denied", ())
         if window[0] >= end
+    ]
+    missed += [
+        f"fault of {fault.sensor} from {fault.window[0]:g} s" for fault in scenario.fault if fault.window[0] >= end
     ]
     return ("warning", f"{text}, before {', '.join(missed)}") if missed else ("info", text)
 
@@ -258,6 +269,7 @@ def run(
                 inertial[name] = sensor
             else:
                 aiding[name] = sensor
+        faults = Faults(scenario.fault, scenario.sensors, seed)
         filters = estimators.build(scenario, seed)
         # Between a tick and what a filter has surely used by then: an increment may not be complete yet.
         behind = {
@@ -275,7 +287,7 @@ def run(
             for link in links:
                 link.event(t, severity, text)
 
-        watch = _EventWatch(emit)
+        watch = _EventWatch(emit, faults.truth)
         latest = _Latest()
         unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
         unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
@@ -297,8 +309,8 @@ def run(
                 for one in filters.values():
                     if one.handover is not None:
                         one.handover.take_over(block)
-            imu = {name: sensor.sense(block) for name, sensor in inertial.items()}
-            samples = {name: sensor.sense(block) for name, sensor in aiding.items()}
+            imu = {name: faults.apply(name, sensor.sense(block)) for name, sensor in inertial.items()}
+            samples = {name: faults.apply(name, sensor.sense(block)) for name, sensor in aiding.items()}
             for own in samples.values():
                 latest.add(own)
             rows = (
@@ -318,6 +330,8 @@ def run(
                 unread[name].extend(reports)
                 if links and name == shown:
                     unshown.extend(reports)
+            if tick == 0:
+                recorder.faults(faults.truth)
             recorder.truth(block)
             for name, increments in imu.items():
                 recorder.imu(name, increments)

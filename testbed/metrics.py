@@ -10,7 +10,19 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
 * An estimator of attitude alone (`Status.ATTITUDE_ONLY`) is judged by its attitude alone.
-* NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident.
+* ``north``, ``east``, ``down``, ``roll`` and ``pitch`` are single axes; ``std`` is about the mean error, ``max`` the
+  largest size.
+* NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident. NIS is averaged over what
+  the gate judged, whether it let it pass or not, and ``rejected_fraction`` is the share that it did not. What was
+  withheld for another reason, such as probation after an outage, is in neither.
+* Faults are scored one by one, under their names, for the estimators that take samples of the faulty sensor. A look is
+  one sample of the sensor; it is an alarm when the estimator refused any part of it, probation apart.
+  ``detection_delay_s``: from the beginning to the first alarm; ``missed``: 1 when there is none in the window;
+  ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a sample is used again;
+  ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window.
+* ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
+  while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
+  ``false_alarms_per_h``: the same per hour of such time.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
 
@@ -18,7 +30,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -26,8 +38,10 @@ import numpy as np
 import numpy.typing as npt
 
 from nav import earth
+from nav.detection import Verdict
 from nav.samples import Array, FixType, Status
 from testbed.data import write_file
+from testbed.sensors.faults import FaultTruth
 
 if TYPE_CHECKING:
     import xarray
@@ -38,6 +52,10 @@ RECOVERED_M = 5.0  # horizontal error that counts as recovered
 RECOVERED_HOLD_S = 30.0  # and for how long it has to stay there
 OUTAGE_MARKS_S = (60, 120, 300, 600)
 SAME_TIME_S = 1e-6
+SILENT = 2.5  # sample intervals without a sample, after which a receiver counts as having no fix
+SUSTAINED_S = 2.0  # for how long an alarm has to go on to be a sustained one,
+SUSTAINED_SHARE = 0.8  # and at how many of the looks
+AXES = ("north", "east", "down")
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 Window: TypeAlias = tuple[float, float]
@@ -48,16 +66,17 @@ class Errors:
     """Errors of one estimator where truth has a row at the same time: estimate - truth, by the conventions of `nav`.
 
     ``t`` (N,) [s]; ``position`` (N, 3) NED [m]; ``velocity`` (N, 3) NED [m/s]; ``attitude`` (N, 3) phi in n [rad];
-    ``sigma_*`` (N, 3) what the estimator claimed; ``*_nees`` (N,) normalised squared error over 3, NaN where the
-    covariance is singular; ``aligned_s`` time of alignment, None when never; ``attitude_only`` whether position and
-    velocity are NaN by design; ``nonfinite`` (N,) rows that should be numbers and are not; ``valid`` (N,) rows that
-    count.
+    ``roll_pitch`` (N, 2) differences of these angles [rad]; ``sigma_*`` (N, 3) what the estimator claimed; ``*_nees``
+    (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of alignment, None
+    when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,) rows that should
+    be numbers and are not; ``valid`` (N,) rows that count.
     """
 
     t: Array
     position: Array
     velocity: Array
     attitude: Array
+    roll_pitch: Array
     sigma_position: Array
     sigma_velocity: Array
     sigma_attitude: Array
@@ -132,6 +151,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         position=position,
         velocity=velocity,
         attitude=attitude,
+        roll_pitch=_wrapped(euler(estimated("q_nb")) - euler(true("q_nb")))[:, :2],
         sigma_position=estimated("sigma_position_n"),
         sigma_velocity=estimated("sigma_velocity_n"),
         sigma_attitude=estimated("sigma_attitude_n"),
@@ -174,6 +194,21 @@ def attitude_error(q: Array, q_true: Array) -> Array:
     return phi
 
 
+def euler(q: Array) -> Array:
+    """Roll, pitch, heading (N, 3) [rad] of q_nb (N, 4)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    heading = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+    return np.column_stack([roll, pitch, heading])
+
+
+def _wrapped(angle: Array) -> Array:
+    """The same angles in [-pi, pi)."""
+    wrapped: Array = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return wrapped
+
+
 def nees(error: Array, covariance: Array) -> Array:
     """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) of covariances (N, n, n), NaN where singular."""
     n = error.shape[1]
@@ -192,25 +227,30 @@ def nees(error: Array, covariance: Array) -> Array:
 def outages(dataset: xarray.DataTree) -> list[Window]:
     """Windows [start, end) in which no GNSS receiver has a fix [s].
 
-    A window starts with the first sample that has no fix and ends when the first fix arrives; one that lasts to the
-    end of the run ends at infinity. Empty without GNSS receivers.
+    A window starts with the first sample that has no fix, or when one is overdue, and ends when the first fix arrives;
+    one that lasts to the end of the run ends at infinity. A receiver that has said nothing yet does not count. Empty
+    without GNSS receivers.
     """
     changes: list[tuple[float, str, bool]] = []
     receivers = _receivers(dataset)
     for name in receivers:
+        t = column(dataset, f"sensors/{name}/time")
         fix = column(dataset, f"sensors/{name}/fix_type") > FixType.NO_FIX
+        when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), t)
+        interval = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
+        silent = np.flatnonzero(np.diff(t, append=column(dataset, "truth/time")[-1]) > SILENT * interval)
+        fix, when = np.insert(fix, silent + 1, False), np.insert(when, silent + 1, t[silent] + interval)
         first = np.flatnonzero(np.diff(fix, prepend=~fix[:1]))
-        when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), column(dataset, f"sensors/{name}/time"))
         changes += [(float(when[k]), name, bool(fix[k])) for k in first]
-    has_fix = dict.fromkeys(receivers, True)
+    has_fix: dict[str, bool] = {}
     windows: list[Window] = []
     start: float | None = None
-    for t, name, fixed in sorted(changes):
+    for t_change, name, fixed in sorted(changes):
         has_fix[name] = fixed
         if start is None and not any(has_fix.values()):
-            start = t
+            start = t_change
         elif start is not None and fixed:
-            windows.append((start, t))
+            windows.append((start, t_change))
             start = None
     return windows if start is None else [*windows, (start, np.inf)]
 
@@ -255,7 +295,8 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
         result |= _outage_marks(e, windows) | _recovery(e, windows)
     for aid in aids(dataset, name):
         result |= _innovations(dataset, name, aid, e.aligned_s + settling_s)
-    return result
+    scores, spans = _detection(dataset, name)
+    return result | scores | _false_alarms(dataset, name, e, [*windows, *spans])
 
 
 def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
@@ -274,9 +315,16 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
     result |= {
         "roll_pitch_rms_deg": _rms(tilt),
         "roll_pitch_max_deg": float(tilt.max()),
-        "heading_rms_deg": _rms(heading),
-        "heading_max_deg": float(np.abs(heading).max()),
     }
+    axes = []
+    if not e.attitude_only:
+        axes += [(f"position_{axis}", e.position[mask, k], "m") for k, axis in enumerate(AXES)]
+        axes += [(f"velocity_{axis}", e.velocity[mask, k], "mps") for k, axis in enumerate(AXES)]
+    axes += [(axis, np.rad2deg(e.roll_pitch[mask, k]), "deg") for k, axis in enumerate(("roll", "pitch"))]
+    for axis, values, unit in [*axes, ("heading", heading, "deg")]:
+        result[f"{axis}_rms_{unit}"] = _rms(values)
+        result[f"{axis}_max_{unit}"] = float(np.abs(values).max())
+        result[f"{axis}_std_{unit}"] = float(values.std())
     for what, values in (("position", e.position_nees), ("velocity", e.velocity_nees), ("attitude", e.attitude_nees)):
         finite = values[mask & np.isfinite(values)]
         if len(finite):
@@ -306,20 +354,20 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
     """Seconds from reacquisition until the horizontal error is below `RECOVERED_M` for `RECOVERED_HOLD_S`.
 
     The worst of all outages. Outages after which it never is, before the next one or the end of the run, are counted
-    instead, and there is no such time. Non-finite rows count as bad.
+    instead, and there is no such time; one that leaves less time than that is not judged. Non-finite rows count as bad.
     """
     found, never = [], 0
     for k, (start, end) in enumerate(windows):
         until = windows[k + 1][0] if k + 1 < len(windows) else np.inf
         rows = np.flatnonzero((e.t >= end) & (e.t < until))
-        if e.aligned_s is None or start < e.aligned_s or not len(rows):
-            continue
         t = e.t[rows]
+        if e.aligned_s is None or start < e.aligned_s or not len(t) or t[-1] - end < RECOVERED_HOLD_S - SAME_TIME_S:
+            continue
         good = e.horizontal[rows] < RECOVERED_M  # false for NaN
         # The first bad row at or after each row, and so how long it stays good from there.
         bad_at = np.where(good, np.inf, t)
         next_bad = np.minimum.accumulate(bad_at[::-1])[::-1]
-        held = good & ((next_bad - t >= RECOVERED_HOLD_S) | np.isinf(next_bad))
+        held = good & (np.minimum(next_bad, t[-1]) - t >= RECOVERED_HOLD_S - SAME_TIME_S)
         if held.any():
             found.append(float(t[np.argmax(held)] - end))
         else:
@@ -329,18 +377,175 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
     return {"recovery_s": max(found), "unrecovered_outages": 0} if found else {}
 
 
-def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
+@dataclass(frozen=True, slots=True)
+class _Reports:
+    """What became of the samples of one aid, or of one sensor, each (N,).
+
+    ``used``; ``gated`` refused by the gate; ``alarm`` refused because the sample looked wrong; ``judged`` used or
+    refused for its innovation.
+    """
+
+    t: Array
+    sensor: npt.NDArray[np.str_]
+    nis: Array
+    used: Mask
+    gated: Mask
+    alarm: Mask
+    judged: Mask
+
+
+def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     own = f"estimators/{estimator}/innovations/{aid}"
-    after = column(dataset, f"{own}/sample_time") >= start
-    value, weight = column(dataset, f"{own}/nis"), column(dataset, f"{own}/weight")
-    fused = after & (weight > 0) & np.isfinite(value)
+    reason, value = column(dataset, f"{own}/reason").astype(str), column(dataset, f"{own}/nis")
+    used = column(dataset, f"{own}/weight") > 0
+    tested = np.isfinite(value)  # an unsound sample has no innovation
+    withheld = np.char.endswith(reason, Verdict.PROBATION.value)
+    withheld |= np.char.startswith(reason, "position ") & tested  # velocity, whose position was refused
+    alarm = ~used & ~withheld
+    return _Reports(
+        t=column(dataset, f"{own}/sample_time"),
+        sensor=column(dataset, f"{own}/sensor").astype(str),
+        nis=value,
+        used=used,
+        gated=alarm & (reason == Verdict.REJECT.value),
+        alarm=alarm,
+        judged=(used | alarm) & tested,
+    )
+
+
+def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
+    reports = _reports(dataset, estimator, aid)
+    judged = (reports.t >= start) & (reports.used | reports.gated) & np.isfinite(reports.nis)
+    if not judged.any():
+        return {}
+    m = column(dataset, f"estimators/{estimator}/innovations/{aid}/innovation").shape[1]
+    return {
+        f"nis_mean.{aid}": float(reports.nis[judged].mean() / m),
+        f"rejected_fraction.{aid}": float(np.mean(reports.gated[judged])),
+    }
+
+
+# --- detection of faults
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionScore:
+    """How one fault was detected; times in seconds, NaN where it was not.
+
+    ``delay`` from its beginning to the first alarm; ``sustained_delay`` to the first alarm from which on, for
+    `SUSTAINED_S` or to the end, `SUSTAINED_SHARE` of the looks are alarms; ``coverage`` share of the looks in the
+    window that are alarms; ``end_lag`` from its end to the first look without alarm.
+    """
+
+    delay: float
+    sustained_delay: float
+    coverage: float
+    end_lag: float
+
+    @property
+    def missed(self) -> bool:
+        """Whether there was no alarm in the window."""
+        return self.coverage == 0.0
+
+
+def detection(t: Array, alarm: Mask, window: Window, until: float = np.inf) -> DetectionScore | None:
+    """Score of alarms (N,) at looks (N,) [s], ascending, on a fault in ``window`` [start, end).
+
+    ``until`` is when the next fault of the same sensor begins: an alarm from then on belongs to that. None when nobody
+    looked during the fault.
+    """
+    start, end = window[0] - SAME_TIME_S, window[1] - SAME_TIME_S
+    during = (t >= start) & (t < end)
+    if not during.any():
+        return None
+    looked, alarmed = t[during], alarm[during]
+    after = (t >= end) & (t < until) & ~alarm
+    total = np.append(0, np.cumsum(alarmed))
+    stop = np.searchsorted(looked, looked + SUSTAINED_S - SAME_TIME_S)
+    here = np.arange(len(looked))
+    sustained = alarmed & (total[stop] - total[here] >= SUSTAINED_SHARE * (stop - here))
+
+    def first(when: Array, since: float) -> float:
+        return max(float(when[0]) - since, 0.0) if len(when) else np.nan
+
+    return DetectionScore(
+        delay=first(looked[alarmed], window[0]),
+        sustained_delay=first(looked[sustained], window[0]),
+        coverage=float(alarmed.mean()),
+        end_lag=first(t[after], window[1]),
+    )
+
+
+def faults(dataset: xarray.DataTree) -> list[FaultTruth]:
+    """What was made to go wrong in a run."""
+    if "faults" not in dataset.children:
+        return []
+    own = [column(dataset, f"faults/{'time' if f.name == 'start' else f.name}").tolist() for f in fields(FaultTruth)]
+    return [FaultTruth(*row) for row in zip(*own, strict=True)]
+
+
+def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Array, Mask, Mask]]:
+    """Times of the samples of each sensor, whether any part of one raised an alarm, and whether none was used."""
+    found = [_reports(dataset, estimator, aid) for aid in aids(dataset, estimator)]
     result = {}
-    if fused.any():
-        m = column(dataset, f"{own}/innovation").shape[1]
-        result[f"nis_mean.{aid}"] = float(value[fused].mean() / m)
-    if after.any():
-        result[f"rejected_fraction.{aid}"] = float(np.mean(weight[after] <= 0))
+    for sensor in dict.fromkeys(name for reports in found for name in np.unique(reports.sensor).tolist()):
+        own = [(reports, reports.sensor == sensor) for reports in found]
+        t, row = np.unique(np.concatenate([reports.t[mine] for reports, mine in own]), return_inverse=True)
+        alarm, used = np.zeros(len(t), bool), np.zeros(len(t), bool)
+        np.logical_or.at(alarm, row, np.concatenate([reports.alarm[mine] for reports, mine in own]))
+        np.logical_or.at(used, row, np.concatenate([reports.used[mine] for reports, mine in own]))
+        result[sensor] = (t, alarm, ~used)
     return result
+
+
+def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, float], list[Window]]:
+    """Scores of all faults, and the spans of time in which an alarm may be theirs."""
+    every = faults(dataset)
+    looks = _by_sensor(dataset, estimator) if every else {}
+    result: dict[str, float] = {}
+    spans: list[Window] = []
+    for fault in every:
+        window, score = (fault.start, fault.end), None
+        # From when on an alarm is another fault's of the same sensor.
+        until = min(
+            (max(o.start, fault.end) for o in every if o.sensor == fault.sensor and o.end > fault.end), default=np.inf
+        )
+        if fault.sensor in looks:
+            t, alarm, unused = looks[fault.sensor]
+            # What was refused as faulty may be on probation before it is used again.
+            score = detection(t, np.where(t < fault.end - SAME_TIME_S, alarm, unused), window, until)
+        if score is None:
+            spans.append((fault.start, fault.end + RECOVERY_WINDOW_S))
+            continue
+        ceased = until if np.isnan(score.end_lag) else fault.end + score.end_lag
+        spans.append((fault.start, ceased + RECOVERY_WINDOW_S))
+        at_fault = {other.sensor for other in every if other.start < fault.end and other.end > fault.start}
+        others = [detection(t, alarm, window) for name, (t, alarm, _) in looks.items() if name not in at_fault]
+        most = max((other.coverage for other in others if other is not None), default=0.0)
+        scored = {
+            "detection_delay_s": score.delay,
+            "end_lag_s": score.end_lag,
+            "coverage": score.coverage,
+            "missed": score.missed,
+            "isolation_correct": score.coverage > most,
+        }
+        result |= {f"{key}.{fault.name}": value for key, value in scored.items() if np.isfinite(value)}
+    return result, spans
+
+
+def _false_alarms(dataset: xarray.DataTree, estimator: str, e: Errors, troubled: list[Window]) -> dict[str, float]:
+    """Innovations refused though all was well, of those judged and per hour of healthy time with GNSS fix."""
+    counted = e.t[e.valid & ~inside(e.t, troubled)]
+    if not len(counted):
+        return {}
+    alarms = looks = 0
+    for aid in aids(dataset, estimator):
+        reports = _reports(dataset, estimator, aid)
+        healthy = reports.judged & (reports.t >= counted[0]) & ~inside(reports.t, troubled)
+        alarms += int(np.sum(healthy & reports.alarm))
+        looks += int(healthy.sum())
+    hours = len(counted) / (3600.0 * float(dataset.attrs["record_rate_hz"]))
+    return {"false_alarms_per_h": alarms / hours} | ({"false_alarms_per_look": alarms / looks} if looks else {})
 
 
 def save(metrics: Mapping[str, float], path: Path) -> None:

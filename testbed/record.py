@@ -6,6 +6,7 @@ Layout, one group each, every group with its own time axis::
     sensors/<name>                           what the sensor delivered
     estimators/<name>                        state, sigmas, 9x9 covariance, further states
     estimators/<name>/innovations/<aid>      what became of each aiding sample
+    faults                                   what was made to go wrong; time is when it begins
     events                                   severity and text
 
 Every variable carries ``units``, ``long_name`` and, where it has one, ``frame``. The root carries the scenario text,
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     import xarray
 
     from testbed.scenario import Scenario
+    from testbed.sensors.faults import FaultTruth
     from testbed.sensors.imu import ImuConfig
 
 Data: TypeAlias = npt.NDArray[Any]
@@ -208,10 +210,21 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "magnetic_heading": ("rad", ("component",)),
 }
 REPORT = {
+    "sensor": Variable("", "whose sample it was", dtype="S32"),
     "nis": Variable("1", "normalised innovation squared"),
     "threshold": Variable("1", "gate for nis"),
     "weight": Variable("1", "factor on the information of the sample: 1 taken as it is, 0 rejected"),
     "reason": Variable("", "why it was refused or weakened, empty when simply fused", dtype="S64"),
+}
+
+FAULT = {
+    "end": Variable("s", "when the fault ends"),
+    "name": Variable("", "name of the fault", dtype="S64"),
+    "sensor": Variable("", "sensor that it acts on", dtype="S64"),
+    "channel": Variable("", "quantity that it acts on, empty for all", dtype="S16"),
+    "kind": Variable("", "how it acts", dtype="S16"),
+    "size": Variable("in unit", "its principal number as in the scenario, NaN when it has none"),
+    "unit": Variable("", "unit of size", dtype="S16"),
 }
 
 EVENT = {
@@ -362,6 +375,9 @@ def _pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dic
                     block["innovation"][k], block["S"][k] = report.innovation, report.S
     for name in ("nis", "threshold", "weight"):
         block[name] = _scalars(reports, name)
+    sensors = {r.sensor for r in reports}
+    names = sensors if len(sensors) == 1 else [r.sensor for r in reports]
+    block["sensor"] = np.resize(_text(list(names), REPORT["sensor"].dtype), len(reports))
     block["reason"] = _text([r.reason for r in reports], REPORT["reason"].dtype)
     return block, variables
 
@@ -386,6 +402,14 @@ def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Var
             block[column] = values if variable.dims else values[:, 0]
             variables[column] = variable if k == 0 else replace(variable, meaning=f"1-sigma of {name}")
     return block, variables
+
+
+def _pack_faults(faults: Sequence[FaultTruth]) -> tuple[Block, dict[str, Variable]]:
+    block: Block = {"time": _scalars(faults, "start")}
+    for name, variable in FAULT.items():
+        text = variable.dtype.startswith("S")
+        block[name] = _text([getattr(f, name) for f in faults], variable.dtype) if text else _scalars(faults, name)
+    return block, FAULT
 
 
 def _pack_events(events: Sequence[tuple[float, str, str]]) -> tuple[Block, dict[str, Variable]]:
@@ -468,6 +492,11 @@ class Recorder:
             path = f"estimators/{name}/innovations/{report.aid}"
             table = self._tables.get(path) or self._table(path, partial(_pack_reports, report.aid), "sample_time")
             table.objects.append(report)
+
+    def faults(self, faults: Sequence[FaultTruth]) -> None:
+        """Note what is going to go wrong."""
+        if faults:
+            self._table("faults", _pack_faults).objects.extend(faults)
 
     def event(self, t: float, severity: str, text: str) -> None:
         """Note that something happened; severity is info, warning or error."""

@@ -1,8 +1,8 @@
 """What a run looks like: a table for the console, figures as PNG, and one HTML page that needs nothing else.
 
-Every figure tells one thing. Time without GNSS fix is shaded everywhere. An estimator has the same colour wherever it
-appears; truth is black. Where one estimator leaves the others behind by orders of magnitude, axes follow the better
-ones, and a second panel or a logarithmic axis shows the rest.
+Every figure tells one thing. Time without GNSS fix is shaded everywhere, faults where the innovations of their sensor
+are shown. An estimator has the same colour wherever it appears; truth is black. Where one estimator leaves the others
+behind by orders of magnitude, axes follow the better ones, and a second panel or a logarithmic axis shows the rest.
 """
 
 from __future__ import annotations
@@ -36,9 +36,11 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 TRUTH = "#000000"
 REFUSED = "#D55E00"
 SHADE = "#DDDDDD"
+FAULT = "#FBE9A8"
 AXIS_COLOURS = ("#0072B2", "#E69F00", "#009E73")  # north-east-down, forward-right-down
 BINS = 900  # a line is drawn through the lowest and highest point of each
 BIAS_MEAN_S = 60.0
+BROKEN = 1e3  # an increment [rad], [m/s] that no IMU measured
 FAR = 4.0  # times: what is so much larger than the rest gets a view of its own
 
 ROWS: tuple[tuple[str, str], ...] = (
@@ -62,6 +64,12 @@ RUN_ROWS = (
     ("unrecovered_outages", "outages it did not recover from"),
     ("aligned_s", "aligned at [s]"),
     ("nonfinite_samples", "estimates that are not finite"),
+)
+FAULT_COLUMNS = (
+    ("detection_delay_s", "detected after [s]", "{:.1f}"),
+    ("coverage", "refused", "{:.0%}"),
+    ("end_lag_s", "used again after [s]", "{:.1f}"),
+    ("isolation_correct", "isolated", "{:.0f}"),
 )
 
 
@@ -106,6 +114,36 @@ def _pace(metrics: Mapping[str, float]) -> str:
     return f"{metrics['run.wall_s']:.3g} s of computing, {metrics['run.realtime_factor']:.4g} times real time"
 
 
+def _fault_rows(metrics: Mapping[str, float]) -> list[list[str]]:
+    """One row per fault and estimator that takes its sensor's samples: fault, estimator, `FAULT_COLUMNS`."""
+    scored = [key.split(".") for key in metrics if ".missed." in key]
+    rows = []
+    for estimator, _, fault in sorted(scored, key=lambda parts: parts[2]):
+        values = [(metrics.get(f"{estimator}.{key}.{fault}"), form) for key, _, form in FAULT_COLUMNS]
+        cells = ["–" if value is None else form.format(value) for value, form in values]
+        cells[0] = "missed" if metrics[f"{estimator}.missed.{fault}"] else cells[0]
+        cells[-1] = {"1": "yes", "0": "no"}[cells[-1]]
+        rows.append([fault, estimator, *cells])
+    return rows
+
+
+def fault_table(metrics: Mapping[str, float]) -> Table | None:
+    """How the faults of a run were detected, for the console; None when there was none to detect."""
+    from rich.table import Table
+
+    rows = _fault_rows(metrics)
+    if not rows:
+        return None
+    table = Table()
+    for name in ("fault", "estimator"):
+        table.add_column(name)
+    for _, name, _ in FAULT_COLUMNS:
+        table.add_column(name.replace("[", r"\["), justify="right")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
 def summary_table(metrics: Mapping[str, float]) -> Table:
     """The main metrics for the console: estimators side by side, with GNSS and in the outage."""
     from rich.table import Table
@@ -134,6 +172,7 @@ class _Run:
     def __init__(self, dataset: xarray.DataTree) -> None:
         self.dataset = dataset
         self.windows = scores.outages(dataset)
+        self.faults = scores.faults(dataset)
         names = scores.names(dataset)
         self.errors = {name: scores.errors(dataset, name) for name in names}
         self.colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(names)}
@@ -457,12 +496,9 @@ def attitude(run: _Run) -> Figure:
 
 def _euler_deg(q: Array) -> Array:
     """Roll, pitch, heading (N, 3) of q_nb (N, 4); heading in [0, 360)."""
-    w, x, y, z = q.T
-    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
-    heading = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    result: Array = np.rad2deg(np.column_stack([roll, pitch, np.mod(heading, 2 * np.pi)]))
-    return result
+    angles = np.rad2deg(scores.euler(q))
+    angles[:, 2] %= 360.0
+    return angles
 
 
 def biases(run: _Run, name: str) -> Figure:
@@ -510,13 +546,17 @@ def _imu_error(run: _Run, estimator: str) -> tuple[Array, Array, Array] | None:
         return None
     means = []
     for name in ("dtheta", "dv"):
-        measured = np.vstack([np.zeros(3), np.cumsum(column(run.dataset, f"sensors/{imu}/{name}"), axis=0)])
+        increments = column(run.dataset, f"sensors/{imu}/{name}")
+        broken = ~(np.abs(increments) < BROKEN).all(axis=1, keepdims=True)
+        measured = np.vstack([np.zeros(3), np.cumsum(np.where(broken, 0.0, increments), axis=0)])
+        lost = np.append(0, np.cumsum(broken))
         true = np.cumsum(run.truth(name), axis=0)
         at = np.searchsorted(t, edges + 1e-9, side="right")
         at_true = np.searchsorted(run.t, edges + 1e-9, side="right") - 1
         total = measured[at] - true[at_true]
         n = round(BIAS_MEAN_S / 10)
-        means.append((total[n:] - total[:-n]) / BIAS_MEAN_S)
+        whole = lost[at[n:]] == lost[at[:-n]]
+        means.append(np.where(whole[:, None], (total[n:] - total[:-n]) / BIAS_MEAN_S, np.nan))
     n = round(BIAS_MEAN_S / 10)
     return (edges[n:] + edges[:-n]) / 2, means[0], means[1]
 
@@ -527,6 +567,7 @@ def innovations(run: _Run, name: str) -> Figure | None:
     if not aids:
         return None
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
     figure, axes = _figure(len(aids), height=1.5, gap=0.32, head=0.75)
     for ax, aid in zip(axes[:, 0], aids, strict=True):
@@ -547,6 +588,10 @@ def innovations(run: _Run, name: str) -> Figure | None:
             colour = AXIS_COLOURS[k] if z.shape[1] > 1 else run.colours[name]
             ax.plot(t[some][fused], shown[some, k][fused], ".", ms=1.6, color=colour, label=label)
             ax.plot(t[weight <= 0], shown[weight <= 0, k], "x", ms=4, color=REFUSED, mew=0.9)
+        mine = set(run.estimate(name, f"{own}/sensor").astype(str).tolist())
+        for fault in run.faults:
+            if fault.sensor in mine and fault.start < run.t[-1]:
+                ax.axvspan(fault.start, min(fault.end, run.t[-1]), color=FAULT, lw=0, zorder=0.5)
         for sign in (-1, 1):
             ax.plot(t, sign * gate, color="#444444", lw=0.8, ls="--")
         ax.set_ylim(-limit, limit)
@@ -560,7 +605,9 @@ def innovations(run: _Run, name: str) -> Figure | None:
     refused_key = Line2D(
         [], [], color=REFUSED, marker="x", ls="", ms=5, label="refused (beyond the axes: at their edge)"
     )
-    _head_legend(run, figure, [gate_key, refused_key] if any(np.isfinite(gate).any() for gate in gates) else [])
+    fault_key = [Patch(color=FAULT, label="fault of the sensor")] if run.faults else []
+    gated = [gate_key, refused_key] if any(np.isfinite(gate).any() for gate in gates) else []
+    _head_legend(run, figure, [*gated, *fault_key])
     return figure
 
 
@@ -693,6 +740,7 @@ def _page(run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, 
         if e.aligned_s is None
     ]
     parts.append(_html_table(metrics))
+    parts.append(_html_faults(run, metrics))
     for caption, image in figures:
         data = base64.b64encode(image).decode()
         text = html.escape(caption)
@@ -717,6 +765,23 @@ def _html_table(metrics: Mapping[str, float]) -> str:
     second = "<tr><th></th>" + "<th>with GNSS</th><th>in the outage</th>" * len(names) + "</tr>" if outage else ""
     body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
     return f"<table><tr><th></th>{head}</tr>{second}{body}</table>"
+
+
+def _html_faults(run: _Run, metrics: Mapping[str, float]) -> str:
+    """What went wrong, and for each estimator how it was detected."""
+    if not run.faults:
+        return ""
+    told = {fault.name: f"{fault}, {fault.start:g} to {fault.end:g} s" for fault in run.faults}
+    names = ("fault", "estimator", *(name for _, name, _ in FAULT_COLUMNS))
+    rows = _fault_rows(metrics)
+    scored = {row[0] for row in rows}
+    rows += [[name, "none looked", *[""] * len(FAULT_COLUMNS)] for name in told if name not in scored]
+    order = list(told)
+    rows.sort(key=lambda row: order.index(row[0]))
+    shown = [[f"{row[0]}: {told[row[0]]}", *row[1:]] for row in rows]
+    head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in shown)
+    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _html_events(run: _Run) -> str:

@@ -27,15 +27,16 @@ from testbed.errors import UserError
 from testbed.keypath import KeyPath
 from testbed.schema import Section
 from testbed.segments import Body, GroundSpeed, Segment, Track, lay_track
-from testbed.sensors import CONFIGS, SensorConfig, Site
+from testbed.sensors import CONFIGS, SensorConfig, Site, faults
 from testbed.sensors.magnetometer import WMM_YEARS
 from testbed.sensors.timing import TICK_TOLERANCE
 
 LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
 LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a slip of the keyboard beyond that
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
+LONGEST_NAME = 32  # as the record keeps them
 ERRORS_SHOWN = 20
-CHOICES_SHOWN = 12
+CHOICES_SHOWN = 16
 MISSING = "is missing: add it"
 
 Latitude: TypeAlias = Annotated[float, Field(gt=-LATITUDE_LIMIT_DEG, lt=LATITUDE_LIMIT_DEG)]
@@ -65,6 +66,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
+_TAG_KEYS = ("leg", "source", "kind")  # whose values tell sections of a union apart
 _RESERVED = frozenset({"run", "truth"})  # `run.wall_s` and the like would become ambiguous
 
 
@@ -283,6 +285,7 @@ class Scenario(Section):
     truth: FlightTruth | KinematicTruth = Field(discriminator="source")
     plan: tuple[guidance.Leg, ...] = ()
     sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(default_factory=dict)
+    fault: tuple[faults.Fault, ...] = ()
     estimator: tuple[EstimatorConfig, ...] = ()
     autopilot: AutopilotConfig = AutopilotConfig()
     record: RecordConfig = RecordConfig()
@@ -429,6 +432,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     for name, config in scenario.sensors.items():
         yield from _sensor_faults(("sensors", name), config, tick_hz, scenario.duration_s)
     yield from _plan_faults(scenario)
+    yield from _fault_mistakes(scenario)
     taken: set[str] = set()
     for index, estimator in enumerate(scenario.estimator):
         yield from _estimator_faults(("estimator", index), estimator, scenario.sensors, taken)
@@ -481,6 +485,8 @@ def _sensor_faults(
     name = str(path[-1])
     if not _IDENTIFIER.fullmatch(name):
         yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
+    elif len(name) > LONGEST_NAME:
+        yield path, f"a sensor's name has at most {LONGEST_NAME} letters"
     yield from _divides((*path, "rate_hz"), config.rate_hz, tick_hz)
     offset_s = getattr(config, "offset_s", 0.0)
     if not _whole(offset_s * tick_hz):
@@ -490,6 +496,32 @@ def _sensor_faults(
         if start >= duration_s:
             shown = f"window [{start:g}, {end:g}]"
             yield (*path, "denied"), f"{shown} starts after the end of the run: duration_s is {duration_s:g}"
+
+
+def _fault_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    taken: list[str] = []
+    for index, fault in enumerate(scenario.fault):
+        path: KeyPath = ("fault", index)
+        name = faults.label(fault, taken)
+        if not _IDENTIFIER.fullmatch(name):
+            yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
+        elif name in taken:
+            yield (*path, "name"), f"{name!r} is taken by a fault above: give each its own name"
+        taken.append(name)
+        start, end = fault.window
+        if start >= scenario.duration_s:
+            after = f"starts after the end of the run: duration_s is {scenario.duration_s:g}"
+            yield (*path, "window"), f"[{start:g}, {end:g}] {after}"
+        sensor = scenario.sensors.get(fault.sensor)
+        if sensor is None:
+            yield (*path, "sensor"), _unknown("sensor", fault.sensor, list(scenario.sensors))
+            continue
+        channels = list(faults.CHANNELS.get(sensor.kind, {}))
+        channel = getattr(fault, "channel", None)
+        if channel is not None and channel not in channels:
+            yield (*path, "channel"), _unknown(f"channel of {fault.sensor}", channel, channels)
+        for key, complaint in faults.mistakes(fault, sensor):
+            yield (*path, key), complaint
 
 
 def _estimator_faults(
@@ -647,8 +679,8 @@ def _locate(details: ErrorDetails, data: dict[str, Any]) -> tuple[KeyPath, list[
     path: KeyPath = ()
     models: list[type[Section]] = [Scenario]
     for step in loc[:-1]:
-        if isinstance(here, dict) and len(models) > 1 and step in (here.get("leg"), here.get("source")):
-            models = [m for m in models if step in (*_tags(m, "leg"), *_tags(m, "source"))]
+        if isinstance(here, dict) and len(models) > 1 and step in (here.get(key) for key in _TAG_KEYS):
+            models = [m for m in models if any(step in _tags(m, key) for key in _TAG_KEYS)]
         elif _holds(here, step):
             here = here[step]
             path = (*path, step)

@@ -7,6 +7,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import typer
@@ -15,6 +16,7 @@ import testbed.__main__ as cli
 from testbed import Scenario, run
 from testbed.flight import modes_table
 from testbed.sensors import imu
+from testbed.sensors.faults import CHANNELS, FaultConfig
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text("utf-8")
@@ -27,6 +29,7 @@ def blocks(language: str) -> list[str]:
 
 
 LINES = [shlex.split(line, comments=True) for block in blocks("sh") for line in block.splitlines()]
+WHOLE = [text for text in blocks("toml") if text.startswith("title")]
 COMMANDS = [line[1:] for line in LINES if line[0] == "testbed"]
 SCRIPTS = [line[1:] for line in LINES if line[0] == "python"]
 
@@ -82,13 +85,33 @@ def test_make_targets_exist() -> None:
     assert set(re.findall(r"`?make ([a-z-]+)", README)) <= set(targets)
 
 
-@pytest.mark.parametrize("text", blocks("toml"))
+@pytest.mark.parametrize("text", WHOLE)
 def test_scenario_flies(text: str) -> None:
     assert Scenario.parse(text).duration_s > 200
     scenario = Scenario.parse(text, ["duration_s=20", "sensors.gnss.denied=[[12, 15]]"])
     result = run(scenario)
     for estimator in scenario.estimator:
         assert result.metrics[f"{estimator.name}.aligned_s"] < 10
+
+
+def test_parts_of_scenarios_fit_into_one() -> None:
+    parts = [text for text in blocks("toml") if text not in WHOLE]
+    assert parts
+    for part in parts:
+        assert Scenario.parse(f"{WHOLE[0]}\n{part}").fault
+
+
+def test_faults_are_those_of_the_code() -> None:
+    section = README[README.index("### Faults") :]
+    section = section[: section.index("\n## ")]
+    rows = [row.split(" | ") for row in re.findall(r"^\| (`.*) \|$", section, re.MULTILINE)]
+    kinds = [name for row in rows for name in re.findall(r"`(\w+)`", row[0]) if name not in CHANNELS]
+    assert sorted(kinds) == sorted(get_args(kind.model_fields["kind"].annotation)[0] for kind in get_args(FaultConfig))
+    told = {name: row[1] for row in rows for name in re.findall(r"`(\w+)`", row[0]) if name in CHANNELS}
+    for sensor, channels in CHANNELS.items():
+        between = {"gyro_y", "accel_y"}  # "gyro_x to gyro_z"
+        assert set(channels) - between <= set(re.findall(r"`(\w+)`", told[sensor])), sensor
+        assert all(unit in told[sensor] for channel in channels.values() for unit in channel.units)
 
 
 @pytest.mark.parametrize("code", blocks("python"))

@@ -187,7 +187,9 @@ def _report(t: float, sensor: str, aid: str, m: int, rng: np.random.Generator) -
     nis = float(z @ np.linalg.solve(S, z))
     threshold = {1: 10.8, 3: 16.3}[m]
     refused = nis > threshold
-    return UpdateReport(t, sensor, aid, z, S, nis, threshold, 0.0 if refused else 1.0, "gate" if refused else "")
+    return UpdateReport(
+        t, sensor, aid, z, S, nis, threshold, 0.0 if refused else 1.0, "outside the gate" if refused else ""
+    )
 
 
 def dataset(

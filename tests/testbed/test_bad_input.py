@@ -18,9 +18,33 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.loop import run
 from testbed.scenario import Scenario
+from testbed.sensors.faults import Faults
 
 TEXTS = {path.stem: path.read_text("utf-8") for path in sorted(data_dir("scenarios").glob("*.toml"))}
 U_TURN = TEXTS["u_turn"]
+FAULTY = """
+[[fault]]
+sensor = "gnss"
+channel = "position"
+kind = "ramp"
+window = [50, 80]
+slope = 2.0
+unit = "sigma"
+bearing_deg = 30
+[[fault]]
+name = "blocked"
+sensor = "airspeed"
+channel = "speed"
+kind = "stuck"
+window = [60, 90]
+value = 5.0
+[[fault]]
+sensor = "gnss"
+kind = "drag_off"
+window = [60, 90]
+bearing_deg = 90
+acceleration_mps2 = 0.1
+"""
 
 
 def complaint(text: str, *overrides: str) -> str:
@@ -160,6 +184,74 @@ def test_windows(windows: str, says: str) -> None:
     assert message.startswith(f"mine.toml:{line_of(U_TURN, '[sensors.gnss]') + 1}: sensors.gnss.{says}")
 
 
+STEP = {"sensor": "gnss", "channel": "north", "kind": "step", "window": [50, 60], "size": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"sensor": "gns"}, 'sensor: there is no sensor "gns": did you mean gnss'),
+        ({"channel": "nort"}, 'channel: there is no channel of gnss "nort": did you mean north'),
+        ({"sensor": "imu"}, 'channel: there is no channel of imu "north": choose from gyro_x, gyro_y'),
+        ({"kind": "stp"}, 'kind: there is no kind "stp": did you mean step'),
+        ({"kind": None}, "kind: is missing: add it, one of step, ramp"),
+        ({"window": [60, 50]}, "window: [60, 50] ends before it starts"),
+        ({"window": [-5, 50]}, "window: [-5, 50] starts before the run"),
+        ({"window": [200, 250]}, "window: [200, 250] starts after the end of the run: duration_s is 200"),
+        ({"window": [50]}, "window[1]: is missing: this item needs one more value"),
+        ({"size": None}, "size: is missing: add it"),
+        ({"size": "5"}, 'size: must be a number, not "5"'),
+        ({"size": 1e300}, "size: must be less than or equal to"),
+        ({"slope": 5.0}, "slope: unknown key: choose from name, sensor, window, channel, bearing_deg"),
+        ({"kind": "ramp"}, "slope: is missing: add it"),
+        ({"unit": "m/s"}, "unit: 'm/s' does not fit gnss north: choose from m, sigma"),
+        ({"bearing_deg": 30.0}, "bearing_deg: 'north' has its own direction"),
+        ({"channel": "position"}, "channel: 'position' has no direction of its own: add bearing_deg"),
+        ({"channel": "position", "bearing_deg": 400.0}, "bearing_deg: must be less than or equal to 360"),
+        ({"kind": "scale", "size": None, "factor": 2.0}, "kind: a multiple of 'north' means nothing"),
+        ({"kind": "stuck", "size": None, "value": 2.0}, "value: 'north' takes no value"),
+        ({"kind": "noise", "size": None, "factor": 0.5}, "factor: must be greater than or equal to 1, not 0.5"),
+        ({"kind": "sine", "period_s": 0.0}, "period_s: must be greater than or equal to 0.001"),
+        ({"kind": "dropout", "size": None}, "channel: unknown key"),
+        (
+            {"sensor": "airspeed", "channel": "speed", "kind": "stuck", "size": None, "unit": "sigma", "value": 3.0},
+            "unit: a value is in no sigmas: give it in m/s",
+        ),
+        (
+            {"sensor": "barometer", "kind": "drag_off", "bearing_deg": 3.0, "velocity_mps": 1.0, "size": None,
+             "channel": None},
+            "kind: drag_off needs a sensor of position, and 'barometer' is of kind 'barometer'",
+        ),
+        ({"kind": "drag_off", "bearing_deg": 3.0, "size": None, "channel": None}, "kind: drag_off needs velocity_mps"),
+        ({"name": "a b"}, "name: is made of letters, digits and _"),
+        ({"name": "x" * 65}, "name: String should have at most 64 characters"),
+    ],
+)  # fmt: skip
+def test_faults(keys: dict[str, Any], says: str) -> None:
+    fault = {key: value for key, value in (STEP | keys).items() if value is not None}
+    text = U_TURN + "\n[[fault]]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in fault.items())
+    message = complaint(text)
+    assert f"fault[0].{says}" in message
+    line = int(re.match(r"mine\.toml:(\d+): ", message.splitlines()[0])[1])  # type: ignore[index]
+    assert line >= line_of(text, "[[fault]]")
+
+
+def test_a_sigma_needs_a_sensor_that_states_one() -> None:
+    text = U_TURN + "\n[[fault]]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in STEP.items())
+    perfect = "sensors.gnss.grade=perfect"
+    says = "'gnss' states no error of 'north' to take multiples of: give a size"
+    assert f"fault[0].unit: {says}" in complaint(text + 'unit = "sigma"\n', perfect)
+    noise = text.replace('kind = "step"', 'kind = "noise"').replace("size = 5.0", "factor = 5.0")
+    assert f"fault[0].factor: {says}" in complaint(noise, perfect)
+
+
+def test_faults_of_one_name() -> None:
+    fault = "\n[[fault]]\n" + "".join(f"{key} = {toml(value)}\n" for key, value in STEP.items())
+    assert len(Scenario.parse(U_TURN + 3 * fault).fault) == 3
+    text = U_TURN + fault + fault + 'name = "gnss_north_step"\n'
+    assert "fault[1].name: 'gnss_north_step' is taken by a fault above" in complaint(text)
+
+
 def test_a_misspelt_key_is_not_missing_as_well() -> None:
     assert len(complaint(U_TURN.replace("lat_deg", "latt_deg")).splitlines()) == 1
     assert len(complaint(U_TURN.replace("lat_deg", "bogus")).splitlines()) == 2
@@ -295,14 +387,16 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path, *(place for key, item in items for place in places(item, (*path, key)))]
 
 
-NAMES = st.text(max_size=8) | st.sampled_from([place[-1] for place in places(tomllib.loads(U_TURN))[1:]]).map(str)
+NAMES = st.text(max_size=8) | st.sampled_from([place[-1] for place in places(tomllib.loads(U_TURN + FAULTY))[1:]]).map(
+    str
+)
 ACCIDENTS = ["drop", "double", "rename", "replace", "replace"]
 
 
 @st.composite
 def mutated_documents(draw: st.DrawFn) -> str:
-    """A shipped scenario after a few accidents: keys dropped, renamed, added; values replaced, moved, doubled."""
-    data: dict[str, Any] = tomllib.loads(TEXTS[draw(st.sampled_from(sorted(TEXTS)))])
+    """A scenario after a few accidents: keys dropped, renamed, added; values replaced, moved, doubled."""
+    data: dict[str, Any] = tomllib.loads(draw(st.sampled_from([*TEXTS.values(), U_TURN + FAULTY])))
     for _ in range(draw(st.integers(1, 4))):
         *above, last = draw(st.sampled_from(places(data)[1:] or [("title",)]))
         parent: Any = data
@@ -361,6 +455,7 @@ def loads_or_complains(text: str, overrides: list[str]) -> Scenario | None:
             assert "pydantic" not in line
         return None
     assert scenario.title
+    Faults(scenario.fault, scenario.sensors, scenario.seed)
     for name, config in scenario.sensors.items():
         sensors.build(name, config, scenario.truth.rate_hz, scenario.seed, scenario.site())
     assert dict(Scenario.parse(scenario.text, scenario.overrides)) == dict(scenario)

@@ -96,7 +96,6 @@ def flown_here(path: Path, seed: int, overrides: tuple[str, ...] = ()) -> Outcom
     """What a campaign should have of one run, flown in this process by the plain loop, truth and all."""
     result = run(Scenario.load(path, overrides), seed=seed)
     metrics = {k: v for k, v in result.metrics.items() if not k.startswith("run.")}
-    metrics["ins.false_alarms_per_h"] = campaigns._false_alarms_per_h(result.dataset, "ins")
     return Outcome(0, seed, metrics, campaigns._history(result.dataset))
 
 
@@ -457,6 +456,7 @@ def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float 
         "ins.position_horizontal_rms_m": float(seed),
         "ins.false_alarms_per_h": float(seed % 2),
     }
+    metrics |= {"ins.detection_delay_s.jump": 0.1 * seed, "ins.coverage.jump": 1 - 0.01 * seed}
     if seed != 4:
         metrics["ins.recovery_s"] = 10.0 - seed
     return Outcome(combination, seed, metrics, history)
@@ -485,17 +485,13 @@ def test_statistics(tmp_path: Path) -> None:
     assert rms.p95 == pytest.approx(0.95 * 29)
     recovery = next(s for s in statistics.spreads if s.metric == "recovery_s")
     assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
-
-
-def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
-    dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
-    for aid in ("barometer", "gnss_position", "gnss_velocity"):
-        dataset[f"estimators/ins/innovations/{aid}"]["weight"][:] = 1.0
-    barometer = dataset["estimators/ins/innovations/barometer"]
-    for t in (30.0, 80.0, 90.2, 120.0, 190.0):  # aligned at 5 s, and settled a minute later; 120 s is in the outage
-        barometer["weight"][round(t * 5)] = 0.0
-    # From 65 s to 100 s, and from the arrival of the first fix at 150.1 s to the end.
-    assert campaigns._false_alarms_per_h(dataset, "ins") == pytest.approx(3 / (84.9 / 3600), rel=0.005)
+    delay = next(s for s in statistics.spreads if s.metric == "detection_delay_s.jump")
+    assert (delay.worst, delay.worst_seed) == (pytest.approx(2.9), 29)
+    coverage = next(s for s in statistics.spreads if s.metric == "coverage.jump")  # little is bad
+    assert (coverage.worst, coverage.worst_seed) == (pytest.approx(0.71), 29)
+    assert coverage.p95 == pytest.approx(1 - 0.95 * 0.29)
+    shown = "".join(str(cell) for cell in campaign_report.tables(made_up_campaign(tmp_path, ["0"]))[0].columns[1].cells)
+    assert "jump: detected after \\[s]" in shown
 
 
 def test_history_is_the_error_once_a_second() -> None:

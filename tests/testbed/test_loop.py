@@ -14,6 +14,7 @@ import pytest
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, UpdateReport
 from testbed import Scenario, flight, loop, record, run, sensors
 from testbed.errors import UserError
+from testbed.scenario import shipped
 from testbed.truth import MotionSource, TruthBlock
 
 SHORT = ["duration_s=40", "sensors.gnss.denied=[[20, 26]]"]
@@ -259,6 +260,68 @@ def test_gnss_denied_sample_says_so() -> None:
     assert inside
     assert all(s.fix_type == FixType.NO_FIX for s in inside)
     assert all(np.isnan(s.lat) for s in inside)
+
+
+def test_faults_and_only_their_sensor() -> None:
+    """A step of one receiver is told, recorded, detected by the gate, and isolated; then all is as before."""
+    step = """
+[[fault]]
+sensor = "gnss"
+channel = "north"
+kind = "step"
+window = [70, 80]
+size = 20
+unit = "sigma"
+[[fault]]
+sensor = "barometer"
+channel = "pressure"
+kind = "garbage"
+window = [75, 77]
+[[fault]]
+sensor = "imu"
+kind = "dropout"
+window = [90, 90.05]
+"""
+    text, options = shipped()["u_turn"].read_text(), ["duration_s=100", "sensors.gnss.denied=[]"]
+    healthy = run(Scenario.parse(text, options))
+    watcher = Watcher()
+    result = run(Scenario.parse(text + step, options), links=[watcher])
+    data = result.dataset
+    for sensor in ("magnetometer", "airspeed"):
+        assert data[f"sensors/{sensor}"].identical(healthy.dataset[f"sensors/{sensor}"])
+    moved = (data["sensors/gnss/lat"].values != healthy.dataset["sensors/gnss/lat"].values).nonzero()[0]
+    t = data["sensors/gnss/time"].values
+    np.testing.assert_array_equal(moved, np.flatnonzero((t > 70 - 1e-6) & (t < 80 - 1e-6)))
+    assert data["faults/name"].values.tolist() == ["gnss_north_step", "barometer_pressure_garbage", "imu_dropout"]
+    assert data["faults/time"].values.tolist() == [70.0, 75.0, 90.0]
+    assert (70.0, "info", "fault gnss_north_step begins: gnss north step 20 sigma") in watcher.events
+    assert (80.0, "info", "fault gnss_north_step ends: gnss north step 20 sigma") in watcher.events
+    found = result.metrics
+    assert found["ins.detection_delay_s.gnss_north_step"] == 0.0
+    assert found["ins.coverage.gnss_north_step"] == 1.0
+    assert found["ins.isolation_correct.gnss_north_step"] == 1.0
+    assert found["ins.end_lag_s.gnss_north_step"] <= 1.5
+    assert found["ins.coverage.barometer_pressure_garbage"] == 1.0
+    assert found["ins.end_lag_s.barometer_pressure_garbage"] == 0.0
+    assert found["ins.position_horizontal_max_m"] < 10.0
+    assert not [key for key in healthy.metrics if "detection" in key or "missed" in key]
+
+
+def test_a_faulty_run_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = shipped()["u_turn"].read_text() + "".join(
+        f'[[fault]]\nsensor = "{sensor}"\nkind = "{kind}"\nwindow = [20, 30]\n{rest}\n'
+        for sensor, kind, rest in (
+            ("gnss", "drag_off", "bearing_deg = 40\nacceleration_mps2 = 0.3"),
+            ("airspeed", "stuck", 'channel = "speed"'),
+            ("barometer", "delay", 'channel = "height"\ndelay_s = 3'),
+            ("imu", "noise", 'channel = "gyro_x"\nfactor = 4'),
+            ("imu", "spikes", 'channel = "accel_z"\nsize = 20\nperiod_s = 0.33'),
+        )
+    )
+    scenario = Scenario.parse(text, ["duration_s=40"])
+    reference = run(scenario)
+    monkeypatch.setattr(loop, "BATCH_S", 0.365)
+    assert same(reference.dataset, run(scenario).dataset)
 
 
 @pytest.mark.parametrize(

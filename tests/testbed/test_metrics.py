@@ -17,6 +17,7 @@ from nav.samples import FixType, GnssSample
 from testbed import metrics
 from testbed.errors import UserError
 from testbed.record import Recorder
+from testbed.sensors.faults import FaultTruth
 
 DENIED = ((150.0, 290.0),)
 
@@ -116,14 +117,179 @@ def test_error_at_marks_of_the_outage(run: Any, computed: dict[str, float]) -> N
     assert "ins.outage_position_horizontal_at_300s_m" not in computed
 
 
-def test_nis_counts_what_was_fused_and_refusals_are_told(run: Any, computed: dict[str, float]) -> None:
+def relabel(run: Any, aid: str, t: float, weight: float, reason: str, nis: float | None = None) -> None:
+    """Make one report of a made-up run say something else."""
+    reports = run[f"estimators/ins/innovations/{aid}"]
+    k = int(np.flatnonzero(np.isclose(reports["sample_time"].values, t))[0])
+    reports["weight"].values[k] = weight
+    reports["reason"] = reports["reason"].astype("U64")
+    reports["reason"].values[k] = reason
+    if nis is not None:
+        reports["nis"].values[k] = nis
+
+
+def test_nis_is_of_all_that_the_gate_judged(run: Any, computed: dict[str, float]) -> None:
     reports = run["estimators/ins/innovations/gnss_position"]
     after = reports["sample_time"].values >= 65
-    fused = after & (reports["weight"].values > 0)
-    assert computed["ins.nis_mean.gnss_position"] == pytest.approx(reports["nis"].values[fused].mean() / 3)
+    assert computed["ins.nis_mean.gnss_position"] == pytest.approx(reports["nis"].values[after].mean() / 3)
     assert computed["ins.nis_mean.barometer"] == pytest.approx(1.0, abs=0.15)
     refused = np.mean(reports["weight"].values[after] == 0)
     assert computed["ins.rejected_fraction.gnss_position"] == pytest.approx(refused)
+
+
+def test_what_was_withheld_is_not_the_gate_s() -> None:
+    run = synthetic_run.dataset(100.0, estimators={"ins": Errors(aligned_after=0.0)})
+    for aid in ("gnss_position", "gnss_velocity"):
+        run[f"estimators/ins/innovations/{aid}"]["nis"].values[:] = 2.0
+        run[f"estimators/ins/innovations/{aid}"]["weight"].values[:] = 1.0
+    relabel(run, "gnss_position", 70.0, 0.0, "outside the gate", 50.0)
+    relabel(run, "gnss_velocity", 70.0, 0.0, "position outside the gate", 700.0)
+    for t in (72.0, 72.2, 72.4):
+        relabel(run, "gnss_position", t, 0.0, "on probation after an outage", 700.0)
+        relabel(run, "gnss_velocity", t, 0.0, "position on probation after an outage", 700.0)
+    relabel(run, "gnss_position", 80.0, 0.0, "position is not finite", float("nan"))
+    looks = 201 - 3 - 1  # from 60 s to 100 s at 5 Hz, less probation and the unsound one
+    found = metrics.compute(run)
+    assert found["ins.rejected_fraction.gnss_position"] == pytest.approx(1 / looks)
+    assert found["ins.nis_mean.gnss_position"] == pytest.approx((2 * (looks - 1) + 50) / looks / 3)
+    assert found["ins.rejected_fraction.gnss_velocity"] == 0.0
+    assert found["ins.nis_mean.gnss_velocity"] == pytest.approx(2 / 3)
+    barometer = run["estimators/ins/innovations/barometer"]
+    by_chance = int(np.sum((barometer["weight"].values <= 0) & (barometer["sample_time"].values >= 60)))
+    assert found["ins.false_alarms_per_h"] == pytest.approx((1 + by_chance) / (401 / 36000))
+    assert found["ins.false_alarms_per_look"] == pytest.approx((1 + by_chance) / (looks + 201 - 4 + 201))
+
+
+def test_axes_agree_with_independent_libraries(run: Any, computed: dict[str, float]) -> None:
+    x = independent(run, "ins")
+    t = x["t"]
+    rows = (t >= 65) & (t < 150) | (t >= 300.1)
+    own, truth = run["estimators/ins"]["q_nb"].values[rows], run["truth"]["q_nb"].values[rows]
+    angles = [Rotation.from_quat(q, scalar_first=True).as_euler("ZYX", degrees=True) for q in (own, truth)]
+    tilt = (angles[0] - angles[1])[:, 1:]
+    axes = {f"position_{a}": (x["position"][rows, k], "m") for k, a in enumerate(("north", "east", "down"))}
+    axes |= {f"velocity_{a}": (x["velocity"][rows, k], "mps") for k, a in enumerate(("north", "east", "down"))}
+    axes |= {"pitch": (tilt[:, 0], "deg"), "roll": (tilt[:, 1], "deg"), "heading": (x["turn_deg"][rows, 2], "deg")}
+    for axis, (error, unit) in axes.items():
+        assert computed[f"ins.{axis}_rms_{unit}"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4), axis
+        assert computed[f"ins.{axis}_max_{unit}"] == pytest.approx(np.abs(error).max(), rel=1e-4), axis
+        assert computed[f"ins.{axis}_std_{unit}"] == pytest.approx(np.std(error), rel=1e-4), axis
+        assert f"ins.outage_{axis}_std_{unit}" in computed
+
+
+# --- detection of faults
+
+
+T = np.arange(0.0, 100.0, 0.2)
+
+
+def alarms(*spans: tuple[float, float]) -> Any:
+    return np.logical_or.reduce([(a - 1e-9 <= T) & (b - 1e-9 > T) for a, b in spans])
+
+
+@pytest.mark.parametrize(
+    ("spans", "delay", "sustained", "coverage", "end_lag"),
+    [
+        ([(40.0, 60.0)], 0.0, 0.0, 1.0, 0.0),
+        ([(41.2, 67.6)], 1.2, 1.2, 0.94, 7.6),  # the paper's fading test on a step
+        ([(10.0, 12.0), (43.0, 43.2), (50.0, 60.4)], 3.0, 10.0, 0.51, 0.4),
+        ([(41.0, 41.2), (58.0, 58.2)], 1.0, np.nan, 0.02, 0.0),
+        ([(59.0, 60.0)], 19.0, 19.0, 0.05, 0.0),
+        ([(10.0, 40.0)], np.nan, np.nan, 0.0, 0.0),
+        ([(60.0, 63.0)], np.nan, np.nan, 0.0, 3.0),
+        ([(45.0, 101.0)], 5.0, 5.0, 0.75, np.nan),
+    ],
+)
+def test_detection_scores(
+    spans: list[tuple[float, float]], delay: float, sustained: float, coverage: float, end_lag: float
+) -> None:
+    score = metrics.detection(T, alarms(*spans), (40.0, 60.0))
+    assert score is not None
+    found = [score.delay, score.sustained_delay, score.coverage, score.end_lag]
+    np.testing.assert_allclose(found, [delay, sustained, coverage, end_lag], atol=1e-9)
+    assert score.missed == np.isnan(delay)
+
+
+def test_an_alarm_that_lasts_into_the_next_fault_has_not_ended() -> None:
+    both = alarms((40.0, 80.0))
+    score = metrics.detection(T, both, (40.0, 60.0), until=70.0)
+    assert score is not None
+    assert np.isnan(score.end_lag)
+    assert metrics.detection(T, both, (200.0, 210.0)) is None
+
+
+def faulty(*injected: tuple[Any, ...], chunk: int = 200) -> Any:
+    """A made-up run of 200 s with faults (name, sensor, start, end) on record."""
+    recorder = Recorder(None, scenario(200.0), 1)
+    recorder.faults([FaultTruth(name, sensor, "x", "step", a, b, 3.0, "m") for name, sensor, a, b in injected])
+    synthetic_run.record(recorder, circle(200.0), {"ins": Errors(aligned_after=0.0)}, chunk=chunk)
+    run = recorder.dataset()
+    for aid in ("gnss_position", "gnss_velocity", "barometer"):
+        run[f"estimators/ins/innovations/{aid}"]["weight"].values[:] = 1.0
+    return run
+
+
+def refuse(run: Any, aid: str, start: float, end: float, reason: str = "outside the gate") -> None:
+    t = run[f"estimators/ins/innovations/{aid}"]["sample_time"].values
+    for when in t[(t > start - 1e-6) & (t < end - 1e-6)]:
+        relabel(run, aid, when, 0.0, reason)
+
+
+def test_faults_are_scored_by_name() -> None:
+    run = faulty(("jump", "gnss", 100.0, 120.0), ("rise", "barometer", 110.0, 130.0), ("quiet", "airspeed", 5.0, 9.0))
+    assert next((f.name, f.start, f.end) for f in metrics.faults(run)) == ("jump", 100.0, 120.0)
+    refuse(run, "gnss_velocity", 102.0, 120.0)  # one aid of the sensor is enough
+    for aid in ("gnss_position", "gnss_velocity"):
+        refuse(run, aid, 120.0, 121.0, "on probation after an outage")  # and it is not used yet
+    refuse(run, "barometer", 80.0, 80.2)  # by chance
+    refuse(run, "barometer", 132.0, 133.0)  # after the fault that it missed
+    found = metrics.compute(run)
+    assert found["ins.detection_delay_s.jump"] == pytest.approx(2.0)
+    assert found["ins.coverage.jump"] == pytest.approx(0.9)
+    assert found["ins.end_lag_s.jump"] == pytest.approx(1.0)
+    assert found["ins.missed.jump"] == 0
+    assert found["ins.isolation_correct.jump"] == 1
+    assert "ins.detection_delay_s.rise" not in found
+    assert found["ins.missed.rise"] == 1
+    assert found["ins.isolation_correct.rise"] == 0
+    assert not [key for key in found if key.endswith("quiet")]  # nobody looks at the airspeed
+    healthy_s = (100.0 - 60.0) + (200.1 - 140.0)  # neither from 100 s to 131 s nor from 110 s to 140 s
+    assert found["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
+    assert found["ins.false_alarms_per_look"] == pytest.approx(1 / (3 * 5 * healthy_s), rel=5e-3)
+
+
+def test_faults_that_overlap_end_when_they_end() -> None:
+    run = faulty(("long", "gnss", 100.0, 130.0), ("short", "gnss", 105.0, 110.0), ("next", "gnss", 140.0, 150.0))
+    refuse(run, "gnss_position", 100.0, 133.0)
+    refuse(run, "gnss_velocity", 100.0, 133.0, "position outside the gate")
+    found = metrics.compute(run)
+    assert found["ins.end_lag_s.long"] == pytest.approx(3.0)
+    assert "ins.end_lag_s.short" not in found  # nobody can tell
+    assert found["ins.missed.next"] == 1
+    healthy_s = (100.0 - 60.0) + (200.1 - 160.0)
+    assert found["ins.false_alarms_per_look"] == 0.0
+    relabel(run, "barometer", 190.0, 0.0, "outside the gate")
+    relabel(run, "barometer", 158.0, 0.0, "outside the gate")
+    assert metrics.compute(run)["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
+
+
+def test_the_wrong_sensor_is_no_isolation() -> None:
+    run = faulty(("jump", "gnss", 100.0, 120.0))
+    refuse(run, "gnss_position", 110.0, 120.0)
+    assert metrics.compute(run)["ins.isolation_correct.jump"] == 1
+    refuse(run, "barometer", 108.0, 120.0)
+    assert metrics.compute(run)["ins.isolation_correct.jump"] == 0
+
+
+def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
+    dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
+    for aid in ("barometer", "gnss_position", "gnss_velocity"):
+        dataset[f"estimators/ins/innovations/{aid}"]["weight"][:] = 1.0
+    barometer = dataset["estimators/ins/innovations/barometer"]
+    for t in (30.0, 80.0, 90.2, 120.0, 190.0):  # aligned at 5 s, and settled a minute later; 120 s is in the outage
+        barometer["weight"][round(t * 5)] = 0.0
+    # From 65 s to 100 s, and from the arrival of the first fix at 150.1 s to the end.
+    assert metrics.compute(dataset)["ins.false_alarms_per_h"] == pytest.approx(3 / (84.9 / 3600), rel=0.005)
 
 
 def test_nothing_counts_before_alignment_and_settling(computed: dict[str, float]) -> None:
@@ -185,6 +351,46 @@ def test_no_recovery_is_no_time(tmp_path: Path) -> None:
     found = recovering(tmp_path, 300.0)
     assert "ins.recovery_s" not in found
     assert found["ins.unrecovered_outages"] == 1
+
+
+def test_a_hold_that_the_end_of_the_run_cuts_off_is_no_recovery(tmp_path: Path) -> None:
+    found = recovering(tmp_path, 172.0)  # of 200 s
+    assert "ins.recovery_s" not in found
+    assert found["ins.unrecovered_outages"] == 1
+    assert recovering(tmp_path, 169.0)["ins.recovery_s"] == pytest.approx(69.0, abs=0.11)
+
+
+def test_an_outage_at_the_end_is_not_judged() -> None:
+    found = metrics.compute(synthetic_run.dataset(200.0, {"ins": Errors(aligned_after=0.0)}, ((150.0, 180.0),)))
+    assert "ins.outage_position_horizontal_rms_m" in found
+    assert not [key for key in found if "recover" in key]
+
+
+def receivers(reports: dict[str, Any], end: float = 60.0) -> list[tuple[float, float]]:
+    """Outages of receivers that report twice a second, by the times at which they do and whether there is a fix."""
+    recorder = Recorder(None, scenario(), 1)
+    recorder.truth(circle(end))
+    nan = np.full(3, np.nan)
+    for name, says in reports.items():
+        for t in np.arange(0.0, end + 0.1, 0.5):
+            if says(t) is not None:
+                fix = FixType.FIX_3D if says(t) else FixType.NO_FIX
+                sample = GnssSample(t, t + 0.2, nan[0], nan[0], nan[0], nan, nan, nan, fix, 0, 1.0, 1.0, name)
+                recorder.samples(name, [sample])
+    return metrics.outages(recorder.dataset())
+
+
+def test_a_receiver_that_has_said_nothing_has_no_fix() -> None:
+    found = receivers({"left": lambda t: t >= 20.0, "right": lambda t: True if t >= 30.0 else None})
+    assert found == [(0.0, 20.2)]
+    found = receivers({"left": lambda t: t >= 40.0, "right": lambda t: True if t >= 30.0 else None})
+    assert found == [(0.0, 30.2)]
+
+
+def test_a_receiver_that_falls_silent_has_no_fix() -> None:
+    assert receivers({"left": lambda t: None if 20.0 <= t < 30.0 else True}) == [(20.0, 30.2)]
+    assert receivers({"left": lambda t: None if t >= 50.0 else True}) == [(50.0, np.inf)]
+    assert receivers({"left": lambda t: True}) == []
 
 
 def test_no_outage_no_outage_keys() -> None:

@@ -121,7 +121,7 @@ def test_samples_estimates_reports_and_events_come_back(run_file: Path) -> None:
 
 
 def test_every_variable_has_a_unit_and_a_meaning(run_file: Path) -> None:
-    text = {"reason", "severity", "text"}
+    text = {"reason", "severity", "text", "sensor"}
     for path, variable in variables(load(run_file)).items():
         if path.rsplit("/", 1)[1] in record.AXES:
             continue

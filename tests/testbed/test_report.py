@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_run
+from matplotlib.colors import to_hex
 from rich.console import Console
 from synthetic_run import Errors, circle, scenario
 
@@ -17,6 +18,7 @@ from testbed import metrics, report
 from testbed.data import is_result
 from testbed.errors import UserError
 from testbed.record import Recorder
+from testbed.sensors.faults import FaultTruth
 
 DENIED = ((40.0, 70.0),)
 BAD = Errors(drift_mps=300.0)
@@ -72,6 +74,54 @@ def test_a_body_at_rest(tmp_path: Path) -> None:
     images = {path.name for path in tmp_path.glob("*.png")}
     assert {"flight.png", "ground_track.png", "ins_position_errors.png"} <= images
     assert page.read_text(encoding="utf-8").count("data:image/png;base64,") == len(images)
+
+
+def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
+    recorder = Recorder(None, scenario(120.0), 1)
+    named = {"jump": ("gnss", 80.0), "rise": ("barometer", 85.0), "unseen": ("airspeed", 70.0)}
+    recorder.faults([FaultTruth(n, s, "x", "step", t, t + 20, 3.0, "m") for n, (s, t) in named.items()])
+    synthetic_run.record(recorder, circle(120.0), {"ins": Errors(aligned_after=0.0)})
+    run = recorder.dataset()
+    for aid, weight in (("gnss_position", 0.0), ("barometer", 1.0)):
+        reports = run[f"estimators/ins/innovations/{aid}"]
+        t = reports["sample_time"].values
+        reports["weight"].values[(t > 82 - 1e-6) & (t < 105)] = weight
+    found = metrics.compute(run)
+    page = report.write_report(run, found, tmp_path).read_text()
+    rows = re.findall(r"<tr><td>(.*?)</td></tr>", page)
+    cells = {row.partition(":")[0]: row.split("</td><td>")[1:] for row in rows if ": " in row}
+    assert cells["jump"] == ["ins", "2.0", "90%", "0.0", "yes"]  # velocity was used all the time
+    assert cells["rise"] == ["ins", "missed", "0%", "0.0", "no"]
+    assert cells["unseen"][0] == "none looked"
+    assert "gnss x step 3 m, 80 to 100 s" in page
+    table = report.fault_table(found)
+    out = io.StringIO()
+    Console(file=out, width=160).print(table)
+    assert re.search(r"jump\W+ins\W+2\.0\W+90%", out.getvalue())
+    assert "detected after [s]" in out.getvalue()
+    assert report.fault_table({"ins.position_horizontal_rms_m": 1.0}) is None
+    figure = report.innovations(report._Run(run), "ins")
+    assert figure is not None
+    shaded = [
+        ax.get_title(loc="left").partition(":")[0]
+        for ax in figure.axes
+        for patch in ax.patches
+        if to_hex(patch.get_facecolor()).upper() == report.FAULT
+    ]
+    assert shaded == ["gnss_position", "gnss_velocity", "barometer"]
+
+
+def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
+    run = synthetic_run.dataset(300.0)
+    clean = report._imu_error(report._Run(run), "ins")
+    increments = run["sensors/imu/dtheta"].values
+    increments[200 * 100 : 200 * 100 + 3] = [[np.nan] * 3, [np.inf, 0, 0], [1e300, 0, 0]]
+    broken = report._imu_error(report._Run(run), "ins")
+    assert clean is not None
+    assert broken is not None
+    apart = np.abs(broken[0] - 100.0) > 31
+    np.testing.assert_allclose(broken[1][apart], clean[1][apart], atol=1e-9)
+    assert np.isnan(broken[1][np.abs(broken[0] - 100.0) < 29]).all()
 
 
 def test_table_sets_gnss_and_outage_side_by_side() -> None:

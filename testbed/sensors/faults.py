@@ -1,0 +1,609 @@
+"""Faults: what goes wrong with a sensor beyond its datasheet, and when.
+
+A fault acts on samples that the healthy sensor has produced, so no noise stream is touched: other sensors keep their
+bits, and so does this one outside the window. Faults on one channel act in the order of the file, each on what the one
+before it left. A window [start, end) is in times of validity; after its end the sensor is as if nothing had been.
+
+With tau = t - start [s] the kinds are::
+
+    step         + size                                  ramp       + slope tau
+    quadratic    + coefficient tau^2                     sine       + size sin(2 pi tau / period_s)
+    exponential  + size (1 - exp(-tau / time_constant_s))
+    spikes       + size on the first sample, and on the first after every period_s
+    noise        white noise on top, so that the sensor's stated 1-sigma becomes factor times as large
+    scale        the value times factor                  stuck      the last value before the window, or ``value``
+    delay        the value of delay_s ago                dropout    no sample at all; an IMU's increments are NaN
+    garbage      NaN, infinities and absurd numbers
+    drag_off     spoofing: from the true position away along bearing_deg by velocity_mps tau +
+                 acceleration_mps2 tau^2 / 2, and the velocity with it
+
+Sizes are in the channel's unit, in another that fits it, or with ``unit = "sigma"`` in the sensor's own stated 1-sigma
+of one sample: what a GNSS receiver reports, white noise elsewhere.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal, TypeAlias, overload
+
+import numpy as np
+from pydantic import Field, field_validator
+
+from nav.earth import isa_pressure, pressure_altitude
+from nav.rotation import quat_from_rotvec, quat_multiply
+from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
+from testbed.schema import Section
+from testbed.sensors.gnss import displaced
+from testbed.sensors.noise import stream
+from testbed.sensors.units import ARCSEC, DEG, DEG_PER_H, MG, MICROTESLA
+
+Size: TypeAlias = Annotated[float, Field(ge=-1e9, le=1e9)]
+Seconds: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e6)]
+
+ON_THE_EDGE_S = 1e-6  # what times lose as decimal numbers
+PASCALS_PER_METRE = 12.0  # near the ground
+NONSENSE = (math.nan, math.inf, -math.inf, 1e300, -1e300, 1e18, -1e9)
+
+
+# --- channels
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One quantity of a sample that a fault can act on.
+
+    ``units`` by name, in SI, the default first; ``read`` and ``write`` its numbers as the sample holds them; ``shift``
+    adds a size [SI] to it, along a bearing [rad] where the channel ``needs_bearing``; ``sigma`` is the stated 1-sigma
+    of one sample [SI] by the sensor's section. Of a channel that ``has_zero`` a multiple and a given value make sense.
+    """
+
+    units: Mapping[str, float]
+    read: Callable[[Any], tuple[float, ...]]
+    write: Callable[[Any, Sequence[float]], Any]
+    shift: Callable[[Any, float, float], Any]
+    sigma: Callable[[Any], float]
+    has_zero: bool = True
+    needs_bearing: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Increment:
+    """One row of `ImuSamples`."""
+
+    t: float
+    dt: float
+    dtheta: Array
+    dv: Array
+
+
+def _changed(vector: Array, axis: int, value: float) -> Array:
+    result = vector.copy()
+    result[axis] = value
+    return result
+
+
+def _scalar(field: str, units: Mapping[str, float], sigma: Callable[[Any], float]) -> Channel:
+    """A number of a sample."""
+    return Channel(
+        units,
+        lambda s: (getattr(s, field),),
+        lambda s, values: replace(s, **{field: values[0]}),
+        lambda s, size, _: replace(s, **{field: getattr(s, field) + size}),
+        sigma,
+    )
+
+
+def _component(field: str, axis: int, units: Mapping[str, float], sigma: Callable[[Any], float]) -> Channel:
+    """One component of a vector of a sample."""
+    return Channel(
+        units,
+        lambda s: (float(getattr(s, field)[axis]),),
+        lambda s, values: replace(s, **{field: _changed(getattr(s, field), axis, values[0])}),
+        lambda s, size, _: replace(s, **{field: _changed(getattr(s, field), axis, getattr(s, field)[axis] + size)}),
+        sigma,
+    )
+
+
+def _rate(field: str, axis: int, units: Mapping[str, float], sigma: Callable[[Any], float]) -> Channel:
+    """Mean rate or force over an increment of an IMU."""
+    return Channel(
+        units,
+        lambda s: (float(getattr(s, field)[axis]) / s.dt,),
+        lambda s, values: replace(s, **{field: _changed(getattr(s, field), axis, values[0] * s.dt)}),
+        lambda s, size, _: replace(
+            s, **{field: _changed(getattr(s, field), axis, getattr(s, field)[axis] + size * s.dt)}
+        ),
+        sigma,
+    )
+
+
+def _displaced(s: Any, north: float, east: float, down: float) -> Any:
+    """A sample with ``lat``, ``lon``, ``h`` moved by metres, for moves that are small beside the Earth."""
+    h = s.h if math.isfinite(s.h) else 0.0  # not every position has a height
+    lat, lon, _ = displaced(s.lat, s.lon, h, np.array([north, east, down]))
+    return replace(s, lat=lat, lon=lon, h=s.h - down)
+
+
+Move: TypeAlias = Callable[[float, float], tuple[float, float, float]]  # size and bearing to north, east, down
+METRES = {"m": 1.0}
+SPEEDS = {"m/s": 1.0}
+BODY_AXES = ("forward", "right", "down")
+
+
+def _position(sigma: Callable[[Any, int], float]) -> dict[str, Channel]:
+    """Position by axis, and horizontally along a bearing, of samples with ``lat``, ``lon``, ``h``."""
+
+    def along(fields: tuple[str, ...], move: Move, axis: int) -> Channel:
+        return Channel(
+            METRES,
+            lambda s: tuple(getattr(s, field) for field in fields),
+            lambda s, values: replace(s, **dict(zip(fields, values, strict=True))),
+            lambda s, size, bearing: _displaced(s, *move(size, bearing)),
+            lambda c: sigma(c, axis),
+            has_zero=False,
+            needs_bearing=len(fields) == 2,
+        )
+
+    return {
+        "north": along(("lat",), lambda d, _: (d, 0.0, 0.0), 0),
+        "east": along(("lon",), lambda d, _: (0.0, d, 0.0), 1),
+        "down": along(("h",), lambda d, _: (0.0, 0.0, d), 2),
+        "position": along(("lat", "lon"), lambda d, b: (d * math.cos(b), d * math.sin(b), 0.0), 0),
+    }
+
+
+def _velocity(sigma: Callable[[Any, int], float]) -> dict[str, Channel]:
+    """Velocity by axis, and horizontally along a bearing, of samples with ``v_n``."""
+    horizontal = Channel(
+        SPEEDS,
+        lambda s: (float(s.v_n[0]), float(s.v_n[1])),
+        lambda s, values: replace(s, v_n=np.array([*values, s.v_n[2]])),
+        lambda s, size, b: replace(s, v_n=s.v_n + size * np.array([math.cos(b), math.sin(b), 0.0])),
+        lambda c: sigma(c, 0),
+        needs_bearing=True,
+    )
+    return {
+        **{
+            f"v_{name}": _component("v_n", axis, SPEEDS, lambda c, axis=axis: sigma(c, axis))  # type: ignore[misc]
+            for axis, name in enumerate(("north", "east", "down"))
+        },
+        "velocity": horizontal,
+    }
+
+
+def _gnss_sigma(what: str) -> Callable[[Any, int], float]:
+    def sigma(config: Any, axis: int) -> float:
+        e = config.errors()
+        return math.hypot(getattr(e, f"{what}_white_n")[axis], getattr(e, f"{what}_correlated_n")[axis])
+
+    return sigma
+
+
+def _imu_axes(what: str, field: str, units: Mapping[str, float]) -> dict[str, Channel]:
+    """The three axes of the gyros or accelerometers, in the axes of the unit; noise over one increment."""
+
+    def sigma(config: Any) -> float:
+        return float(getattr(config.errors(), f"{what}_noise")) * math.sqrt(config.rate_hz)
+
+    return {f"{what}_{name}": _rate(field, axis, units, sigma) for axis, name in enumerate("xyz")}
+
+
+def _turn(axis: int) -> Channel:
+    """Attitude about one body axis, of samples with ``q_ib``; what sticks or is late is the attitude as a whole."""
+    direction = np.eye(3)[axis]
+    return Channel(
+        {"arcsec": ARCSEC, "deg": DEG},
+        lambda s: tuple(s.q_ib.tolist()),
+        lambda s, values: replace(s, q_ib=np.array(values)),
+        lambda s, size, _: replace(s, q_ib=quat_multiply(s.q_ib, quat_from_rotvec(size * direction))),
+        lambda c: float(c.errors().noise_b[axis]),
+        has_zero=False,
+    )
+
+
+_HEIGHT = Channel(
+    METRES,
+    lambda s: (s.pressure,),
+    lambda s, values: replace(s, pressure=values[0]),
+    lambda s, size, _: replace(s, pressure=float(isa_pressure(pressure_altitude(s.pressure) + size))),
+    lambda c: c.errors().noise / PASCALS_PER_METRE,
+    has_zero=False,
+)
+
+# By kind of sensor. A new kind of sample takes a row here, of these building blocks.
+CHANNELS: Mapping[str, Mapping[str, Channel]] = {
+    "imu": {
+        **_imu_axes("gyro", "dtheta", {"deg/s": DEG, "deg/h": DEG_PER_H, "rad/s": 1.0}),
+        **_imu_axes("accel", "dv", {"m/s^2": 1.0, "mg": MG}),
+    },
+    "gnss": {**_position(_gnss_sigma("position")), **_velocity(_gnss_sigma("velocity"))},
+    "barometer": {
+        "pressure": _scalar("pressure", {"Pa": 1.0, "hPa": 100.0}, lambda c: c.errors().noise),
+        "height": _HEIGHT,
+    },
+    "magnetometer": {
+        name: _component("field_b", axis, {"uT": MICROTESLA}, lambda c: c.errors().noise)
+        for axis, name in enumerate("xyz")
+    },
+    "body_velocity": {
+        name: _component("v_b", axis, SPEEDS, lambda c: c.errors().noise) for axis, name in enumerate(BODY_AXES)
+    },
+    "star_tracker": {name: _turn(axis) for axis, name in enumerate(BODY_AXES)},
+    "position_fix": _position(lambda c, axis: float(c.errors().position_n[axis])),
+    "airspeed": {"speed": _scalar("eas", SPEEDS, lambda c: c.errors().noise)},
+}
+
+
+# --- what a scenario says
+
+
+class _Fault(Section):
+    """Keys of every ``[[fault]]``. Metrics and events know it by its name."""
+
+    name: str | None = Field(None, max_length=64)
+    sensor: str
+    window: tuple[float, float]
+
+    @field_validator("window")
+    @classmethod
+    def _forwards(cls, window: tuple[float, float]) -> tuple[float, float]:
+        start, end = window
+        if start < 0:
+            raise ValueError(f"[{start:g}, {end:g}] starts before the run; times are seconds from its start")
+        if end <= start:
+            raise ValueError(f"[{start:g}, {end:g}] ends before it starts; write [start, end] in seconds")
+        return window
+
+
+class _OnChannel(_Fault):
+    channel: str
+    bearing_deg: float | None = Field(None, ge=-360, le=360, description="of channels without a direction of their own")
+
+
+class _Sized(_OnChannel):
+    unit: str | None = Field(None, description="the channel's first unit unless it is given; or sigma")
+
+
+class Step(_Sized):
+    """A constant offset."""
+
+    kind: Literal["step"]
+    size: Size
+
+    def offset(self, tau: float) -> float:
+        """What is added ``tau`` [s] after the start, in the fault's unit."""
+        return self.size
+
+
+class Ramp(_Sized):
+    """An offset that grows by ``slope`` per second."""
+
+    kind: Literal["ramp"]
+    slope: Size
+
+    def offset(self, tau: float) -> float:
+        """What is added ``tau`` [s] after the start, in the fault's unit."""
+        return self.slope * tau
+
+
+class Quadratic(_Sized):
+    """An offset of ``coefficient`` times the square of the seconds."""
+
+    kind: Literal["quadratic"]
+    coefficient: Size
+
+    def offset(self, tau: float) -> float:
+        """What is added ``tau`` [s] after the start, in the fault's unit."""
+        return self.coefficient * tau**2
+
+
+class Exponential(_Sized):
+    """An offset that settles at ``size``."""
+
+    kind: Literal["exponential"]
+    size: Size
+    time_constant_s: Seconds
+
+    def offset(self, tau: float) -> float:
+        """What is added ``tau`` [s] after the start, in the fault's unit."""
+        return -self.size * math.expm1(-tau / self.time_constant_s)
+
+
+class Sine(_Sized):
+    """An oscillation of amplitude ``size``."""
+
+    kind: Literal["sine"]
+    size: Size
+    period_s: Seconds
+
+    def offset(self, tau: float) -> float:
+        """What is added ``tau`` [s] after the start, in the fault's unit."""
+        return self.size * math.sin(2 * math.pi * tau / self.period_s)
+
+
+class Spikes(_Sized):
+    """Single samples that are off by ``size``, one every ``period_s``."""
+
+    kind: Literal["spikes"]
+    size: Size
+    period_s: Seconds
+
+
+class Stuck(_Sized):
+    """Always the same value."""
+
+    kind: Literal["stuck"]
+    value: Size | None = Field(None, description="the last one before the window unless it is given")
+
+
+class Noise(_OnChannel):
+    """The stated 1-sigma is ``factor`` times as large."""
+
+    kind: Literal["noise"]
+    factor: float = Field(ge=1, le=1e6)
+
+
+class Scale(_OnChannel):
+    """The value times ``factor``."""
+
+    kind: Literal["scale"]
+    factor: Size
+
+
+class Delay(_OnChannel):
+    """The value of ``delay_s`` ago, under the time of now."""
+
+    kind: Literal["delay"]
+    delay_s: float = Field(gt=0, le=3600)
+
+
+class Garbage(_OnChannel):
+    """Random nonsense."""
+
+    kind: Literal["garbage"]
+
+
+class Dropout(_Fault):
+    """No samples."""
+
+    kind: Literal["dropout"]
+
+
+class DragOff(_Fault):
+    """Spoofing: position and velocity are drawn away together, smoothly."""
+
+    kind: Literal["drag_off"]
+    bearing_deg: float = Field(ge=-360, le=360)
+    velocity_mps: Size = 0.0
+    acceleration_mps2: Size = 0.0
+
+
+FaultConfig: TypeAlias = (
+    Step | Ramp | Quadratic | Exponential | Sine | Spikes | Stuck | Noise | Scale | Delay | Garbage | Dropout | DragOff
+)
+Fault: TypeAlias = Annotated[FaultConfig, Field(discriminator="kind")]
+
+
+def mistakes(fault: FaultConfig, sensor: Any) -> Iterator[tuple[str, str]]:
+    """Key and complaint for everything about a fault that does not fit its ``sensor``'s section."""
+    channels = CHANNELS.get(sensor.kind, {})
+    if isinstance(fault, DragOff):
+        if "position" not in channels:
+            yield "kind", f"drag_off needs a sensor of position, and {fault.sensor!r} is of kind {sensor.kind!r}"
+        if not fault.velocity_mps and not fault.acceleration_mps2:
+            yield "kind", "drag_off needs velocity_mps, acceleration_mps2 or both: nothing would move"
+    if not isinstance(fault, _OnChannel) or fault.channel not in channels:
+        return
+    channel = channels[fault.channel]
+    if channel.needs_bearing and fault.bearing_deg is None and not isinstance(fault, (Stuck, Delay, Scale, Garbage)):
+        yield "channel", f"{fault.channel!r} has no direction of its own: add bearing_deg"
+    if not channel.needs_bearing and fault.bearing_deg is not None:
+        yield "bearing_deg", f"{fault.channel!r} has its own direction: leave the bearing out"
+    if not channel.has_zero and isinstance(fault, Scale):
+        yield "kind", f"a multiple of {fault.channel!r} means nothing: choose another kind"
+    if isinstance(fault, Stuck) and fault.value is not None and (not channel.has_zero or channel.needs_bearing):
+        yield "value", f"{fault.channel!r} takes no value: leave it out, and it sticks where it was"
+    in_sigmas = isinstance(fault, Noise)
+    if isinstance(fault, _Sized) and fault.unit is not None:
+        known = [*channel.units, "sigma"]
+        in_sigmas = fault.unit == "sigma"
+        if fault.unit not in known:
+            yield "unit", f"{fault.unit!r} does not fit {fault.sensor} {fault.channel}: choose from {', '.join(known)}"
+        if in_sigmas and isinstance(fault, Stuck):
+            yield "unit", "a value is in no sigmas: give it in " + " or ".join(channel.units)
+    if in_sigmas and channel.sigma(sensor) <= 0:
+        key = "factor" if isinstance(fault, Noise) else "unit"
+        yield key, f"{fault.sensor!r} states no error of {fault.channel!r} to take multiples of: give a size"
+
+
+# --- at work
+
+
+@dataclass(frozen=True, slots=True)
+class FaultTruth:
+    """What is recorded of one fault; ``size`` is its principal number, in ``unit``. ``channel`` empty: all of them."""
+
+    name: str
+    sensor: str
+    channel: str
+    kind: str
+    start: float
+    end: float
+    size: float
+    unit: str
+
+    def __str__(self) -> str:
+        size = "" if math.isnan(self.size) else f" {self.size:g} {self.unit}"
+        return f"{' '.join(filter(None, (self.sensor, self.channel, self.kind)))}{size}"
+
+
+class _Running:
+    """One fault at work on the samples of its sensor, in their order."""
+
+    def __init__(self, fault: FaultConfig, sensor: Any, rng: np.random.Generator) -> None:
+        self._fault = fault
+        self._rng = rng
+        self._channels = CHANNELS.get(sensor.kind, {})
+        self.start, self.end = (edge - ON_THE_EDGE_S for edge in fault.window)
+        self.listens = self.start  # from when on it has to see every sample; of earlier ones the newest will do
+        self._before: deque[tuple[float, tuple[float, ...]]] = deque()
+        self._next_spike = fault.window[0]
+        self._unit = 1.0
+        self._bearing = 0.0
+        self._sigma = 0.0
+        if isinstance(fault, _OnChannel):
+            self._channel = self._channels[fault.channel]
+            self._bearing = (fault.bearing_deg or 0.0) * DEG
+            self._sigma = self._channel.sigma(sensor)
+        if isinstance(fault, _Sized):
+            name = fault.unit or next(iter(self._channel.units))
+            self._unit = self._sigma if name == "sigma" else self._channel.units[name]
+        if isinstance(fault, Delay):
+            self.listens -= fault.delay_s
+
+    def act(self, sample: Any) -> Any:
+        """What becomes of a sample, None when it is lost."""
+        fault = self._fault
+        if isinstance(sample, GnssSample) and sample.fix_type is FixType.NO_FIX and not isinstance(fault, Dropout):
+            return sample  # there is nothing in it that could be wrong
+        if isinstance(fault, (Stuck, Delay)):
+            self._remember(fault, sample)
+        if not self.start <= sample.t < self.end:
+            return sample
+        tau = max(sample.t - fault.window[0], 0.0)
+        match fault:
+            case Step() | Ramp() | Quadratic() | Exponential() | Sine():
+                return self._shifted(sample, self._unit * fault.offset(tau))
+            case Spikes():
+                if sample.t < self._next_spike - ON_THE_EDGE_S:
+                    return sample
+                self._next_spike = fault.window[0] + fault.period_s * (
+                    1 + math.floor((tau + ON_THE_EDGE_S) / fault.period_s)
+                )
+                return self._shifted(sample, self._unit * fault.size)
+            case Noise():
+                sigma = math.sqrt(fault.factor**2 - 1) * self._sigma
+                return self._shifted(sample, sigma * self._rng.standard_normal())
+            case Scale():
+                return self._channel.write(sample, [fault.factor * x for x in self._channel.read(sample)])
+            case Stuck():
+                stuck = self._before[0][1] if fault.value is None else [self._unit * fault.value]
+                return self._channel.write(sample, stuck)
+            case Delay():
+                return self._channel.write(sample, self._before[0][1])
+            case Garbage():
+                picked = self._rng.integers(len(NONSENSE), size=len(self._channel.read(sample)))
+                return self._channel.write(sample, [NONSENSE[k] for k in picked])
+            case Dropout():
+                return _lost(sample) if isinstance(sample, _Increment) else None
+            case DragOff():
+                bearing = fault.bearing_deg * DEG
+                away = fault.velocity_mps * tau + fault.acceleration_mps2 * tau**2 / 2
+                sample = self._channels["position"].shift(sample, away, bearing)
+                if "velocity" in self._channels:
+                    speed = fault.velocity_mps + fault.acceleration_mps2 * tau
+                    sample = self._channels["velocity"].shift(sample, speed, bearing)
+                return sample
+
+    def _shifted(self, sample: Any, size: float) -> Any:
+        return self._channel.shift(sample, size, self._bearing)
+
+    def _remember(self, fault: Stuck | Delay, sample: Any) -> None:
+        """Keep the value to stick at, or all values since ``delay_s`` ago, that of then first."""
+        if isinstance(fault, Stuck):
+            if not self._before or sample.t < self.start:
+                self._before.clear()
+                self._before.append((sample.t, self._channel.read(sample)))
+            return
+        self._before.append((sample.t, self._channel.read(sample)))
+        while len(self._before) > 1 and self._before[1][0] <= sample.t - fault.delay_s + ON_THE_EDGE_S:
+            self._before.popleft()
+
+
+def _lost(increment: _Increment) -> _Increment:
+    nothing = np.full(3, np.nan)
+    return replace(increment, dtheta=nothing, dv=nothing)
+
+
+class Faults:
+    """All faults of a run. ``truth`` says what they are; one may be added while the run goes on."""
+
+    def __init__(self, faults: Sequence[FaultConfig], sensors: Mapping[str, Any], seed: int) -> None:
+        self.truth: list[FaultTruth] = []
+        self._sensors = sensors
+        self._seed = seed
+        self._running: dict[str, list[_Running]] = {}
+        for fault in faults:
+            self.add(fault)
+
+    def add(self, fault: FaultConfig) -> None:
+        """One more fault; it acts on the samples that have yet to come."""
+        sensor = self._sensors[fault.sensor]
+        rng = stream(self._seed, fault.sensor, f"fault {len(self.truth)}")
+        self._running.setdefault(fault.sensor, []).append(_Running(fault, sensor, rng))
+        self.truth.append(_truth(fault, sensor, [one.name for one in self.truth]))
+
+    @overload
+    def apply(self, sensor: str, samples: ImuSamples) -> ImuSamples: ...
+    @overload
+    def apply(self, sensor: str, samples: Sequence[Sample]) -> Sequence[Sample]: ...
+    def apply(self, sensor: str, samples: ImuSamples | Sequence[Sample]) -> ImuSamples | Sequence[Sample]:
+        """What the faults of a sensor make of a block of its samples, of any length."""
+        running = self._running.get(sensor)
+        if not running or not len(samples):
+            return samples
+        if isinstance(samples, ImuSamples):
+            return self._apply_imu(running, samples)
+        first, last = samples[0].t, samples[-1].t
+        if not any(one.listens <= last and first < one.end for one in running):
+            _act(running, samples[-1])  # which a fault that begins later may have to know
+            return samples
+        return [changed for sample in samples if (changed := _act(running, sample)) is not None]
+
+    @staticmethod
+    def _apply_imu(running: Sequence[_Running], imu: ImuSamples) -> ImuSamples:
+        listening = any(one.listens <= imu.t[-1] and imu.t[0] < one.end for one in running)
+        dtheta, dv = imu.dtheta, imu.dv
+        for k in range(len(imu)) if listening else (len(imu) - 1,):
+            row = _Increment(float(imu.t[k]), float(imu.dt[k]), imu.dtheta[k], imu.dv[k])
+            changed = _act(running, row)
+            if changed is not row:
+                if dtheta is imu.dtheta:
+                    dtheta, dv = dtheta.copy(), dv.copy()
+                dtheta[k], dv[k] = changed.dtheta, changed.dv
+        return replace(imu, dtheta=dtheta, dv=dv)
+
+
+def _act(running: Sequence[_Running], sample: Any) -> Any:
+    for one in running:
+        if sample is None:
+            break
+        sample = one.act(sample)
+    return sample
+
+
+def label(fault: FaultConfig, taken: Collection[str]) -> str:
+    """The fault's name: its own, or one made of what it is that is not ``taken``."""
+    if fault.name is not None:
+        return fault.name
+    made = "_".join(filter(None, (fault.sensor, getattr(fault, "channel", ""), fault.kind)))
+    numbered = (f"{made}_{count}" for count in itertools.count(2))
+    return next(name for name in itertools.chain([made], numbered) if name not in taken)
+
+
+_SIZES = ("size", "slope", "coefficient", "value", "factor", "delay_s", "velocity_mps")
+_UNITS = {"noise": "times", "scale": "times", "delay": "s", "drag_off": "m/s"}
+_PER = {"ramp": "/s", "quadratic": "/s^2"}
+
+
+def _truth(fault: FaultConfig, sensor: Any, taken: Collection[str]) -> FaultTruth:
+    size = next((value for key in _SIZES if (value := getattr(fault, key, None)) is not None), math.nan)
+    unit = _UNITS.get(fault.kind, "")
+    if isinstance(fault, _Sized) and not math.isnan(size):
+        unit = (fault.unit or next(iter(CHANNELS[sensor.kind][fault.channel].units))) + _PER.get(fault.kind, "")
+    channel = fault.channel if isinstance(fault, _OnChannel) else ""
+    return FaultTruth(label(fault, taken), fault.sensor, channel, fault.kind, *fault.window, float(size), unit)
