@@ -18,9 +18,8 @@ turned from north-up-east to north-east-down.
 from __future__ import annotations
 
 import math
-from collections import deque
-from copy import copy
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -52,12 +51,14 @@ from nav.samples import (
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
 KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
+MAGNETIC_HEADING = "magnetic_heading"  # what an update by the magnetometer is called: an angle, not a field
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
-REPORTS_KEPT = 1000  # of levelling, until the next sample takes them along
 UNKNOWN = np.full(3, np.nan)
+NO_ATTITUDE = np.full(4, np.nan)
+NO_COVARIANCE = np.full((9, 9), np.nan)
 DEG = math.pi / 180
 
 
@@ -123,11 +124,8 @@ class _State:
     elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
 
     def copy(self) -> _State:
-        twin = copy(self)
-        for name, value in vars(self).items():
-            if isinstance(value, np.ndarray):
-                setattr(twin, name, value.copy())
-        return twin
+        values: list[Any] = [x.copy() if isinstance(x, np.ndarray) else x for x in vars(self).values()]
+        return _State(*values)
 
 
 class Ahrs:
@@ -150,10 +148,15 @@ class Ahrs:
         self._earth_n = earth_rate_n(config.lat)
         imu = config.imu
         self._variance_rate = np.repeat([imu.gyro_noise, imu.gyro_bias_walk], 3) ** 2
+        self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
+        self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2] * 2 + [0.0])
         self._H_level = np.zeros((2, STATES))
         self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
+        self._H_heading = np.zeros((1, STATES))
+        if field_n is not None:
+            self._H_heading[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
+        self._H_heading[0, PHI + 2] = -1.0
         self._last_bad = -math.inf
-        self._reports: deque[UpdateReport] = deque(maxlen=REPORTS_KEPT)
 
     @property
     def aligned(self) -> bool:
@@ -179,16 +182,21 @@ class Ahrs:
         state.air_velocity_n = self._air_velocity_n(state, t)
         self.t = t
 
-    def propagate(self, imu: ImuSamples) -> None:
-        """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
+    def propagate(self, imu: ImuSamples) -> list[UpdateReport]:
+        """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates.
+
+        The reports are those of the levellings on the way.
+        """
+        reports: list[UpdateReport] = []
         if len(imu) == 0:
-            return
+            return reports
         if self._state is None:
             start = float(imu.t[0] - imu.dt[0])
             self._state = _fresh(start + self.config.levelling_s)
             self._state.air_velocity_n = self._air_velocity_n(self._state, start)
-        self._last_bad = max(self._last_bad, self._run(self._state, imu, self._reports))
+        self._last_bad = max(self._last_bad, self._run(self._state, imu, reports))
         self.t = float(imu.t[-1])
+        return reports
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample's kind is an aid."""
@@ -197,17 +205,14 @@ class Ahrs:
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
 
-        The reports of the levellings since the last sample come along, then the sample's own when it is a
-        magnetometer's or unsound; airspeed and pressure leave none.
+        A magnetometer's sample and one that is unsound leave a report; airspeed and pressure leave none.
         """
         if not self.accepts(sample):
             return []
-        reports = list(self._reports)
-        self._reports.clear()
         trouble = aiding.problem(sample)
         if trouble:
             self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
-            return [*reports, _refused(sample, trouble)]
+            return [_refused(sample, trouble)]
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
         match sample:
@@ -219,8 +224,8 @@ class Ahrs:
             case BarometerSample():
                 self._airspeed.add_pressure(sample.pressure)
             case MagnetometerSample():
-                reports += self._update_magnetometer(sample)
-        return reports
+                return self._update_magnetometer(sample)
+        return []
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """The report on a sample that is not used."""
@@ -235,10 +240,10 @@ class Ahrs:
         state = self._state.copy() if self._state is not None else None
         last_bad = self._last_bad
         if state is not None and len(imu):
-            last_bad = max(last_bad, self._run(state, imu, deque(maxlen=0)))
+            last_bad = max(last_bad, self._run(state, imu, []))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _run(self, s: _State, imu: ImuSamples, reports: deque[UpdateReport]) -> float:
+    def _run(self, s: _State, imu: ImuSamples, reports: list[UpdateReport]) -> float:
         """Propagate a state; the time of the last increment that was not usable, -inf when all were.
 
         Periods end at times of their own, whatever the blocks.
@@ -259,7 +264,7 @@ class Ahrs:
                 self._end_period(s, float(imu.t[end - 1]), reports)
         return last_bad
 
-    def _end_period(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
+    def _end_period(self, s: _State, t: float, reports: list[UpdateReport]) -> None:
         """Level by what the period has shown, and begin the next."""
         if s.levelled:
             self._settle(s)
@@ -316,7 +321,7 @@ class Ahrs:
         sigma[PHI + 2] = config.heading_sigma
         return np.diag(sigma**2)
 
-    def _level(self, s: _State, t: float, reports: deque[UpdateReport]) -> None:
+    def _level(self, s: _State, t: float, reports: list[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
         config = self.config
         f_n, compensated = self._steady_force(s, t)
@@ -329,8 +334,7 @@ class Ahrs:
         variance = config.force_sigma**2
         if compensated:
             variance += config.airspeed_sigma**2 * float(omega_b @ omega_b)
-        report = _fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level")
-        reports.append(report)
+        reports.append(_fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level"))
         self._feed_back(s)
 
     def _feed_back(self, s: _State) -> None:
@@ -367,11 +371,8 @@ class Ahrs:
             return []
         self._settle(s)
         z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
-        H = np.zeros((1, STATES))
-        H[0, PHI : PHI + 2] = m_n[:2] * m_n[2] / (m_n[0] ** 2 + m_n[1] ** 2)
-        H[0, PHI + 2] = -1.0
         R = np.array([self.config.magnetometer_sigma**2])
-        return [_fuse(s, H, R, np.array([z]), sample.t, sample.sensor, "magnetometer")]
+        return [_fuse(s, self._H_heading, R, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
 
     def _settle(self, s: _State) -> None:
         """Bring error states and covariance up to the time of the attitude."""
@@ -385,30 +386,28 @@ class Ahrs:
         tilt of accelerometers that are biased, which no state stands for.
         """
         bad = Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status(0)
-        nothing, covariance = np.full(3, np.nan), np.full((9, 9), np.nan)
         if s is None or not s.levelled:
             return Estimate(
-                t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, covariance, nothing,
-                nothing, Status.ALIGNING | bad,
+                t, math.nan, math.nan, math.nan, UNKNOWN, NO_ATTITUDE, UNKNOWN, UNKNOWN, NO_COVARIANCE, UNKNOWN,
+                UNKNOWN, Status.ALIGNING | bad,
             )  # fmt: skip
         self._settle(s)
-        imu = self.config.imu
         phi = s.x[PHI : PHI + 3]
-        floor = imu.accel_bias_sigma / self._g
-        covariance[6:, 6:] = s.P[PHI : PHI + 3, PHI : PHI + 3] + np.outer(phi, phi) + np.diag([floor**2, floor**2, 0.0])
+        covariance = NO_COVARIANCE.copy()
+        covariance[6:, 6:] = s.P[PHI : PHI + 3, PHI : PHI + 3] + phi[:, None] * phi + self._floor
         zero = np.zeros(1)
         return Estimate(
             t=t,
             lat=math.nan,
             lon=math.nan,
             h=math.nan,
-            v_n=nothing,
+            v_n=UNKNOWN,
             q_nb=s.q_nb,
             gyro_bias=s.gyro_bias - s.x[BIAS:],
             accel_bias=np.zeros(3),
             covariance=covariance,
             sigma_gyro_bias=np.sqrt(s.P.diagonal()[BIAS:]),
-            sigma_accel_bias=np.full(3, imu.accel_bias_sigma),
+            sigma_accel_bias=self._sigma_accel_bias,
             status=Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY | bad,
             extra={
                 "mode_counter": (np.array([float(s.mode_counter)]), zero),
@@ -447,9 +446,8 @@ def _fuse(s: _State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: s
 
 
 def _refused(sample: Sample, reason: str) -> UpdateReport:
-    return UpdateReport(
-        sample.t, sample.sensor, KINDS[type(sample)], np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason
-    )
+    aid = MAGNETIC_HEADING if isinstance(sample, MagnetometerSample) else KINDS[type(sample)]
+    return UpdateReport(sample.t, sample.sensor, aid, np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason)
 
 
 def _azimuth(x_n: Array) -> float:

@@ -25,8 +25,11 @@ COINCIDENT = 1e-6  # two times this close are the same [s]
 class Estimator(Protocol):
     """Whatever turns sensors into an estimate: `nav.ins.Ins` and its kin."""
 
-    def propagate(self, imu: ImuSamples) -> None:
-        """Advance by a block of increments; how the increments are cut into blocks makes no difference."""
+    def propagate(self, imu: ImuSamples) -> Sequence[UpdateReport] | None:
+        """Advance by a block of increments; how the increments are cut into blocks makes no difference.
+
+        Reports are on what the estimator made of the increments themselves, such as levelling, if it does that.
+        """
         ...
 
     @property
@@ -142,9 +145,9 @@ class FusionHorizon:
             if t < self._t - COINCIDENT:
                 reports += self.estimator.refuse(sample, f"{self._t - t:.3g} s too late")
                 continue
-            self._advance(t)
+            self._advance(t, reports)
             reports += self.estimator.update(sample)
-        self._propagate_to(horizon)
+        self._propagate_to(horizon, reports)
 
     def _append(self, imu: ImuSamples) -> None:
         if self._t == -math.inf:
@@ -157,21 +160,21 @@ class FusionHorizon:
         self._longest = max(self._longest, float(imu.dt.max()))
         self._next -= kept
 
-    def _advance(self, t: float) -> None:
+    def _advance(self, t: float, reports: list[UpdateReport]) -> None:
         """Bring the estimator to ``t``, splitting an increment in which it falls."""
-        self._propagate_to(t)
+        self._propagate_to(t, reports)
         if t > self._t + COINCIDENT and self._next < len(self._ends):
             part = self._part(self._next, t)
             for rest, used in ((self._imu.dt, part.dt), (self._imu.dtheta, part.dtheta), (self._imu.dv, part.dv)):
                 rest[self._next] -= used[0]
-            self.estimator.propagate(part)
+            reports += self.estimator.propagate(part) or ()
             self._t = t
 
-    def _propagate_to(self, t: float) -> None:
+    def _propagate_to(self, t: float, reports: list[UpdateReport]) -> None:
         """Hand over the whole increments that end by ``t``."""
         stop = self._row_after(t)
         if stop > self._next:
-            self.estimator.propagate(_cut(self._imu, self._next, stop))
+            reports += self.estimator.propagate(_cut(self._imu, self._next, stop)) or ()
             self._t = self._ends[stop - 1]
             self._next = stop
 

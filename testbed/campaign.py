@@ -73,7 +73,8 @@ class Outcome:
 
     ``history`` has ``time`` (N,) [s], ``outage`` (N,) 1 while some GNSS receiver has no fix, and for each estimator
     ``<name>.error`` horizontal position error [m], ``<name>.sigma`` its own 1-sigma sqrt(P_N + P_E) [m] and
-    ``<name>.nees`` the position NEES per degree of freedom; each (N,), NaN while aligning.
+    ``<name>.nees`` the position NEES per degree of freedom; each (N,), NaN while aligning. Of an estimator of attitude
+    alone they are the error of roll and pitch [deg], its sigma [deg] and the attitude NEES.
     """
 
     combination: int
@@ -484,10 +485,14 @@ def _history(dataset: xarray.DataTree) -> dict[str, Array]:
     for name in metrics.names(dataset):
         errors = metrics.errors(dataset, name)
         rows = np.searchsorted(t, errors.t - metrics.SAME_TIME_S)
+        if errors.attitude_only:
+            error, sigma, nees = np.rad2deg(errors.tilt), np.rad2deg(errors.sigma_attitude), errors.attitude_nees
+        else:
+            error, sigma, nees = errors.horizontal, errors.sigma_position, errors.position_nees
         for what, values in (
-            ("error", errors.horizontal),
-            ("sigma", np.hypot(errors.sigma_position[:, 0], errors.sigma_position[:, 1])),
-            ("nees", np.where(errors.valid, errors.position_nees, np.nan)),
+            ("error", error),
+            ("sigma", np.hypot(sigma[:, 0], sigma[:, 1])),
+            ("nees", np.where(errors.valid, nees, np.nan)),
         ):
             kept[f"{name}.{what}"] = np.full(len(t), np.nan)
             kept[f"{name}.{what}"][rows] = values

@@ -41,9 +41,11 @@ QUANTITIES: Mapping[str, str] = {
     "position_vertical_rms_m": "vertical rms [m]",
     "velocity_rms_mps": "velocity rms [m/s]",
     "roll_pitch_rms_deg": "roll, pitch rms [deg]",
+    "roll_pitch_max_deg": "roll, pitch max [deg]",
     "heading_rms_deg": "heading rms [deg]",
     "outage_position_horizontal_rms_m": "in outage, horizontal rms [m]",
     "outage_position_horizontal_max_m": "in outage, horizontal max [m]",
+    "outage_roll_pitch_max_deg": "in outage, roll, pitch max [deg]",
     "outage_position_horizontal_at_120s_m": "after 120 s of outage [m]",
     "outage_position_horizontal_at_600s_m": "after 600 s of outage [m]",
     "recovery_s": "recovery [s]",
@@ -68,8 +70,9 @@ class Spread:
 class Consistency:
     """Whether an estimator's claims hold over the runs of one combination.
 
-    ``nees`` is the position NEES per degree of freedom, mean over runs and time; ``lower`` and ``upper`` bound the mean
-    over runs at one instant; ``inside`` is the share of instants at which it keeps them, 0.95 when all is right.
+    ``nees`` is the position NEES per degree of freedom (of an estimator of attitude alone, the attitude NEES), mean
+    over runs and time; ``lower`` and ``upper`` bound the mean over runs at one instant; ``inside`` is the share of
+    instants at which it keeps them, 0.95 when all is right.
     ``false_alarms_per_h`` counts aiding samples rejected while GNSS had a fix, mean over runs.
     """
 
@@ -142,7 +145,7 @@ def _consistency(combination: int, estimator: str, outcomes: Sequence[Outcome]) 
 
 
 def nees_mean(outcomes: Sequence[Outcome], estimator: str) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Position NEES per degree of freedom over time, mean over the runs that have one, and how many these are."""
+    """NEES per degree of freedom over time, mean over the runs that have one, and how many these are."""
     nees = _stack(outcomes, f"{estimator}.nees")
     runs = np.isfinite(nees).sum(axis=0)
     return np.where(runs > 0, np.nansum(nees, axis=0) / np.maximum(runs, 1), np.nan), runs
@@ -316,7 +319,7 @@ def _error_figure(result: CampaignResult) -> Figure:
     groups = list(_groups(result))
     apart = len(groups) <= _MOST_COLUMNS
     runs = max(len(own) for _, _, own in groups)
-    figure, panels = _panels(result, f"Horizontal position error over {runs} runs", len(groups) if apart else 1)
+    figure, panels = _panels(result, f"Errors over {runs} runs", len(groups) if apart else 1)
     for axes, (label, _, _) in zip(panels[0] if apart else (), groups, strict=False):
         axes.set_title(label, loc="right", fontsize="medium")
     for row, estimator in zip(panels, result.combinations[0].scenario.estimator, strict=True):
@@ -331,7 +334,7 @@ def _error_figure(result: CampaignResult) -> Figure:
                 claimed = np.nanmedian(_stack(own, f"{estimator.name}.sigma")[:, known], axis=0)
                 axes.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0, label="5 – 95 %")
                 axes.plot(time, claimed, color="0.2", linewidth=1.0, linestyle="--", label="claimed 1 σ, median")
-        row[0].set_ylabel("error [m]")
+        row[0].set_ylabel("roll, pitch error [deg]" if estimator.attitude_only else "horizontal error [m]")
         _logarithmic(row[0])
     panels[0, -1].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
@@ -340,7 +343,7 @@ def _error_figure(result: CampaignResult) -> Figure:
 def _nees_figure(result: CampaignResult) -> Figure:
     groups = list(_groups(result))
     runs = max(len(own) for _, _, own in groups)
-    figure, panels = _panels(result, f"Position NEES per degree of freedom, mean over {runs} runs")
+    figure, panels = _panels(result, f"NEES per degree of freedom, mean over {runs} runs")
     low, high = nees_bounds(runs)
     for axes, estimator in zip(panels[:, 0], result.combinations[0].scenario.estimator, strict=True):
         axes.axhspan(low, high, color="0.75", linewidth=0, label="95 % bounds")
@@ -348,7 +351,7 @@ def _nees_figure(result: CampaignResult) -> Figure:
         for label, colour, own in groups:
             mean, _ = nees_mean(own, estimator.name)
             axes.plot(_longest(own)["time"], mean, color=colour, linewidth=1.0, label=label or "mean")
-        axes.set_ylabel("NEES / dof")
+        axes.set_ylabel(f"{'attitude' if estimator.attitude_only else 'position'} NEES / dof")
         _logarithmic(axes, 0.1, 10.0)
     panels[0, 0].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
@@ -373,23 +376,24 @@ def _distribution_figure(result: CampaignResult, key: str, value_of: Callable[[C
     """A panel for each estimator: a box of one metric per value, with every run as a dot."""
     from matplotlib.figure import Figure
 
-    estimators = [e.name for e in result.combinations[0].scenario.estimator]
-    denied = any("outage_position_horizontal_max_m" in key for o in result.outcomes for key in o.metrics)
-    metric = "outage_position_horizontal_max_m" if denied else "position_horizontal_max_m"
+    estimators = result.combinations[0].scenario.estimator
+    denied = any(".outage_" in key for o in result.outcomes for key in o.metrics)
     values = list(dict.fromkeys(value_of(c) for c in result.combinations))
     figure = Figure(figsize=(3.0 + 1.5 * len(values), 1.4 + 2.8 * len(estimators)), layout="constrained")
     figure.suptitle("Largest error of each run\n(box: quartiles, whiskers: 5 and 95 %)", fontsize="medium")
     panels = figure.subplots(len(estimators), 1, sharex=True, squeeze=False)[:, 0]
     for axes, estimator in zip(panels, estimators, strict=True):
+        metric = "roll_pitch_max_deg" if estimator.attitude_only else "position_horizontal_max_m"
+        metric = f"outage_{metric}" if denied else metric
         found: dict[str, list[float]] = {value: [] for value in values}
         for o in result.outcomes:
-            if f"{estimator}.{metric}" in o.metrics:
-                found[value_of(result.combinations[o.combination])].append(o.metrics[f"{estimator}.{metric}"])
+            if f"{estimator.name}.{metric}" in o.metrics:
+                found[value_of(result.combinations[o.combination])].append(o.metrics[f"{estimator.name}.{metric}"])
         for x, errors in enumerate(found.values()):
             line = {"color": _COLOURS[0], "linewidth": 2}
             axes.boxplot(errors, positions=[x], widths=0.5, whis=(5, 95), showfliers=False, medianprops=line)
             axes.plot(x + np.linspace(-0.15, 0.15, len(errors)), errors, "o", color="0.3", markersize=3, alpha=0.6)
-        axes.set_title(estimator, loc="left", fontsize="medium")
+        axes.set_title(estimator.name, loc="left", fontsize="medium")
         axes.set_ylabel(QUANTITIES[metric])
         axes.grid(alpha=0.3, axis="y")
         known = [error for errors in found.values() for error in errors]

@@ -13,7 +13,7 @@ DERIVED = (
     "metrics.json",
     "report.html",
     *(f"{name}.png" for name in ("ground_track", "flight", "comparison", "attitude", "wind", "nees")),
-    *(f"*_{name}.png" for name in ("position_errors", "motion_errors", "biases", "innovations")),
+    *(f"*_{name}.png" for name in ("position_errors", "motion_errors", "attitude_errors", "biases", "innovations")),
 )
 
 

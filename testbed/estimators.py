@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
+from nav.ahrs import Ahrs, AhrsConfig
 from nav.detection import ChiSquare, Detector, Eraim, Glr, Reset, Sprt, exponential
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
@@ -18,6 +19,7 @@ from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import Aid, Watched
+from nav.motion import LowDynamics
 from nav.samples import Array, ImuSamples
 from testbed.scenario import AIDS, DetectorConfig, EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
@@ -33,6 +35,7 @@ LOAD_CHANGE = 0.1  # and the change of its load factor
 MANOEUVRE_S = 120.0  # between changes of these
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
+FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
 PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
 GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
@@ -40,6 +43,9 @@ SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
+LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
+IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
+NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +73,7 @@ def _turned_back(C_sb: Array, x_s: Array) -> Array:
 
 def build(scenario: Scenario) -> dict[str, Running]:
     """The scenario's estimators by name, not yet aligned."""
-    kinds = {"ins": _ins, "federated": _federated}
+    kinds = {"ins": _ins, "federated": _federated, "ahrs": _ahrs}
     return {config.name: kinds[config.kind](config, scenario) for config in scenario.estimator}
 
 
@@ -241,3 +247,43 @@ def _detector(config: DetectorConfig) -> Detector:
             return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, mean, Reset(config.reset))
         case "glr":
             return Glr(config.false_alarm or GATHERED_FALSE_ALARM, config.window_s)
+
+
+def _ahrs(config: EstimatorConfig, scenario: Scenario) -> Running:
+    """Attitude alone. It is told its area of operation, and its heading where no magnetometer finds it."""
+    imu = scenario.sensors[config.imu]
+    assert isinstance(imu, ImuConfig)  # the scenario was checked
+    errors, site = imu.errors(), scenario.site()
+    aids = {scenario.sensors[name].kind: scenario.sensors[name] for name in config.aids}
+    field_n = geomagnetic_field_n(site.lat, site.lon, site.h, scenario.date)
+    told: dict[str, object] = {}
+    if not config.levelling:
+        told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
+    if config.heading_deg is not None:
+        told |= {"heading": math.radians(config.heading_deg)}
+    magnetometer = aids.get("magnetometer")
+    if isinstance(magnetometer, MagnetometerConfig):
+        m = magnetometer.errors()
+        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * PAYLOAD_CURRENT)
+        lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * IRON_TURN_S * magnetometer.rate_hz)
+        told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
+    ahrs = Ahrs(
+        AhrsConfig(
+            imu_model(errors),
+            site.lat,
+            site.h,
+            tuple(aids),
+            force_sigma=LEVELLING_FORCE,
+            airspeed_sigma=config.gust_mps,
+            literal=config.literal,
+            **told,  # type: ignore[arg-type]
+        ),
+        field_n,
+    )
+    lag_s = max((section.latency_s for section in aids.values() if not isinstance(section, ImuConfig)), default=0.0)
+    return Running(
+        FusionHorizon(ahrs, lag_s, coning=imu.rate_hz < scenario.truth.rate_hz),
+        config.imu,
+        errors.C_sb,
+        config.aids,
+    )

@@ -9,6 +9,7 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * An estimate is of the point where its IMU sits, and is compared with the true position and velocity of that point.
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
+* An estimator of attitude alone (`Status.ATTITUDE_ONLY`) is judged by its attitude alone.
 * NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
@@ -48,7 +49,9 @@ class Errors:
 
     ``t`` (N,) [s]; ``position`` (N, 3) NED [m]; ``velocity`` (N, 3) NED [m/s]; ``attitude`` (N, 3) phi in n [rad];
     ``sigma_*`` (N, 3) what the estimator claimed; ``*_nees`` (N,) normalised squared error over 3, NaN where the
-    covariance is singular; ``aligned_s`` time of alignment, None when never; ``valid`` (N,) rows that count.
+    covariance is singular; ``aligned_s`` time of alignment, None when never; ``attitude_only`` whether position and
+    velocity are NaN by design; ``nonfinite`` (N,) rows that should be numbers and are not; ``valid`` (N,) rows that
+    count.
     """
 
     t: Array
@@ -62,6 +65,7 @@ class Errors:
     velocity_nees: Array
     attitude_nees: Array
     aligned_s: float | None
+    attitude_only: bool
     nonfinite: Mask
     valid: Mask
 
@@ -114,9 +118,13 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     velocity -= _rotate(true("q_nb"), np.cross(true("omega_b"), arm_b))
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
-    aligned = (column(dataset, f"{own}/status")[rows] & Status.ALIGNED) != 0
+    status = column(dataset, f"{own}/status")[rows]
+    aligned = (status & Status.ALIGNED) != 0
+    attitude_only = bool(np.any(aligned & ((status & Status.ATTITUDE_ONLY) != 0)))
     aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
-    finite = np.isfinite(np.column_stack([position, velocity, attitude, covariance.reshape(len(t), -1)])).all(axis=1)
+    judged = slice(6 if attitude_only else 0, 9)
+    every = np.column_stack([position, velocity, attitude])[:, judged]
+    finite = np.isfinite(every).all(axis=1) & np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
     settled = since if aligned_s is None else t >= aligned_s + settling_s
     return Errors(
@@ -131,6 +139,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         velocity_nees=nees(velocity, covariance[:, 3:6, 3:6]),
         attitude_nees=nees(attitude, covariance[:, 6:9, 6:9]),
         aligned_s=aligned_s,
+        attitude_only=attitude_only,
         nonfinite=since & ~finite,
         valid=settled & finite,
     )
@@ -242,7 +251,8 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
     recovering = inside(e.t, [(end, end + RECOVERY_WINDOW_S) for _, end in windows])
     result |= _statistics(e, e.valid & ~denied & ~recovering, "")
     result |= _statistics(e, e.valid & denied, "outage_")
-    result |= _outage_marks(e, windows) | _recovery(e, windows)
+    if not e.attitude_only:
+        result |= _outage_marks(e, windows) | _recovery(e, windows)
     for aid in aids(dataset, name):
         result |= _innovations(dataset, name, aid, e.aligned_s + settling_s)
     return result
@@ -251,13 +261,17 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
 def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
     if not mask.any():
         return {}
-    horizontal, tilt = e.horizontal[mask], np.rad2deg(e.tilt[mask])
-    heading = np.rad2deg(e.attitude[mask, 2])
-    result = {
-        "position_horizontal_rms_m": _rms(horizontal),
-        "position_horizontal_max_m": float(horizontal.max()),
-        "position_vertical_rms_m": _rms(e.position[mask, 2]),
-        "velocity_rms_mps": _rms(np.linalg.norm(e.velocity[mask], axis=1)),
+    tilt, heading = np.rad2deg(e.tilt[mask]), np.rad2deg(e.attitude[mask, 2])
+    result = {}
+    if not e.attitude_only:
+        horizontal = e.horizontal[mask]
+        result = {
+            "position_horizontal_rms_m": _rms(horizontal),
+            "position_horizontal_max_m": float(horizontal.max()),
+            "position_vertical_rms_m": _rms(e.position[mask, 2]),
+            "velocity_rms_mps": _rms(np.linalg.norm(e.velocity[mask], axis=1)),
+        }
+    result |= {
         "roll_pitch_rms_deg": _rms(tilt),
         "roll_pitch_max_deg": float(tilt.max()),
         "heading_rms_deg": _rms(heading),
@@ -319,10 +333,10 @@ def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: floa
     own = f"estimators/{estimator}/innovations/{aid}"
     after = column(dataset, f"{own}/sample_time") >= start
     value, weight = column(dataset, f"{own}/nis"), column(dataset, f"{own}/weight")
-    m = column(dataset, f"{own}/innovation").shape[1]
     fused = after & (weight > 0) & np.isfinite(value)
     result = {}
     if fused.any():
+        m = column(dataset, f"{own}/innovation").shape[1]
         result[f"nis_mean.{aid}"] = float(value[fused].mean() / m)
     if after.any():
         result[f"rejected_fraction.{aid}"] = float(np.mean(weight[after] <= 0))

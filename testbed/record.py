@@ -187,6 +187,8 @@ EXTRA = {
     "airspeed_scale": Variable("1", "estimated scale factor error of the airspeed sensor"),
     "body_velocity_scale": Variable("1", "estimated scale factor error of the body velocity sensor", ("body_axis",)),
     "body_velocity_error": Variable("m/s", "estimated correlated error of body velocity", ("body_axis",)),
+    "mode_counter": Variable("1", "periods of low dynamics without a break"),
+    "correction_counter": Variable("1", "corrections of the attitude among them"),
 }
 
 # Unit of the innovation of each aid, and its components.
@@ -202,6 +204,8 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "star_attitude": ("rad", ("body",)),
     "position_fix": ("m", ("component",)),
     "gnss_course": ("rad", ("component",)),
+    "level": ("m/s^2", ("north_east",)),
+    "magnetic_heading": ("rad", ("component",)),
 }
 REPORT = {
     "nis": Variable("1", "normalised innovation squared"),

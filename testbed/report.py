@@ -83,6 +83,8 @@ def _cells(metrics: Mapping[str, float]) -> tuple[list[str], bool, list[list[str
 
     rows = []
     for key, label in ROWS:
+        if not any(f"{n}.{prefix}{key}" in metrics for n in names for prefix in ("", "outage_")):
+            continue
         pairs = [[cell(f"{n}.{key}"), *([cell(f"{n}.outage_{key}")] if outage else [])] for n in names]
         rows.append([label, *(c for pair in pairs for c in pair)])
     for key, label in (*OUTAGE_ROWS, *RUN_ROWS):
@@ -155,6 +157,11 @@ class _Run:
     def aligned(self) -> dict[str, Errors]:
         """Errors of the estimators that were ever aligned."""
         return {name: e for name, e in self.errors.items() if e.aligned_s is not None}
+
+    @property
+    def positioned(self) -> dict[str, Errors]:
+        """Those of them that estimate position and velocity too."""
+        return {name: e for name, e in self.aligned.items() if not e.attitude_only}
 
     def track(self, lat: Array, lon: Array) -> Array:
         """North and east of the run's first point (N, 2) [km]."""
@@ -246,7 +253,7 @@ def _head_legend(run: _Run, figure: Figure, handles: list[Any]) -> None:
 def ground_track(run: _Run) -> Figure:
     """Where it flew and where each estimator thought it was."""
     truth = run.track(run.truth("lat"), run.truth("lon"))
-    believed = {name: run.track(run.estimate(name, "lat"), run.estimate(name, "lon")) for name in run.aligned}
+    believed = {name: run.track(run.estimate(name, "lat"), run.estimate(name, "lon")) for name in run.positioned}
     low, high = truth.min(axis=0), truth.max(axis=0)
     extent = max(float((high - low).max()), 0.02)
     far = [
@@ -287,7 +294,7 @@ def flight(run: _Run) -> Figure:
     figure, axes = _figure(2, height=2.5, gap=0.35)
     top, bottom = axes[:, 0]
     top.plot(*thin(run.t, run.truth("h")), color=TRUTH, lw=1.4, label="truth")
-    for name in run.aligned:
+    for name in run.positioned:
         top.plot(*thin(run.estimate(name, "time"), run.estimate(name, "h")), color=run.colours[name], lw=1, label=name)
     truth = run.truth("h")
     margin = max(0.15 * float(np.ptp(truth)), 20.0)
@@ -305,15 +312,19 @@ def flight(run: _Run) -> Figure:
 
 def comparison(run: _Run) -> Figure:
     """Size of the errors of all estimators, logarithmic so that a good one stays readable beside a bad one."""
-    figure, axes = _figure(4, height=1.9)
-    panels: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
+    of_position: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
         ("horizontal\nposition [m]", lambda e: e.horizontal),
         ("height [m]", lambda e: np.abs(e.position[:, 2])),
+    )
+    of_attitude: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
         ("roll and\npitch [deg]", lambda e: np.rad2deg(e.tilt)),
         ("heading [deg]", lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
-    for ax, (label, size) in zip(axes[:, 0], panels, strict=True):
-        for name, e in run.aligned.items():
+    panels = [(run.positioned, *panel) for panel in of_position if run.positioned]
+    panels += [(run.aligned, *panel) for panel in of_attitude]
+    figure, axes = _figure(len(panels), height=1.9)
+    for ax, (shown, label, size) in zip(axes[:, 0], panels, strict=True):
+        for name, e in shown.items():
             # A moving mean of squares over 2 s: the single zero crossings of an error say nothing on a log axis.
             ax.plot(
                 *thin(e.t, np.maximum(_moving_rms(e.t, size(e), 2.0), 1e-6)),
@@ -323,9 +334,11 @@ def comparison(run: _Run) -> Figure:
             )
         ax.set_yscale("log")
         ax.set_ylabel(label)
-        _focus_log(ax, [size(e)[e.valid] for e in run.aligned.values()])
+        _focus_log(ax, [size(e)[e.valid] for e in shown.values()])
     _against_time(run, axes)
-    _legend(run, axes[0, 0])
+    for k, ax in enumerate(axes[:, 0]):
+        if k == 0 or panels[k][0] != panels[k - 1][0]:
+            _legend(run, ax, shade=k == 0)
     return figure
 
 
@@ -400,24 +413,24 @@ def _near_outage(run: _Run, e: Errors) -> scores.Mask:
 
 
 def _any_row(e: Errors) -> scores.Mask:
-    return np.asarray(np.isfinite(e.position).all(axis=1))
+    return np.asarray(np.isfinite(e.attitude).all(axis=1))
 
 
 def motion_errors(run: _Run, name: str) -> Figure:
     """Velocity and attitude error with ±3 sigma."""
     e = run.errors[name]
-    figure, axes = _figure(3, 2)
-    mask = e.valid if e.valid.any() else _any_row(e)
-    _error_panels(run, axes[:, 0], name, e.t, e.velocity, e.sigma_velocity, ("north [m/s]", "east [m/s]", "down [m/s]"))
-    degrees, sigma = np.rad2deg(e.attitude), np.rad2deg(e.sigma_attitude)
     labels = ("about north [deg]", "about east [deg]", "about down [deg]")
-    _error_panels(run, axes[:, 1], name, e.t, degrees, sigma, labels)
-    _focus(axes[:, 0], e.velocity, e.sigma_velocity, mask)
-    _focus(axes[:, 1], degrees, sigma, mask)
-    axes[0, 0].set_title("velocity", fontsize=10, loc="left")
-    axes[0, 1].set_title("attitude", fontsize=10, loc="left")
+    columns = [("attitude", np.rad2deg(e.attitude), np.rad2deg(e.sigma_attitude), labels)]
+    if not e.attitude_only:
+        columns.insert(0, ("velocity", e.velocity, e.sigma_velocity, ("north [m/s]", "east [m/s]", "down [m/s]")))
+    figure, axes = _figure(3, len(columns))
+    mask = e.valid if e.valid.any() else _any_row(e)
+    for k, (title, error, sigma, names) in enumerate(columns):
+        _error_panels(run, axes[:, k], name, e.t, error, sigma, names)
+        _focus(axes[:, k], error, sigma, mask)
+        axes[0, k].set_title(title, fontsize=10, loc="left")
     _against_time(run, axes)
-    _legend(run, axes[0, 1])
+    _legend(run, axes[0, -1])
     return figure
 
 
@@ -526,7 +539,7 @@ def innovations(run: _Run, name: str) -> Figure | None:
         limit = 1.6 * float(np.nanmax(gate)) if np.isfinite(gate).any() else 6.0
         shown = np.clip(normalised, -0.97 * limit, 0.97 * limit)
         ned, body = ("north", "east", "down"), ("forward", "right", "down")
-        labels = ned if aid.startswith(("gnss", "position")) else body[1:] if aid == "nonholonomic" else body
+        labels = ned if aid.startswith(("gnss", "position", "level")) else body[1:] if aid == "nonholonomic" else body
         some = slice(None, None, max(1, len(t) // 4000))
         for k in range(z.shape[1]):
             label = labels[k] if z.shape[1] > 1 else None
@@ -542,20 +555,23 @@ def innovations(run: _Run, name: str) -> Figure | None:
             ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False, fontsize=9, markerscale=5)
     figure.supylabel("innovation / its sigma", fontsize=10)
     _against_time(run, axes)
+    gates = [run.estimate(name, f"innovations/{aid}/threshold") for aid in aids]
     gate_key = Line2D([], [], color="#444444", lw=0.8, ls="--", label="gate")
     refused_key = Line2D(
         [], [], color=REFUSED, marker="x", ls="", ms=5, label="refused (beyond the axes: at their edge)"
     )
-    _head_legend(run, figure, [gate_key, refused_key])
+    _head_legend(run, figure, [gate_key, refused_key] if any(np.isfinite(gate).any() for gate in gates) else [])
     return figure
 
 
 def consistency(run: _Run) -> Figure:
     """NEES per degree of freedom of every estimator with the 95 % bounds of a single run."""
-    figure, axes = _figure(3, height=2.0, gap=0.32)
+    quantities = ("position", "velocity", "attitude") if run.positioned else ("attitude",)
+    figure, axes = _figure(len(quantities), height=2.0, gap=0.32)
     low, high = (float(chi2.ppf(p, 3)) / 3 for p in (0.025, 0.975))
-    for ax, what in zip(axes[:, 0], ("position", "velocity", "attitude"), strict=True):
-        values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in run.aligned.items()}
+    for ax, what in zip(axes[:, 0], quantities, strict=True):
+        shown = run.aligned if what == "attitude" else run.positioned
+        values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in shown.items()}
         ax.axhspan(low, high, color="#009E73", alpha=0.15, lw=0, label="95 % of a consistent filter")
         ax.axhline(1.0, color="#444444", lw=0.8)
         for name, nees in values.items():
@@ -614,9 +630,16 @@ def _figures(run: _Run) -> Iterator[tuple[str, str, Figure | None]]:
             "Consistency: squared errors over claimed variances (2 s mean); 1 is right, above is overconfident.",
             (consistency(run)),
         )
-    for name in run.aligned:
-        yield f"{name}_position_errors", f"{name}: position error with ±3 sigma.", position_errors(run, name)
-        yield f"{name}_motion_errors", f"{name}: velocity and attitude errors with ±3 sigma.", motion_errors(run, name)
+    for name, e in run.aligned.items():
+        if e.attitude_only:
+            yield f"{name}_attitude_errors", f"{name}: attitude error with ±3 sigma.", motion_errors(run, name)
+        else:
+            yield f"{name}_position_errors", f"{name}: position error with ±3 sigma.", position_errors(run, name)
+            yield (
+                f"{name}_motion_errors",
+                f"{name}: velocity and attitude errors with ±3 sigma.",
+                motion_errors(run, name),
+            )
         yield f"{name}_biases", f"{name}: estimated IMU biases with ±3 sigma.", biases(run, name)
         yield f"{name}_innovations", f"{name}: what each aid said that was not expected.", innovations(run, name)
 

@@ -50,12 +50,20 @@ Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt
 AIDS: Mapping[str, frozenset[str]] = {
     "ins": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
     "federated": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}),
+    "ahrs": frozenset({"barometer", "magnetometer", "airspeed"}),
 }
-# What no other kind of estimator has.
-FEDERATED_KEYS = (
-    "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after", "readmit_after",
-    "literal",
-)  # fmt: skip
+# The keys that only these kinds of estimator have.
+OWN_KEYS: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        (
+            "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
+            "readmit_after",
+        ),
+        ("federated",),
+    ),
+    **dict.fromkeys(("heading_deg", "levelling"), ("ahrs",)),
+    "literal": ("federated", "ahrs"),
+}  # fmt: skip
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
@@ -177,7 +185,7 @@ class EstimatorConfig(Section):
     """
 
     name: str
-    kind: Literal["ins", "federated"] = "ins"
+    kind: Literal["ins", "federated", "ahrs"] = "ins"
     imu: str = "imu"
     aids: tuple[str, ...]
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
@@ -189,7 +197,12 @@ class EstimatorConfig(Section):
     fusion_period_s: float = Field(default=1.0, ge=0, le=60)
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
-    literal: bool = Field(default=False, description="weights of Zhu et al. 2020, equation 13, as they are printed")
+    heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
+    levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
+    literal: bool = Field(
+        default=False,
+        description="as printed: weights of Zhu et al. 2020, equation 13; of an AHRS, Jiang et al. 2021, equation 10",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -197,6 +210,11 @@ class EstimatorConfig(Section):
         if isinstance(value, dict) and value.get("kind") == "federated" and "aids" not in value:
             return value | {"aids": ()}
         return value
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return self.kind == "ahrs"
 
 
 class AutopilotConfig(Section):
@@ -474,6 +492,21 @@ def _estimator_faults(
     elif config.name in _RESERVED:
         yield (*path, "name"), f"{config.name!r} is reserved: choose another name"
     kinds = {name: sensor.kind for name, sensor in sensors.items()}
+    if config.kind == "ahrs":
+        blind = "magnetometer" not in [kinds.get(aid) for aid in config.aids]
+        if blind and config.heading_deg is None:
+            yield (
+                (*path, "heading_deg"),
+                "is missing: an AHRS without magnetometer is told where it points at the start",
+            )
+        elif not blind and config.heading_deg is not None:
+            yield (*path, "heading_deg"), "the magnetometer among the aids finds the heading: leave one of the two out"
+    for key, owners in OWN_KEYS.items():
+        if key in config.model_fields_set and config.kind not in owners:
+            yield (
+                (*path, key),
+                f"is a key of kind {' or '.join(map(repr, owners))}, not of {config.kind!r}: leave it out",
+            )
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
@@ -481,9 +514,6 @@ def _estimator_faults(
     if config.kind == "federated":
         yield from _federated_faults(path, config, kinds, usable)
         return
-    for key in FEDERATED_KEYS:
-        if key in config.model_fields_set:
-            yield (*path, key), f"is a key of kind 'federated', not of {config.kind!r}: leave it out"
     yield from _aid_faults(path, config.kind, config.aids, kinds, usable)
     for index, aid in enumerate(config.aids):
         if aid in config.aids[:index] or aid not in usable:

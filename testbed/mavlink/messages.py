@@ -141,18 +141,20 @@ class Snapshot:
 
     @cached_property
     def errors(self) -> dict[str, float]:
-        """Estimate less truth, and the estimator's own idea of it; empty while there is no estimate."""
-        if self.point is None or self.euler is None:
+        """Estimate less truth, and the estimator's own idea of it, of what is estimated."""
+        if self.euler is None:
             return {}
+        turn = _floats(rotvec_from_quat(quat_multiply(self.estimate.q_nb, quat_conjugate(self.truth.q_nb[0]))))
+        of_attitude = {"err_tilt": math.degrees(math.hypot(turn[0], turn[1])), "err_head": math.degrees(turn[2])}
+        if self.point is None:
+            return of_attitude
         north, east, down = _floats(position_difference_n(*self.point, *self.true_point))
         speed = _floats(self.estimate.v_n - self.truth.v_n[0])
-        turn = _floats(rotvec_from_quat(quat_multiply(self.estimate.q_nb, quat_conjugate(self.truth.q_nb[0]))))
         return {
             "err_horiz": math.hypot(north, east),
             "err_down": down,
             "err_vel": math.hypot(*speed),
-            "err_tilt": math.degrees(math.hypot(turn[0], turn[1])),
-            "err_head": math.degrees(turn[2]),
+            **of_attitude,
             "sig_horiz": self.sigma(_POSITION, 2),
         }
 
@@ -458,6 +460,8 @@ def odometry(s: Snapshot) -> Fields | None:
 
 def _solution(status: Status) -> int:
     """What an aligned estimator knows, in the bits that ESTIMATOR_STATUS and EKF_STATUS_REPORT have in common."""
+    if Status.ATTITUDE_ONLY in status:
+        return int(mav.EKF_ATTITUDE)
     known: int = (
         mav.EKF_ATTITUDE
         | mav.EKF_VELOCITY_HORIZ

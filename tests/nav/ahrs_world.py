@@ -109,7 +109,6 @@ def run(config, truth, increments_, samples=(), tilt_deg=0.5, every_s=1.0, ahrs=
     ahrs.start(0.0, tilted(truth.q_nb[0], tilt_deg))
     times = np.arange(every_s, truth.t[-1] + 1e-9, every_s).tolist()
     reports, estimates = FusionHorizon(ahrs).track(increments_, samples, times)
-    reports += list(ahrs._reports)
     rows = np.round(np.array(times) / DT).astype(int)
     return np.array(times), errors(np.array([e.q_nb for e in estimates]), truth.q_nb[rows]), estimates, reports
 

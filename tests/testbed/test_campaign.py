@@ -463,7 +463,7 @@ def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float 
 
 
 def made_up_campaign(tmp_path: Path, values: list[str], runs: int = 30) -> campaigns.CampaignResult:
-    scenario: Any = SimpleNamespace(estimator=[SimpleNamespace(name="ins")])
+    scenario: Any = SimpleNamespace(estimator=[SimpleNamespace(name="ins", attitude_only=False)])
     combinations = [Combination({"wind": value} if value else {}, scenario) for value in values]
     rng = np.random.default_rng(2)
     outcomes = [made_up(i, seed, rng, 1.0 + i) for i in range(len(values)) for seed in range(runs)]
@@ -519,7 +519,7 @@ def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
     for figure in drawn.values():
         figure.canvas.draw()
     panels = drawn["nees"].axes
-    assert panels[0].get_ylabel() == "NEES / dof"
+    assert panels[0].get_ylabel() == "position NEES / dof"
     assert len(panels[0].get_lines()) == 1 + len(values)
 
 
