@@ -54,14 +54,18 @@ AIDS: Mapping[str, frozenset[str]] = {
     "federated": frozenset({"gnss", "barometer", "magnetometer", "airspeed"}) | SEVERAL,
     "ahrs": frozenset({"barometer", "magnetometer", "airspeed"}),
 }
-# What only some kinds of estimator have.
+# The keys that only these kinds of estimator have.
 OWN_KEYS: Mapping[str, tuple[str, ...]] = {
-    "federated": (
-        "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
-        "readmit_after", "literal", "handover", "nonholonomic_mps",
+    **dict.fromkeys(
+        (
+            "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
+            "readmit_after",
+        ),
+        ("federated",),
     ),
-    "ins": ("handover", "nonholonomic_mps"),
-    "ahrs": ("heading_deg", "levelling", "literal"),
+    **dict.fromkeys(("heading_deg", "levelling"), ("ahrs",)),
+    **dict.fromkeys(("handover", "nonholonomic_mps"), ("ins", "federated")),
+    "literal": ("federated", "ahrs"),
 }  # fmt: skip
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -216,17 +220,17 @@ class EstimatorConfig(Section):
         default=False, description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13"
     )
 
-    @property
-    def attitude_only(self) -> bool:
-        """Whether it estimates no position and no velocity."""
-        return self.kind == "ahrs"
-
     @model_validator(mode="before")
     @classmethod
     def _aids_by_local(cls, value: Any) -> Any:
         if isinstance(value, dict) and value.get("kind") == "federated" and "aids" not in value:
             return value | {"aids": ()}
         return value
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return self.kind == "ahrs"
 
 
 class AutopilotConfig(Section):
@@ -543,11 +547,10 @@ def _estimator_faults(
             )
         elif not blind and config.heading_deg is not None:
             yield (*path, "heading_deg"), "the magnetometer among the aids finds the heading: leave one of the two out"
-    for key in sorted(config.model_fields_set):
-        owners = [kind for kind, keys in OWN_KEYS.items() if key in keys]
-        if owners and config.kind not in owners:
-            kinds_of_it = " and ".join(map(repr, owners))
-            yield (*path, key), f"is a key of kind {kinds_of_it}, not of {config.kind!r}: leave it out"
+    for key, owners in OWN_KEYS.items():
+        if key in config.model_fields_set and config.kind not in owners:
+            named = " or ".join(map(repr, owners))
+            yield (*path, key), f"is a key of kind {named}, not of {config.kind!r}: leave it out"
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)

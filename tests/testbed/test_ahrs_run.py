@@ -60,7 +60,7 @@ def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
         ('{name="a", kind="ahrs", aids=[], heading_deg=400}', "heading_deg: must be less than or equal to 360"),
         ('{name="a", aids=["gnss"], heading_deg=3}', "heading_deg: is a key of kind 'ahrs', not of 'ins': leave it"),
         ('{name="a", aids=["gnss"], levelling=false}', "levelling: is a key of kind 'ahrs', not of 'ins'"),
-        ('{name="a", aids=["gnss"], literal=true}', "literal: is a key of kind 'ahrs', not of 'ins'"),
+        ('{name="a", aids=["gnss"], literal=true}', "literal: is a key of kind 'federated' or 'ahrs', not of 'ins'"),
         ('{name="a", kind="ahrz", aids=[]}', 'kind: can\'t be "ahrz": did you mean ahrs'),
     ],
 )
