@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from testbed.progress import Tell
 
 RESULTS = "papers.json"
-IDS: tuple[str, ...] = ()  # in the order of their publication
+IDS = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))
 
 
 class Job(NamedTuple):
