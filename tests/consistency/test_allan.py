@@ -67,7 +67,7 @@ def test_two_hours_at_rest_give_back_the_datasheet(grade):
 
 def test_perfect_unit_has_no_allan_deviation():
     rates = at_rest(ImuConfig(grade="perfect", rate_hz=RATE_HZ), 0)
-    assert max(allan_variance(axis, 1.0) for triad in rates for axis in triad) < 1e-30
+    assert max(allan_variance(axis, 1.0) for triad in rates for axis in triad) < 1e-24  # rounding of the motion
 
 
 def test_one_run_of_the_consumer_unit_gives_back_its_random_walk():

@@ -302,8 +302,8 @@ def test_two_aids_of_a_kind() -> None:
 
 
 def test_a_sensor_that_is_no_aid_of_the_estimator() -> None:
-    message = complaint(U_TURN, "sensors.star_tracker={}", 'estimator.ins.aids=["gnss", "star_tracker"]')
-    assert "'star_tracker' is of kind 'star_tracker', which does not aid 'ins'" in message
+    message = complaint(U_TURN, 'estimator.ins.kind="ahrs"', 'estimator.ins.aids=["magnetometer", "gnss"]')
+    assert "estimator[0].aids[1]: 'gnss' is of kind 'gnss', which does not aid 'ahrs'" in message
 
 
 def test_a_plan_belongs_to_a_flight_and_a_flight_to_a_plan() -> None:
