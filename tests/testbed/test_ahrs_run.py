@@ -110,7 +110,7 @@ def test_metrics_are_of_attitude_alone(flown: Any) -> None:
     heading = {"nis_mean.magnetic_heading", "rejected_fraction.magnetic_heading"}
     assert keys == OF_ATTITUDE | {f"outage_{key}" for key in OF_ATTITUDE} | {"aligned_s"} | levelled | heading | quiet
     assert all(math.isfinite(value) for value in found.values())
-    assert "ins.recovery_s" in found
+    assert "ins.outage_position_horizontal_max_m" in found
     assert found["ahrs.roll_pitch_max_deg"] < 1.0
     assert found["ahrs.heading_max_deg"] < 5.0
     assert found["ahrs.outage_roll_pitch_max_deg"] < 1.0
