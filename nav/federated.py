@@ -32,7 +32,7 @@ velocities are given up as in `nav.ins`, and the next fixes are believed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -71,6 +71,8 @@ from nav.reference import (
     describe,
     forget,
     inject,
+    nothing_known,
+    spread,
 )
 from nav.samples import (
     Array,
@@ -495,19 +497,20 @@ class Federated:
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE
         if state is None:
-            return describe(None, np.empty((0, 0)), self.model, t, status, 0.0)[0]
+            return nothing_known(t, status)
         self._reference.settle(state)
         master = self._combine(state, np.ones(len(self.locals)))
         inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
-        estimate, sigma = describe(state, master.P, self.model, t, status, self.config.mounting_sigma)
+        covariance, sigma = spread(master.P, self.config.mounting_sigma**2)
+        imu = state.imu.copy()
         extra = {
-            name: (state.imu[where], sigma[where])
+            name: (imu[where], sigma[where])
             for name, where in self.model.slices.items()
             if where.start < self._common and name not in REPORTED
         }
         for name, row, where in self._extra:
-            extra[name] = (state.x[row, where], np.sqrt(state.P[row, where, where].diagonal()))
-        return replace(estimate, extra=extra)
+            extra[name] = (state.x[row, where].copy(), np.sqrt(state.P[row, where, where].diagonal()))
+        return describe(state, imu, master.P, self.model, t, status, covariance, sigma, extra)
 
 
 def combine(x: Array, P: Array, common: int, members: Array, config: Config) -> Master:

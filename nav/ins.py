@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -43,6 +43,8 @@ from nav.reference import (
     align,
     describe,
     forget,
+    nothing_known,
+    spread,
 )
 from nav.samples import (
     AirspeedSample,
@@ -192,7 +194,7 @@ class Ins:
     ) -> None:
         self.config = config
         self.t = math.nan
-        self._aids = {kind: config.aid_of(kind) for kind in config.aids}
+        self._by_type = {type_: config.aid_of(kind) for type_, kind in KINDS.items() if kind in config.aids}
         self._others = {aid.sensor: aid for aid in config.others}
         self._gate = ChiSquareGate(config.false_rejection)
         self._filter = LocalFilter(config.imu, config.used(), self._gate)
@@ -236,6 +238,7 @@ class Ins:
     def start(self, initial: InitialState) -> None:
         """Begin at a given state instead of aligning."""
         self._state = self._reference.start(initial)
+        self._draft = self._state.copy()
         self.t = initial.t
         self._monitor.last_fused = initial.t
 
@@ -257,7 +260,7 @@ class Ins:
 
     def _aid(self, sample: Sample) -> Aid | None:
         """The aid that a sample is of."""
-        return self._others.get(sample.sensor) or self._aids.get(KINDS.get(type(sample), ""))
+        return self._others.get(sample.sensor) or self._by_type.get(type(sample))
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
@@ -299,15 +302,22 @@ class Ins:
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
-        return self._estimate(self._state.copy() if self._state is not None else None, self.t, self._last_bad)
+        return self._estimate(self._drafted(), self.t, self._last_bad)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments, the filter itself staying where it is."""
-        state = self._state.copy() if self._state is not None else None
+        state = self._drafted()
         last_bad = self._last_bad
         if state is not None and len(imu):
             last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
+
+    def _drafted(self) -> State | None:
+        """The state in arrays of its own, which are the same ones each time."""
+        if self._state is None:
+            return None
+        self._draft.take(self._state)
+        return self._draft
 
     def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
         look = self._filter.look(self._reference, state, aid, "gnss_position", sample)
@@ -361,17 +371,16 @@ class Ins:
         forget(P, POS, nu**2 + np.diag(S))
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
-        """The estimate at ``t`` from a ``state`` of its own."""
+        """The estimate at ``t`` from a ``state`` that may be changed."""
         aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
         status = Status.ALIGNING if state is None else FUSED if aided else UNAIDED
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE
         if state is None:
-            return describe(None, np.empty((0, 0)), self.model, t, status, 0.0)[0]
+            return nothing_known(t, status)
         self._reference.settle(state)
-        estimate, sigma = describe(state, state.P[0], self.model, t, status, self.config.mounting_sigma)
-        if not self._extra:
-            return estimate
-        x = state.x[0]
+        P, x = state.P[0], state.x[0].copy()
         x[: len(state.imu)] = state.imu
-        return replace(estimate, extra={name: (x[where], sigma[where]) for name, where in self._extra})
+        covariance, sigma = spread(P, self.config.mounting_sigma**2)
+        extra = {name: (x[where], sigma[where]) for name, where in self._extra}
+        return describe(state, x, P, self.model, t, status, covariance, sigma, extra)

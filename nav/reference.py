@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -36,12 +35,12 @@ REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
 FieldModel = Callable[[float, float, float], Array]
 
 
-@dataclass
 class State:
     """Everything that moves: nominal motion and sensor errors, what the filters hold, and integrals still to be used.
 
     ``x[i, :common]`` is what filter i would add to the nominal state, the estimated error with its sign turned; behind
-    that are the estimated errors of its own aids, whole values.
+    that are the estimated errors of its own aids, whole values. All are views of one array, so that a prediction can
+    `take` the whole at once.
     """
 
     q_nb: Array
@@ -55,9 +54,27 @@ class State:
     elapsed: Array  # (2,) seconds and samples since the last covariance step
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
 
+    def __init__(self, common: int, filters: int, n: int) -> None:
+        shapes: dict[str, tuple[int, ...]] = {
+            "q_nb": (4,), "v_n": (3,), "lla": (3,), "imu": (common,), "x": (filters, n), "P": (filters, n, n),
+            "errors": (4, 3), "sums": (3, 3, 3), "elapsed": (2,), "rates": (2, 3),
+        }  # fmt: skip
+        self._shape = common, filters, n
+        self._all = np.zeros(sum(map(math.prod, shapes.values())))
+        end = 0
+        for name, shape in shapes.items():
+            start, end = end, end + math.prod(shape)
+            setattr(self, name, self._all[start:end].reshape(shape))
+
+    def take(self, other: State) -> None:
+        """Become the same as ``other``, which has as many filters and states."""
+        self._all[:] = other._all
+
     def copy(self) -> State:
         """The same in arrays of its own."""
-        return State(*(getattr(self, field.name).copy() for field in fields(self)))
+        made = State(*self._shape)
+        made.take(self)
+        return made
 
 
 class Reference:
@@ -112,18 +129,11 @@ class Reference:
                     block = model.slices[name]
                     P[i, :MOTION, block] = covariance
                     P[i, block, :MOTION] = covariance.T
-        return State(
-            q_nb=np.array(initial.q_nb, dtype=float),
-            v_n=np.array(initial.v_n, dtype=float),
-            lla=np.array([initial.lat, initial.lon, initial.h]),
-            imu=np.zeros(self.common),
-            x=np.zeros((filters, n)),
-            P=P,
-            errors=np.zeros((4, 3)),
-            sums=np.zeros((3, 3, 3)),
-            elapsed=np.zeros(2),
-            rates=np.zeros((2, 3)),
-        )
+        state = State(self.common, filters, n)
+        state.q_nb[:], state.v_n[:] = initial.q_nb, initial.v_n
+        state.lla[:] = initial.lat, initial.lon, initial.h
+        state.P[:] = P
+        return state
 
     def run(self, state: State, imu: ImuSamples, periods: int = 1) -> float:
         """Propagate by a block of increments, a covariance step every ``periods`` of the usual ones.
@@ -166,40 +176,30 @@ class Reference:
         return self._field_value
 
 
-def describe(
-    state: State | None, P: Array, model: ErrorModel, t: float, status: Status, mounting_sigma: float
-) -> tuple[Estimate, Array]:
-    """The estimate of a settled nominal state with covariance ``P`` (n, n), laid out as ``model``, and each 1-sigma.
+def nothing_known(t: float, status: Status) -> Estimate:
+    """The estimate before there is a state: every number is NaN."""
+    nothing = np.full(3, np.nan)
+    return Estimate(
+        t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, np.full((9, 9), np.nan),
+        nothing, nothing, status,
+    )  # fmt: skip
 
-    Without a state every number is NaN. ``mounting_sigma`` [rad] is between the axes of the IMU and of the body.
+
+def describe(
+    state: State, x: Array, P: Array, model: ErrorModel, t: float, status: Status, covariance: Array, sigma: Array,
+    extra: dict[str, tuple[Array, Array]],
+) -> Estimate:  # fmt: skip
+    """The estimate of a nominal state with estimated sensor errors ``x`` and covariance ``P``, laid out as ``model``.
+
+    ``covariance`` and ``sigma`` are those of `spread`. Nothing of the estimate is a view of ``state``.
     """
-    if state is None:
-        nothing = np.full(3, np.nan)
-        estimate = Estimate(
-            t, math.nan, math.nan, math.nan, nothing, np.full(4, np.nan), nothing, nothing, np.full((9, 9), np.nan),
-            nothing, nothing, status,
-        )  # fmt: skip
-        return estimate, np.empty(0)
-    covariance, sigma = _spread(P, mounting_sigma**2)
-    gyro_bias, sigma_gyro = _with_drift(state.imu, P, model, sigma, "gyro")
-    accel_bias, sigma_accel = _with_drift(state.imu, P, model, sigma, "accel")
+    gyro_bias, sigma_gyro = _with_drift(x, P, model, sigma, "gyro")
+    accel_bias, sigma_accel = _with_drift(x, P, model, sigma, "accel")
     lat, lon, h = state.lla.tolist()
-    estimate = Estimate(
-        t=t,
-        lat=lat,
-        lon=lon,
-        h=h,
-        v_n=state.v_n,
-        q_nb=state.q_nb,
-        gyro_bias=gyro_bias,
-        accel_bias=accel_bias,
-        covariance=covariance,
-        sigma_gyro_bias=sigma_gyro,
-        sigma_accel_bias=sigma_accel,
-        status=status,
-        extra={},
-    )
-    return estimate, sigma
+    return Estimate(
+        t, lat, lon, h, state.v_n.copy(), state.q_nb.copy(), gyro_bias, accel_bias, covariance, sigma_gyro, sigma_accel,
+        status, extra,
+    )  # fmt: skip
 
 
 def align(alignment: Alignment, reference: Reference, sample: Sample) -> InitialState | None:
@@ -231,7 +231,7 @@ def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str
 
 
 @njit
-def _spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
+def spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
     """Covariance (9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (n,) of every state."""
     covariance, sigma = np.empty((MOTION, MOTION)), np.empty(len(P))
     for i in range(MOTION):
