@@ -27,7 +27,7 @@ POUND = 0.45359237  # [kg]
 PSF = 47.88025898  # one pound-force per square foot [Pa]
 RANKINE = 5 / 9  # [K]
 
-GUIDANCE_HZ = 20.0
+GUIDANCE_HZ = 10.0
 SETTLING_S = 90.0  # of straight and level flight before the run starts
 
 # JSBSim's numbers for: second order Adams-Bashforth rates, Adams-Bashforth 3 position, and Buss's augmented second
