@@ -556,12 +556,20 @@ class GnssMonitor:
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
     _streak_start: float = math.nan
-    _interval: float = math.inf  # the shortest between two fixes: what the receiver can do
+    _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
+    _heard: float = math.nan  # when the last of them was
     _was_aided: bool = False
     _previous: tuple[GnssSample, Array] | None = None
 
+    def heard(self, t: float) -> None:
+        """The receiver has reported at ``t`` [s], if only that it has no fix."""
+        if t > self._heard:  # not the first
+            self._interval = min(self._interval, t - self._heard)
+        self._heard = t
+
     def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool) -> Verdict:
         """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate."""
+        self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
             self._streak_start = fix.t
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
@@ -589,7 +597,6 @@ class GnssMonitor:
             return False
         before, v0_n = self._previous
         dt = fix.t - before.t
-        self._interval = min(self._interval, dt)
         if dt > self._longest_gap():
             return False
         moved = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)

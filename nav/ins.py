@@ -269,6 +269,7 @@ class Ins:
         that is not among the aids, and during alignment.
         """
         if isinstance(sample, GnssSample) and sample.fix_type is not FixType.FIX_3D:
+            self._monitor.heard(sample.t)
             return []
         trouble = aiding.problem(sample)
         if trouble:

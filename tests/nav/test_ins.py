@@ -343,3 +343,19 @@ def test_a_receiver_slower_than_an_outage_is_fused():
         fix = GnssSample(t, t, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
         verdicts.append(monitor.judge(fix, np.zeros(3), 0.1 * sigma, inside_gate=True))
     assert verdicts[1:] == [Verdict.FUSE] * 6
+
+
+def test_an_outage_right_after_the_first_fix_is_one():
+    """The receiver goes on reporting that it has no fix, so nobody takes it for a slow one."""
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma = np.full(3, 1.0)
+
+    def judged(t):
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        return monitor.judge(fix, np.zeros(3), 0.1 * sigma, inside_gate=True)
+
+    assert judged(0.2) is Verdict.FUSE
+    for k in range(2, 200):
+        monitor.heard(0.2 * k)
+    assert judged(40.0) is Verdict.PROBATION
