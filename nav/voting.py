@@ -3,7 +3,8 @@
 Units of one kind, turned to common axes and close together, sense the same motion, so their differences hold errors
 only. Over each window of ``window_s`` the mean rates and specific forces y_i (6,) of the k units in use are compared:
 
-    w_i = sum over axes of (y_i - mean y)^2 / (sigma^2 (1 - 1/k)),  sigma^2 = bias_sigma^2 + noise^2 / window_s,
+    w_i = sum over axes of (y_i - mean y)^2 / (sigma^2 (1 - 1/k)),
+    sigma^2 = bias_sigma^2 + noise^2 / window_s + (scale |mean y|)^2,
 
 chi-square of six degrees of freedom for a sound unit (the parity vector's component that unit i alone explains). While
 the largest is over the limit and three units or more are in use, that unit goes and the others are compared again. Of
@@ -39,9 +40,15 @@ class Ballot(NamedTuple):
 
 @dataclass
 class Voter:
-    """Votes over blocks of increments; ``false_alarm`` is the probability per unit and window."""
+    """Votes over blocks of increments; ``false_alarm`` is the probability per unit and window.
+
+    ``gyro_scale`` and ``accel_scale`` are what a unit's error grows by with rate and force: scale factor and
+    misalignment, 1 sigma.
+    """
 
     imu: ImuModel
+    gyro_scale: float = 0.0
+    accel_scale: float = 0.0
     false_alarm: float = 1e-6
     window_s: float = 0.2
     readmit_after: int = 25
@@ -84,7 +91,6 @@ class Voter:
         T = self._elapsed
         imu, y = self.imu, self._sums / T
         gyro, accel = imu.gyro_bias_sigma**2 + imu.gyro_noise**2 / T, imu.accel_bias_sigma**2 + imu.accel_noise**2 / T
-        variance = np.repeat([gyro, accel], 3)
         threshold = chi_square_threshold(self.false_alarm, 6)
         finite = np.array([bool(np.isfinite(row).all()) for row in y])
         failed: Mask = self._failed | ~finite
@@ -92,6 +98,10 @@ class Voter:
             failed = ~finite
         if failed.all():
             failed = self._failed.copy()
+        mean = y[~failed].mean(axis=0)
+        gyro += self.gyro_scale**2 * float(mean[:3] @ mean[:3])
+        accel += self.accel_scale**2 * float(mean[3:] @ mean[3:])
+        variance = np.repeat([gyro, accel], 3)
         while True:
             statistic = _compare(y, failed, variance)
             bad = ~failed & ~(statistic <= threshold)

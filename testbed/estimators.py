@@ -25,7 +25,8 @@ from nav.ins import Ins, InsConfig
 from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid, Watched
 from nav.motion import LowDynamics
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_rotate
-from nav.samples import Array, ImuSamples
+from nav.samples import Array, ImuSamples, UpdateReport
+from nav.voting import Voter
 from testbed.scenario import DetectorConfig, EstimatorConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
@@ -52,6 +53,7 @@ GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
+VOTED_OUT, DISAGREE = "voted out", "the units left disagree"
 SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
 LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
 IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
@@ -60,20 +62,44 @@ NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 
 @dataclass(frozen=True, slots=True)
 class Running:
-    """An estimator behind its fusion horizon: the IMU it integrates, the sensors whose samples it is handed.
+    """An estimator behind its fusion horizon: the IMUs it integrates, the sensors whose samples it is handed.
 
-    ``C_sb`` (3, 3) is how the IMU is mounted. The estimate is of the point where the IMU sits.
+    ``imus`` has how each IMU is mounted, C_sb (3, 3), by name; of several the ``voter`` makes one. The estimate is of
+    the point where the first sits.
     """
 
     horizon: FusionHorizon
-    imu: str
-    C_sb: Array
+    imus: Mapping[str, Array]
     sensors: tuple[str, ...]
     handover: Handover | None = None
+    voter: Voter | None = None
 
-    def in_body_axes(self, imu: ImuSamples) -> ImuSamples:
-        """The increments of the IMU, turned back by its mounting."""
-        return replace(imu, dtheta=_turned_back(self.C_sb, imu.dtheta), dv=_turned_back(self.C_sb, imu.dv))
+    @property
+    def imu(self) -> str:
+        """The first IMU."""
+        return next(iter(self.imus))
+
+    def increments(self, imu: Mapping[str, ImuSamples]) -> tuple[ImuSamples, list[UpdateReport]]:
+        """What to integrate, in body axes, from the increments of each IMU; and on each unit of several what was voted.
+
+        A report's nis is the unit's parity statistic; its weight is 0 while the unit is voted out.
+        """
+        turned = [
+            replace(imu[name], dtheta=_turned_back(C_sb, imu[name].dtheta), dv=_turned_back(C_sb, imu[name].dv))
+            for name, C_sb in self.imus.items()
+        ]
+        if self.voter is None:
+            return turned[0], []
+        used, ballots = self.voter.vote(turned)
+        none = np.empty(0)
+        return used, [
+            UpdateReport(
+                ballot.t, name, "imu_parity", none, none.reshape(0, 0), float(statistic), ballot.threshold,
+                0.0 if failed else 1.0, VOTED_OUT if failed else DISAGREE if ballot.ambiguous else "",
+            )
+            for ballot in ballots
+            for name, statistic, failed in zip(self.imus, ballot.statistic, ballot.failed, strict=True)
+        ]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +130,19 @@ class Handover:
             h - down, v_n, q_nb, np.diag(self.sigma**2),
         )  # fmt: skip
         self.estimator.start(initial)
+
+
+def _imus(config: EstimatorConfig, scenario: Scenario) -> tuple[dict[str, Array], Voter | None]:
+    """How the IMUs are mounted, and who votes where there are several."""
+    sections = {name: scenario.sensors[name] for name in (config.imu, *config.spare_imus)}
+    errors = {name: section.errors() for name, section in sections.items() if isinstance(section, ImuConfig)}
+    mountings = {name: e.C_sb for name, e in errors.items()}
+    if not config.spare_imus:
+        return mountings, None
+    e = errors[config.imu]
+    turn = math.hypot(e.gyro_misalignment, e.gyro_nonorthogonality, e.gyro_scale)
+    level = math.hypot(e.accel_misalignment, e.accel_nonorthogonality, e.accel_scale)
+    return mountings, Voter(imu_model(e), turn, level)
 
 
 def _handover(config: EstimatorConfig, estimator: Ins | Federated, imu: ImuErrors, seed: int) -> Handover | None:
@@ -189,12 +228,13 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         partial(geomagnetic_field_n, date=scenario.date),
     )
     used = dict.fromkeys((*offered.values(), *(name for name, aid in others.items() if aid is not None)))
+    imus, voter = _imus(config, scenario)
     return Running(
         FusionHorizon(ins, _lag_s(scenario, used), coning=imu.rate_hz < scenario.truth.rate_hz),
-        config.imu,
-        errors.C_sb,
+        imus,
         tuple(used),
         _handover(config, ins, errors, seed),
+        voter,
     )
 
 
@@ -308,12 +348,13 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
         ),
         partial(geomagnetic_field_n, date=scenario.date),
     )
+    imus, voter = _imus(config, scenario)
     return Running(
         FusionHorizon(federated, _lag_s(scenario, used), coning=imu.rate_hz < scenario.truth.rate_hz),
-        config.imu,
-        errors.C_sb,
+        imus,
         tuple(used),
         _handover(config, federated, errors, seed),
+        voter,
     )
 
 
@@ -362,9 +403,10 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         ),
         field_n,
     )
+    imus, voter = _imus(config, scenario)
     return Running(
         FusionHorizon(ahrs, _lag_s(scenario, config.aids), coning=imu.rate_hz < scenario.truth.rate_hz),
-        config.imu,
-        errors.C_sb,
+        imus,
         config.aids,
+        voter=voter,
     )

@@ -291,6 +291,7 @@ def run(
         latest = _Latest()
         unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
         unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
+        votes: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # on redundant units, nor these
         arrived: list[Sample] = []  # nor these
         truth_s = 0.0
         # Samples come by the million, and the collector would walk all that was there before again and again.
@@ -324,7 +325,9 @@ def run(
             integrated: dict[str, ImuSamples] = {}
             for name, one in filters.items():
                 handed = [sample for aid in one.sensors for sample in samples[aid]]
-                integrated[name] = one.in_body_axes(imu[one.imu])
+                integrated[name], parity = one.increments(imu)
+                recorder.reports(name, parity)
+                votes[name].extend(parity)
                 reports, estimates[name] = one.horizon.track(integrated[name], handed, times)
                 recorder.reports(name, reports)
                 unread[name].extend(reports)
@@ -347,7 +350,7 @@ def run(
                     watch.row(times[i], block.leg[k], plan)
                     for name, estimate in now:
                         watch.estimate(name, estimate)
-                        for report in _take(unread[name], times[i] - behind[name]):
+                        for report in (*_take(votes[name], times[i]), *_take(unread[name], times[i] - behind[name])):
                             watch.report(name, report)
                 if (tick + k) % record_every == 0:
                     for name, estimate in now:

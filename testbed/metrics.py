@@ -416,9 +416,10 @@ def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
 def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
     reports = _reports(dataset, estimator, aid)
     judged = (reports.t >= start) & (reports.used | reports.gated) & np.isfinite(reports.nis)
-    if not judged.any():
+    own = dataset[f"estimators/{estimator}/innovations/{aid}"]
+    if not judged.any() or "innovation" not in own:  # the parity of redundant units has none
         return {}
-    m = column(dataset, f"estimators/{estimator}/innovations/{aid}/innovation").shape[1]
+    m = own["innovation"].shape[1]
     return {
         f"nis_mean.{aid}": float(reports.nis[judged].mean() / m),
         f"rejected_fraction.{aid}": float(np.mean(reports.gated[judged])),

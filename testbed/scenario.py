@@ -200,6 +200,7 @@ class EstimatorConfig(Section):
     name: str
     kind: Literal["ins", "federated", "ahrs"] = "ins"
     imu: str = "imu"
+    spare_imus: Annotated[tuple[str, ...], Field(max_length=3)] = ()  # voted with the first, of its kind and beside it
     aids: tuple[str, ...]
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
     handover: HandoverConfig | None = Field(default=None, description="how well the start is known; none: it aligns")
@@ -554,6 +555,14 @@ def _estimator_faults(
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)
+    for index, spare in enumerate(config.spare_imus):
+        if spare not in imus:
+            yield (*path, "spare_imus", index), _unknown("IMU", spare, imus)
+        elif spare == config.imu or spare in config.spare_imus[:index]:
+            yield (*path, "spare_imus", index), f"{spare!r} is used already: name another IMU"
+        elif config.imu in imus and sensors[spare].rate_hz != sensors[config.imu].rate_hz:
+            rates = f"{sensors[spare].rate_hz:g} Hz, not the {sensors[config.imu].rate_hz:g} Hz of {config.imu!r}"
+            yield (*path, "spare_imus", index), f"has {rates}: units that are voted on must report together"
     usable = [name for name, kind in kinds.items() if kind in AIDS[config.kind]]
     if config.kind == "federated":
         yield from _federated_faults(path, config, kinds, usable)

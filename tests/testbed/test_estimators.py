@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nav.earth import position_difference_n
 from nav.ins import Ins
-from testbed import Scenario, estimators, run
+from testbed import Scenario, estimators, metrics, run
+from testbed.errors import UserError
+from testbed.kinematic import Kinematic
+from testbed.scenario import KinematicStart
 
 TWO_RECEIVERS = [
     "duration_s=20",
@@ -55,3 +60,109 @@ def test_alignment_knows_the_lever_arm_of_a_receiver_that_is_no_aid() -> None:
     place = [float(truth[name].values[0]) for name in ("lat", "lon", "h")]
     error = position_difference_n(float(lat[first]), float(lon[first]), float(h[first]), *place)
     assert np.linalg.norm(error) < 2.0  # 20 m of arm, turned by a heading that is known to a degree or two
+
+
+THREE_IMUS = [
+    "duration_s=90",
+    "sensors.spare={kind='imu', grade='mems-consumer'}",
+    "sensors.third={kind='imu', grade='mems-consumer'}",
+    "expect={}",
+]
+
+
+def failing(estimator: str) -> Scenario:
+    fault = "{sensor='imu', channel='gyro_z', kind='step', window=[60, 80], size=3}"
+    return Scenario.load("u_turn", [*THREE_IMUS, f"fault=[{fault}]", f"estimator=[{estimator}]"])
+
+
+def test_a_failed_unit_of_three_is_voted_out_and_comes_back() -> None:
+    aids = "aids=['gnss', 'magnetometer']"
+    both = f"{{name='voted', spare_imus=['spare', 'third'], {aids}}}, {{name='alone', {aids}}}"
+    dataset = run(failing(both)).dataset
+    parity = dataset["estimators/voted/innovations/imu_parity"]
+    t, weight, sensor = (parity[name].values for name in ("sample_time", "weight", "sensor"))
+    out = np.unique(sensor[weight == 0.0])
+    assert out.tolist() == ["imu"]
+    times = t[(sensor == "imu") & (weight == 0.0)]
+    assert times[0] < 60.5
+    assert 80.0 < times[-1] < 90.0
+    error = {name: np.abs(heading_error_deg(dataset, name, 61.0)).max() for name in ("voted", "alone")}
+    assert error["voted"] < 3.0
+    assert error["alone"] > 20.0
+    assert any("imu_parity of imu refused" in text for text in dataset["events/text"].values.astype(str))
+
+
+def heading_error_deg(dataset: Any, name: str, since: float) -> Any:
+    """Difference of headings from a time on, by scipy."""
+    late = dataset["truth/time"].values > since
+    q_hat, q = (dataset[path].values[late] for path in (f"estimators/{name}/q_nb", "truth/q_nb"))
+    turned = Rotation.from_quat(q, scalar_first=True) * Rotation.from_quat(q_hat, scalar_first=True).inv()
+    return np.rad2deg(turned.as_rotvec()[:, 2])
+
+
+def test_units_that_cannot_be_voted_on_are_refused() -> None:
+    for spare, complaint in (
+        ("gyro", "there is no IMU"),
+        ("imu", "'imu' is used already: name another IMU"),
+        ("slow", "has 100 Hz, not the 200 Hz of 'imu': units that are voted on must report together"),
+    ):
+        with pytest.raises(UserError, match=complaint):
+            Scenario.load(
+                "u_turn",
+                [
+                    "sensors.slow={kind='imu', rate_hz=100}",
+                    f"estimator=[{{name='ins', aids=['gnss'], spare_imus=['{spare}']}}]",
+                    "expect={}",
+                ],
+            )
+
+
+def test_a_start_is_handed_over_with_its_errors() -> None:
+    handover = "handover={level_deg=0.5, heading_deg=2, velocity_mps=0.3, position_m=8}"
+    drawn = []
+    for seed in range(40):
+        scenario = Scenario.load(
+            "u_turn", ["duration_s=0.1", f"estimator=[{{name='ins', aids=[], {handover}}}]", "expect={}"]
+        )
+        dataset = run(scenario, seed=seed, source=still()).dataset
+        e = metrics.errors(dataset, "ins")
+        assert e.aligned_s == 0.0
+        drawn.append(np.concatenate([e.attitude[0], e.velocity[0], e.position[0]]))
+    sigma = np.array([*np.deg2rad([0.5, 0.5, 2.0]), *[0.3] * 3, *[8.0] * 3])
+    scaled = np.array(drawn) / sigma
+    # 40 draws: the sample variance of each is chi-square of 40 degrees of freedom over 40.
+    assert np.all(np.abs(scaled.mean(axis=0)) < 4 / np.sqrt(40))
+    assert np.all((scaled.var(axis=0) > 0.4) & (scaled.var(axis=0) < 2.0))
+
+
+def still() -> Kinematic:
+    return Kinematic(KinematicStart(lat_deg=34.0, lon_deg=108.0, alt_m=300.0, heading_deg=40.0), 200.0)
+
+
+def test_body_velocity_stars_and_position_fixes_aid() -> None:
+    sensors = [
+        "sensors.imu.grade='navigation'",
+        "sensors.doppler={kind='body_velocity', grade='doppler'}",
+        "sensors.stars={kind='star_tracker'}",
+        "sensors.terrain={kind='position_fix', grade='terrain'}",
+    ]
+    handover = "handover={level_deg=0.5, heading_deg=2, velocity_mps=0.3, position_m=30}"
+    aids = ["doppler", "stars", "terrain"]
+    local = ", ".join(f"{{name='{aid}', aids=['{aid}']}}" for aid in aids)
+    scenario = Scenario.load(
+        "kinematic_u_flight",
+        [
+            *sensors,
+            "truth.segments=[{leg='straight', duration_s=200}]",
+            f"estimator=[{{name='ins', aids={aids}, {handover}}},"
+            f" {{name='fed', kind='federated', locals=[{local}], {handover}}}]",
+            "expect={}",
+        ],
+    )
+    found = run(scenario).metrics
+    for name in ("ins", "fed"):
+        assert found[f"{name}.position_horizontal_rms_m"] < 15.0
+        assert found[f"{name}.velocity_rms_mps"] < 0.3
+        assert found[f"{name}.heading_rms_deg"] < 0.02
+        for aid in ("body_velocity", "star_attitude", "position_fix"):
+            assert 0.5 < found[f"{name}.nis_mean.{aid}"] < 1.5
