@@ -97,8 +97,10 @@ def test_scenario_flies(text: str) -> None:
 def test_parts_of_scenarios_fit_into_one() -> None:
     parts = [text for text in blocks("toml") if text not in WHOLE]
     assert parts
+    alone = Scenario.parse(WHOLE[0])
     for part in parts:
-        assert Scenario.parse(f"{WHOLE[0]}\n{part}").fault
+        both = Scenario.parse(f"{WHOLE[0]}\n{part}")
+        assert len(both.fault) + len(both.estimator) > len(alone.fault) + len(alone.estimator)
 
 
 def test_faults_are_those_of_the_code() -> None:
