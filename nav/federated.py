@@ -21,9 +21,14 @@ axis is isolated as a whole. While any part of a sensor is isolated it is judged
 filters without an isolated part, since its own filter drifts, or is wrong. A fault
 that grows slowly has pulled its filter before it is found. Therefore on every isolation all filters start again from
 the fused solution of those without an isolated part, P_i = P_g / beta_i: what the faulty sensor told stays in none,
-nothing is counted twice, and the Markov errors of its aid go back to their first variance. With ``full_reset`` or
-``partial`` a slow fault also reaches the other filters until it is found: where faults are to be told apart, use
-``no_reset``. When all filters have an isolated part, they are left as they are.
+nothing is counted twice, and the Markov errors of its aid go back to their first variance. When all filters have an
+isolated part, they are left as they are.
+
+Which structure finds faults: with ``no_reset`` a fault stays in its own filter until it is found, but a filter that is
+alone with a poor IMU follows a spoofer whose velocity grows slowly together with its position, and never notices. With
+``full_reset`` the fault reaches all filters until it is found, but every look is judged by what all sensors predict,
+and the sound receiver keeps that prediction with the IMU. Without aid in an outage ``full_reset`` is as good as one
+filter with every sensor; without resets nobody combines one filter's wind with another's heading.
 
 When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
 velocities are given up as in `nav.ins`, and the next fixes are believed.

@@ -296,6 +296,43 @@ def test_same_name_for_two_estimators() -> None:
     assert "estimator[1].name: 'ins' is taken by an estimator above" in message
 
 
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("estimator[0].locals=[]", "estimator[0].locals: is missing: add local filters, such as"),
+        ('estimator[0].locals[0].name="air"', "estimator[0].locals[1].name: 'air' is taken by a local filter above"),
+        ('estimator[0].locals[0].name="1"', "estimator[0].locals[0].name: is made of letters, digits and _"),
+        ('estimator[0].locals[1].aids=["gps"]', 'estimator[0].locals[1].aids[0]: there is no sensor "gps"'),
+        ('estimator[0].locals[1].aids=["imu"]', "aids[0]: 'imu' is of kind 'imu', which does not aid 'federated'"),
+        ("estimator[0].locals[1].share=0.4", "estimator[0].locals: the shares of all local filters must add up to 1"),
+        ('estimator[0].aids=["gnss"]', "estimator[0].aids: a federated estimator lists its aids by local filter"),
+        ('estimator[0].combination="scalar"', "combination 'scalar' needs no shares: set sharing = \"none\""),
+        ('estimator[0].structure="no_rest"', 'can\'t be "no_rest": did you mean no_reset?'),
+        ('estimator[0].locals[0].detector={kind="gl"}', 'detector.kind: can\'t be "gl": did you mean glr?'),
+        (
+            'estimator[0].locals[0].detector={kind="glr", reset="fast"}',
+            "estimator[0].locals[0].detector: reset is a key of kind 'sprt', not of 'glr': leave it out",
+        ),
+        ('estimator[0].kind="ins"', "estimator[0].locals: is a key of kind 'federated', not of 'ins': leave it out"),
+    ],
+)
+def test_federated(override: str, said: str) -> None:
+    federated = (
+        'estimator=[{name="fed", kind="federated", locals=['
+        '{name="one", aids=["gnss"]}, {name="air", aids=["barometer", "airspeed"]}]}]'
+    )
+    extra = ["estimator[0].aids=[]"] if 'kind="ins"' in override else []
+    assert said in complaint(U_TURN, federated, "expect={}", override, *extra)
+
+
+def test_federated_without_sharing() -> None:
+    override = (
+        'estimator=[{name="fed", kind="federated", structure="full_reset", sharing="none",'
+        ' locals=[{name="one", aids=["gnss"]}]}]'
+    )
+    assert "would count the same information again and again" in complaint(U_TURN, override, "expect={}")
+
+
 def test_two_aids_of_a_kind() -> None:
     message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
     assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nav.detection import Eraim, Glr
 from nav.earth import position_difference_n
+from nav.federated import Federated
 from nav.ins import Ins
+from nav.local_filter import AirspeedAid, GnssAid
 from testbed import Scenario, estimators, metrics, run
 from testbed.errors import UserError
 from testbed.kinematic import Kinematic
@@ -166,3 +169,54 @@ def test_body_velocity_stars_and_position_fixes_aid() -> None:
         assert found[f"{name}.heading_rms_deg"] < 0.02
         for aid in ("body_velocity", "star_attitude", "position_fix"):
             assert 0.5 < found[f"{name}.nis_mean.{aid}"] < 1.5
+
+
+FEDERATED = [
+    "sensors.gnss.grade=rtk",
+    'sensors.gnss2={kind="gnss", lever_arm_m=[2.0, 0.0, 0.0], denied=[[40, 50]]}',
+    'estimator=[{name="fed", kind="federated", structure="full_reset", locals=['
+    '{name="one", aids=["gnss"], share=0.5, detector={kind="glr", window_s=20.0}},'
+    '{name="two", aids=["gnss2"], share=0.3},'
+    '{name="air", aids=["airspeed", "barometer", "magnetometer"], share=0.2, detector={kind="eraim"}}]}]',
+    "expect={}",
+]
+
+
+def test_a_federation_is_told_of_each_sensor() -> None:
+    running = estimators.build(Scenario.load("u_turn", FEDERATED), 0)["fed"]
+    federated = running.horizon.estimator
+    assert isinstance(federated, Federated)
+    assert running.sensors == ("gnss", "gnss2", "airspeed", "barometer", "magnetometer")
+    assert federated.config.structure == "full_reset"
+    assert federated.shares.tolist() == [0.5, 0.3, 0.2]
+    one, two, air = federated.config.locals
+    first, second = one.sensors[0].aid, two.sensors[0].aid
+    assert isinstance(first, GnssAid)
+    assert isinstance(second, GnssAid)
+    assert second.arm_b[0] - first.arm_b[0] == pytest.approx(2.0, abs=0.5)
+    assert first.position_error_sigma < second.position_error_sigma  # RTK and the usual kind
+    assert isinstance(air.sensors[0].aid, AirspeedAid)
+    detector = one.sensors[0].detector()
+    assert isinstance(detector, Glr)
+    assert detector.window_s == 20.0
+    assert isinstance(air.sensors[0].detector(), Eraim)
+    assert air.sensors[0].detector() is not air.sensors[0].detector()
+
+
+def test_a_federation_without_receivers_aligns_with_the_first() -> None:
+    blind = ['estimator=[{name="fed", kind="federated", locals=[{name="air", aids=["barometer"]}]}]', "expect={}"]
+    running = estimators.build(Scenario.load("u_turn", blind), 0)["fed"]
+    assert running.sensors == ("barometer", "gnss", "magnetometer")
+
+
+def test_a_federation_in_a_run() -> None:
+    result = run(Scenario.load("u_turn", [*FEDERATED, "duration_s=110"]))
+    metrics = result.metrics
+    assert metrics["fed.position_horizontal_rms_m"] < 0.5  # RTK goes first
+    assert metrics["fed.heading_rms_deg"] < 1.0
+    assert metrics["fed.velocity_nees_mean"] < 3.0
+    innovations = result.dataset["estimators/fed/innovations"]
+    assert set(innovations.children) == {
+        "gnss_position", "gnss_velocity", "airspeed", "sideslip", "barometer", "magnetometer",
+    }  # fmt: skip
+    assert "wind" in result.dataset["estimators/fed"]
