@@ -386,6 +386,7 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         limits = LowDynamics(level.acceleration_mps2, yaw_rate, roll_rate, level.test)
         told |= {"motion": limits, "compensated_motion": limits}
         told |= {"force_sigma": level.force_sigma_mps2, "phi_limit": math.radians(level.limit_deg)}
+        told |= {"gyro_bias_feedback": level.gyro_bias_feedback}
     if not config.levelling:
         told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
     if config.heading_deg is not None:

@@ -203,6 +203,7 @@ class LevelConfig(Section):
     test: Literal["norm", "vector"] = "norm"
     force_sigma_mps2: float = Field(default=0.1, gt=0, le=10, description="of a second's mean, as a sign of tilt")
     limit_deg: float = Field(default=0.2, gt=0, le=20, description="largest correction per second and axis")
+    gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
 
 
 class EstimatorConfig(Section):
