@@ -23,12 +23,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from nav import strapdown
+from nav import strapdown, unscented
+from nav._jit import njit
+from nav.ahrs import Ahrs, AhrsConfig
 from nav.alignment import InitialState
-from nav.earth import position_difference_n
-from nav.error_model import ImuModel
+from nav.earth import gravity, position_difference_n
+from nav.error_model import POS, VEL, ErrorModel, ImuModel, Indices, transition
+from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.local_filter import GnssAid, Watched
 from nav.rotation import euler_from_quat, quat_from_euler
 from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
 from testbed import loop
@@ -48,6 +52,8 @@ GYRO_BIAS = np.array([60.0, -40.0, 50.0]) * DEG / 3600  # [rad/s]
 ACCEL_BIAS = np.array([0.05, -0.04, 0.06])  # [m/s^2]
 GYRO_WALK, ACCEL_WALK = 1e-6, 1e-5  # [rad/s/sqrt(s)], [m/s^2/sqrt(s)]
 GNSS_SIGMA = 1.0  # [m]
+REST_S, REST_HZ = 600.0, 200  # of the comparisons without a peer
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 IMU_COLUMNS = ("gyro", "accel")  # as pyins names them
 
 
@@ -230,6 +236,85 @@ def campaign_efficiency() -> list[Row]:
     return [Row("campaign: parallel efficiency", seconds[1] / (2 * seconds[2]), "", at_least=0.85, detail=detail)]
 
 
+def ahrs_batch() -> list[Row]:
+    """The attitude filter through increments in one block, levelling once a second; the fastest of the rounds."""
+    samples = _rest()
+
+    def ours() -> None:
+        ahrs = Ahrs(AhrsConfig(_unit(), START[0] * DEG))
+        ahrs.start(0.0, LEVEL)
+        ahrs.propagate(samples)
+
+    ours()
+    rate = len(samples) / min(_seconds(ours) for _ in range(ROUNDS)) / 1e6
+    return [Row("AHRS in a batch", rate, "M updates/s", at_least=1.5)]
+
+
+def federated() -> list[Row]:
+    """Three local filters of 15 states, each with a receiver, over one INS of 15 states with one."""
+    samples, names = _rest(), ("gnss", "second", "third")
+    initial = InitialState(0.0, *_site(), np.zeros(3), LEVEL, np.diag(np.repeat([2 * DEG, 0.5, 1.0], 3) ** 2))
+    receivers = [_still_fixes(name) for name in names]
+    every = [fix for second in zip(*receivers, strict=True) for fix in second]
+
+    def one() -> None:
+        ins = Ins(InsConfig(_unit(), aids=("gnss",)))
+        ins.start(initial)
+        FusionHorizon(ins).push(samples, receivers[0])
+
+    def three() -> None:
+        filters = tuple(Local(name, (Watched(GnssAid(name)),)) for name in names)
+        fused = Federated(Config(_unit(), filters))
+        fused.start(initial)
+        FusionHorizon(fused).push(samples, every)
+
+    us, them = _alternate(three, one)
+    detail = f"{us / REST_S * 1e6:.0f} us over {them / REST_S * 1e6:.0f} us per second of flight, fixes at 1 Hz"
+    return [Row("federated, three local filters / one INS", us / them, at_most=4.0, detail=detail)]
+
+
+def unscented_period() -> list[Row]:
+    """A second's step of 15 states by sigma points, with six rows of GNSS, over the strapdown of that second."""
+    samples, model, scaling = _rest(), ErrorModel(_unit()), unscented.Scaling()
+    P = np.diag(np.repeat([0.1, 0.5, 3.0, 2e-4, 0.02], 3) ** 2)
+    H = np.zeros((6, len(P)))
+    H[:3, POS : POS + 3] = H[3:, VEL : VEL + 3] = np.eye(3)
+    force = np.eye(3) * np.array([1.0, 0.1, -9.8])[:, None, None]  # integrals of C_nb, and of it times rates and forces
+
+    def linear() -> None:
+        strapdown.propagate(LEVEL.copy(), np.zeros(3), np.array(_site()), samples.dtheta, samples.dv, samples.dt)
+
+    def ours() -> None:
+        _unscented_seconds(
+            int(REST_S), P, LEVEL.copy(), np.zeros(3), np.array(_site()), model.driven, force, H,
+            np.array([1.0] * 3 + [0.01] * 3), scaling.spread, scaling.excess,
+        )  # fmt: skip
+
+    us, them = _alternate(ours, linear)
+    detail = f"{us / REST_S * 1e6:.1f} us over {them / REST_S * 1e6:.1f} us for {REST_HZ} steps"
+    return [Row("UKF at 1 Hz / strapdown beside it", us / them, at_most=1.0, detail=detail)]
+
+
+@njit
+def _unscented_seconds(
+    count: int, P0: Array, q_nb: Array, v_n: Array, lla: Array, driven: Indices, sums: Array, H: Array, R: Array,
+    spread: float, excess: float,
+) -> None:  # fmt: skip
+    """``count`` periods of a second, each from the same covariance."""
+    n = len(P0)
+    Phi, FT, work, x = np.zeros((9, n)), np.zeros((9, n)), np.empty((9, n)), np.zeros(n)
+    decay, half, push = np.ones(n), np.full(n, 1e-12), sums[2].sum(axis=1)
+    Z, z = np.zeros((7, len(R))), np.zeros(len(R))
+    for _ in range(count):
+        P = P0.copy()
+        transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, 1.0)
+        unscented.remove(q_nb, v_n, lla, x, unscented.predict(P, Phi, decay, half, work, push, 1.0, spread, excess))
+        root = unscented.factor(P, n)
+        unscented._points(q_nb, v_n, lla, x, root[:3], spread)
+        nu, _, A, curved, _ = unscented.innovate(Z, z, R, root, H, spread, excess)
+        unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, root, A, curved, R, nu))
+
+
 def start_up() -> list[Row]:
     """Cold compile of every kernel, and the time from process start to the first tick when they are compiled."""
     script = (
@@ -290,6 +375,36 @@ def growth() -> list[tuple[str, float, float, float]]:
 
 
 @cache
+def _rest() -> ImuSamples:
+    """Noisy increments of a body that lies still."""
+    rng, n = np.random.default_rng(1), round(REST_S * REST_HZ)
+    dtheta = GYRO_NOISE / np.sqrt(REST_HZ) * rng.normal(size=(n, 3))
+    dv = ACCEL_NOISE / np.sqrt(REST_HZ) * rng.normal(size=(n, 3))
+    dv[:, 2] -= gravity(_site()[0], START[2]) / REST_HZ
+    return ImuSamples(np.arange(1, n + 1) / REST_HZ, np.full(n, 1 / REST_HZ), dtheta, dv)
+
+
+def _still_fixes(sensor: str) -> list[Sample]:
+    """A fix of the body that lies still in every second but the last."""
+    rng, (lat, lon, h) = np.random.default_rng(2), _site()
+    sigma_p, sigma_v = np.full(3, GNSS_SIGMA), np.full(3, 0.1)
+    return [
+        GnssSample(t, t, lat, lon, h, 0.1 * rng.normal(size=3), sigma_p, sigma_v, FixType.FIX_3D, 12, hdop=1.0,
+                   vdop=1.0, sensor=sensor)
+        for t in np.arange(1.0, REST_S).tolist()
+    ]  # fmt: skip
+
+
+def _site() -> tuple[float, float, float]:
+    return START[0] * DEG, START[1] * DEG, START[2]
+
+
+def _unit() -> ImuModel:
+    """The filters' model of that IMU."""
+    return ImuModel(GYRO_NOISE, ACCEL_NOISE, 60 * DEG / 3600, 0.06, GYRO_WALK, ACCEL_WALK)
+
+
+@cache
 def _oracle_hour() -> tuple[Any, Any, Any]:
     """Trajectory, increments with errors and GNSS fixes of the hour, from pyins' own simulator, as its frames."""
     from pyins import inertial_sensor, sim
@@ -334,8 +449,7 @@ def _initial(trajectory: Any) -> tuple[Array, Array, Array]:
 
 def _aligned(trajectory: Any) -> Ins:
     """A 15-state INS told the true error levels, at the start of the hour."""
-    imu = ImuModel(GYRO_NOISE, ACCEL_NOISE, 60 * DEG / 3600, 0.06, GYRO_WALK, ACCEL_WALK)
-    ins = Ins(InsConfig(imu, aids=("gnss",), covariance_period=1, gnss_use_velocity=False))
+    ins = Ins(InsConfig(_unit(), aids=("gnss",), covariance_period=1, gnss_use_velocity=False))
     q, v, lla = _initial(trajectory)
     covariance = np.diag(np.repeat([2 * DEG, 0.5, 1.0], 3) ** 2)
     ins.start(InitialState(0.0, lla[0], lla[1], lla[2], v, q, covariance))
@@ -346,7 +460,10 @@ def main() -> list[str]:
     """Measure and print everything; returns the names of the figures that missed their bound."""
     console = Console()
     rows: list[Row] = []
-    for measure in (whole_run, strapdown_alone, ins_at_every_sample, accuracy, start_up, campaign_efficiency):
+    for measure in (
+        whole_run, strapdown_alone, ins_at_every_sample, accuracy, ahrs_batch, federated, unscented_period, start_up,
+        campaign_efficiency,
+    ):  # fmt: skip
         with console.status((measure.__doc__ or "").partition("\n")[0]):
             rows += measure()
     table = Table("figure", "value", "bound", "", "detail", title="Speed")

@@ -379,7 +379,14 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     errors, site = imu.errors(), scenario.site()
     aids = {scenario.sensors[name].kind: scenario.sensors[name] for name in config.aids}
     field_n = geomagnetic_field_n(site.lat, site.lon, site.h, scenario.date)
-    told: dict[str, object] = {}
+    told: dict[str, object] = {"force_sigma": LEVELLING_FORCE}
+    level = config.level
+    if level is not None:
+        yaw_rate, roll_rate = math.radians(level.yaw_rate_degps), math.radians(level.roll_rate_degps)
+        limits = LowDynamics(level.acceleration_mps2, yaw_rate, roll_rate, level.test)
+        told |= {"motion": limits, "compensated_motion": limits}
+        told |= {"force_sigma": level.force_sigma_mps2, "phi_limit": math.radians(level.limit_deg)}
+        told |= {"gyro_bias_feedback": level.gyro_bias_feedback}
     if not config.levelling:
         told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
     if config.heading_deg is not None:
@@ -396,7 +403,6 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
             site.lat,
             site.h,
             tuple(aids),
-            force_sigma=LEVELLING_FORCE,
             airspeed_sigma=config.gust_mps,
             literal=config.literal,
             **told,  # type: ignore[arg-type]

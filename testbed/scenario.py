@@ -63,7 +63,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
         ),
         ("federated",),
     ),
-    **dict.fromkeys(("heading_deg", "levelling"), ("ahrs",)),
+    **dict.fromkeys(("heading_deg", "levelling", "level"), ("ahrs",)),
     **dict.fromkeys(("handover", "nonholonomic_mps"), ("ins", "federated")),
     "literal": ("federated", "ahrs"),
 }  # fmt: skip
@@ -191,6 +191,21 @@ class HandoverConfig(Section):
     position_m: float = Field(gt=0, le=1e4)
 
 
+class LevelConfig(Section):
+    """When an AHRS takes specific force for tilt, and how far it follows; with airspeed as without.
+
+    Defaults are those of Jiang et al. 2021 (`nav.motion.LowDynamics`, `nav.ahrs.AhrsConfig`).
+    """
+
+    acceleration_mps2: float = Field(default=0.2, gt=0, le=10)
+    yaw_rate_degps: float = Field(default=0.5, gt=0, le=100)
+    roll_rate_degps: float = Field(default=2.0, gt=0, le=100)
+    test: Literal["norm", "vector"] = "norm"
+    force_sigma_mps2: float = Field(default=0.1, gt=0, le=10, description="of a second's mean, as a sign of tilt")
+    limit_deg: float = Field(default=0.2, gt=0, le=20, description="largest correction per second and axis")
+    gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
+
+
 class EstimatorConfig(Section):
     """One ``[[estimator]]``: which IMU it integrates and which sensors aid it.
 
@@ -209,6 +224,7 @@ class EstimatorConfig(Section):
     )
     heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
     levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
+    level: LevelConfig | None = Field(default=None, description="how an AHRS levels; none: as light turbulence wants")
     locals: tuple[LocalConfig, ...] = ()
     structure: Literal["no_reset", "full_reset", "partial"] = "no_reset"
     sharing: Literal["fixed", "by_covariance", "none"] = "fixed"

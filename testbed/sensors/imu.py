@@ -234,6 +234,9 @@ class ImuConfig(Section):
     kind: Literal["imu"] = "imu"
     grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = "mems-consumer"
     rate_hz: float = Field(200.0, ge=5, le=10_000)
+    turn_on: Literal["drawn", "exact"] = Field(
+        "drawn", description="exact: turn-on biases of just their 1 sigma, only the signs drawn"
+    )
 
     gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5)
     gyro_instability_degph: float = Field(0.0, ge=0, le=1e4)
@@ -341,7 +344,10 @@ class Imu:
             return stream(seed, self.name, process).standard_normal(n)
 
         e = self.errors
-        self._turn_on = draw("turn-on", 6) * np.repeat([e.gyro_turn_on, e.accel_turn_on], 3)
+        turn_on = draw("turn-on", 6)
+        if config.turn_on == "exact":
+            turn_on = np.sign(turn_on)
+        self._turn_on = turn_on * np.repeat([e.gyro_turn_on, e.accel_turn_on], 3)
         self._temperature_slope = draw("temperature", 6) * np.repeat([e.gyro_temperature, e.accel_temperature], 3)
         self._asymmetry = draw("scale asymmetry", 6) * np.repeat([e.gyro_scale_asymmetry, e.accel_scale_asymmetry], 3)
         scale = draw("scale", 6) * np.repeat([e.gyro_scale, e.accel_scale], 3)

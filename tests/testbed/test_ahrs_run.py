@@ -18,6 +18,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from nav.ahrs import Ahrs
+from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, UpdateReport
 from testbed import RunResult, Scenario, campaign, campaign_report, estimators, metrics, record, report, run
 from testbed.campaign import CampaignResult, Combination, Outcome
@@ -60,6 +61,8 @@ def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
         ('{name="a", kind="ahrs", aids=[], heading_deg=400}', "heading_deg: must be less than or equal to 360"),
         ('{name="a", aids=["gnss"], heading_deg=3}', "heading_deg: is a key of kind 'ahrs', not of 'ins': leave it"),
         ('{name="a", aids=["gnss"], levelling=false}', "levelling: is a key of kind 'ahrs', not of 'ins'"),
+        ('{name="a", aids=["gnss"], level={}}', "level: is a key of kind 'ahrs', not of 'ins'"),
+        ('{name="a", kind="ahrs", aids=[], heading_deg=0, level={test="nrm"}}', 'level.test: can\'t be "nrm"'),
         ('{name="a", aids=["gnss"], literal=true}', "literal: is a key of kind 'federated' or 'ahrs', not of 'ins'"),
         ('{name="a", kind="ahrz", aids=[]}', 'kind: can\'t be "ahrz": did you mean ahrs'),
     ],
@@ -82,6 +85,19 @@ def test_it_is_told_the_datasheets() -> None:
     assert 0.3 < config(AHRS).magnetometer_sigma < 0.6
     strong = config(AHRS, overrides=("sensors.magnetometer.hard_iron_ut=5.0",))
     assert strong.magnetometer_sigma > 8 * config(AHRS).magnetometer_sigma
+
+
+def test_it_is_told_how_to_level() -> None:
+    house, paper = config(BLIND), config(BLIND.replace("}", ", level={}}"))
+    assert (house.force_sigma, paper.force_sigma) == (0.3, 0.1)
+    assert house.motion == paper.motion == paper.compensated_motion != house.compensated_motion
+    keys = (
+        'acceleration_mps2=0.5, yaw_rate_degps=1, roll_rate_degps=3, test="vector", force_sigma_mps2=0.2, '
+        "limit_deg=0.4, gyro_bias_feedback=true"
+    )
+    told = config(AHRS.replace("}", f", level={{{keys}}}}}"))
+    assert told.motion == told.compensated_motion == LowDynamics(0.5, math.radians(1), math.radians(3), "vector")
+    assert (told.force_sigma, told.phi_limit, told.gyro_bias_feedback) == (0.2, math.radians(0.4), True)
 
 
 # --- a run

@@ -266,6 +266,15 @@ def test_thousand_runs_spread_turn_on_biases_as_the_grade_says(grade):
     assert_spread(accel, preset["accel_turn_on_mg"] * 1e-3 * G)
 
 
+def test_exact_turn_on_biases_differ_in_sign_alone():
+    config = perfect(turn_on="exact", gyro_turn_on_degph=40.0, accel_turn_on_mg=2.0)
+    seeds = [sense(config, still(2), seed=seed) for seed in range(20)]
+    for values, size in (([s.dtheta[0] for s in seeds], 40 * DEG / 3600), ([s.dv[0] for s in seeds], 2e-3 * G)):
+        biases = np.array(values) * RATE_HZ
+        np.testing.assert_allclose(np.abs(biases), size, rtol=1e-9)
+        assert (np.ptp(np.sign(biases), axis=0) == 2).all()
+
+
 @pytest.mark.slow
 def test_thousand_runs_spread_scale_factors():
     truth = constant(2, RATE_HZ, omega=(1.0, 1.0, 1.0), force=(10.0, 10.0, 10.0))
