@@ -1,7 +1,7 @@
 """Speed, each figure as a ratio measured in one run: machines differ and are noisy, ratios much less so.
 
-Peers come with the bench extra (`make bench` installs it): pyins (PyPI python-ins) and smsfusion. Alternating rounds,
-the median of each side.
+Peers come with the bench extra (`make bench` installs it): pyins (PyPI python-ins), smsfusion and vqf. Alternating
+rounds, the median of each side.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ MAIN = "loiter_gnss_outage"
 ROUNDS = 5
 CAMPAIGN_RUNS = 40
 DEG = np.pi / 180
-HAS_PEERS = find_spec("pyins") is not None and find_spec("smsfusion") is not None
+HAS_PEERS = all(find_spec(name) is not None for name in ("pyins", "smsfusion", "vqf"))
 
 # The oracle hour: 100 Hz IMU, 1 Hz GNSS position, errors of an industrial MEMS unit.
 RATE_HZ, HOUR_S = 100, 3600.0
@@ -247,7 +247,19 @@ def ahrs_batch() -> list[Row]:
 
     ours()
     rate = len(samples) / min(_seconds(ours) for _ in range(ROUNDS)) / 1e6
-    return [Row("AHRS in a batch", rate, "M updates/s", at_least=1.5)]
+    rows = [Row("AHRS in a batch", rate, "M updates/s", at_least=1.5)]
+    if not HAS_PEERS:
+        return rows
+    from vqf import VQF
+
+    rates, forces = samples.dtheta / samples.dt[:, None], samples.dv / samples.dt[:, None]
+
+    def theirs() -> None:
+        VQF(float(samples.dt[0])).updateBatch(rates, forces)
+
+    us, them = _alternate(ours, theirs)
+    speeds = f"{len(samples) / us / 1e6:.1f} M updates/s against {len(samples) / them / 1e6:.1f} M"
+    return [*rows, Row("AHRS: vqf / ours", them / us, at_least=1.0, detail=speeds)]
 
 
 def federated() -> list[Row]:
