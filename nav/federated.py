@@ -30,6 +30,10 @@ alone with a poor IMU follows a spoofer whose velocity grows slowly together wit
 and the sound receiver keeps that prediction with the IMU. Without aid in an outage ``full_reset`` is as good as one
 filter with every sensor; without resets nobody combines one filter's wind with another's heading.
 
+Weighting. ``normalised`` weakens a look before its detector condemns it: its variances become R / N with the weight of
+`nav.weighting.normalised_weights` (Zhou et al. 2025, Eq 22-26) from its own statistic and that of every other filter,
+each filter counting by the most suspect of its latest looks. A filter without one in the last seconds has no say.
+
 When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
 velocities are given up as in `nav.ins`, and the next fixes are believed.
 """
@@ -89,10 +93,12 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.weighting import InOrder, Policy, Weight, normalised_weights
 
 Structure = Literal["no_reset", "full_reset", "partial"]
 Sharing = Literal["fixed", "by_covariance", "none"]
 Combination = Literal["information", "scalar", "covariance_intersection"]
+Weighting = Literal["none", "normalised"]
 
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 LEAST_SHARE = 0.02  # of a filter when shares follow the covariances: it must be able to come back
@@ -112,7 +118,8 @@ class Config:
     """What the federation is told.
 
     ``literal`` takes the weights of the scalar combination from Zhu et al. 2020, Eq 13, as printed: they mix units, are
-    decided by the gyro biases and hardly react to a filter whose position is lost.
+    decided by the gyro biases and hardly react to a filter whose position is lost. It also takes the normalised weights
+    from Zhou et al. 2025, Eq 22-25, as printed: every R is multiplied by the number of filters when nothing is wrong.
     """
 
     imu: ImuModel
@@ -121,6 +128,7 @@ class Config:
     sharing: Sharing = "fixed"
     combination: Combination = "information"
     retention: float = 0.5  # alpha of ``partial``: 0 is no reset, 1 a full one
+    weighting: Weighting = "none"
     literal: bool = False
     fusion_period_s: float = 1.0  # at the first aiding epoch after this; 0 is at every one
     isolate_after: int = 3  # consecutive condemned looks
@@ -390,13 +398,29 @@ class Federated:
         weight, reason = 0.0, withheld
         if not withheld and not out:
             used = decision.axis_mask & ~watch.isolated if suspect else decision.axis_mask
-            weight, reason = filter_.take(self._reference, state, look, nu, S, used, watch.policy, t)
+            weight, reason = filter_.take(self._reference, state, look, nu, S, used, self._policy(filter_, watch), t)
         if out or watch.suspect:
             reason = ISOLATED
         elif decision.alarm and not withheld:
             reason = OUTSIDE
         threshold = decision.threshold if math.isclose(decision.statistic, nis, rel_tol=1e-6) else math.nan
         return UpdateReport(t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
+
+    def _policy(self, filter_: LocalFilter, watch: Watch) -> Policy | None:
+        """What becomes of R in the look that ``watch`` has just judged: its own policy, then the normalised weight."""
+        if self.config.weighting == "none":
+            return watch.policy
+        t = watch.judged
+        latest = [
+            max((w.suspicion for w in other.watches.values() if t - w.judged <= RECENT_S), default=math.inf)
+            for other in self.locals
+            if other is not filter_
+        ]
+        suspicions = np.array([watch.suspicion, *latest])
+        N = float(normalised_weights(suspicions, np.ones(len(suspicions)), literal=self.config.literal)[0])
+        if N == 1.0:
+            return watch.policy
+        return Weight(N) if watch.policy is None else InOrder([watch.policy, Weight(N)])
 
     def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
         """Innovation and covariance of a look against the fused solution of the healthy filters."""

@@ -431,7 +431,8 @@ class Watch:
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
     consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
-    ``suspect`` says that some axis is isolated, ``out`` that every one is.
+    ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
+    look over its threshold, infinite when there is none; ``judged`` the time of that look [s].
     """
 
     def __init__(
@@ -441,12 +442,15 @@ class Watch:
         self._isolate_after, self._readmit_after = isolate_after, readmit_after
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
+        self.suspicion, self.judged = 0.0, -math.inf
         self._bad, self._good = np.zeros(size), np.zeros(size)
         self._clean = True
 
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
         decision = self.detector.step(nu, S, t)
+        ratio = decision.statistic / decision.threshold
+        self.suspicion, self.judged = max(ratio, 0.0) if ratio == ratio else math.inf, t
         if not decision.alarm and self._clean:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated

@@ -339,6 +339,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
             sharing=config.sharing,
             combination=config.combination,
             retention=config.retention,
+            weighting=config.weighting,
             literal=config.literal,
             fusion_period_s=config.fusion_period_s,
             isolate_after=config.isolate_after,

@@ -58,8 +58,8 @@ AIDS: Mapping[str, frozenset[str]] = {
 OWN_KEYS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         (
-            "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
-            "readmit_after",
+            "locals", "structure", "sharing", "combination", "retention", "weighting", "fusion_period_s",
+            "isolate_after", "readmit_after",
         ),
         ("federated",),
     ),
@@ -230,11 +230,16 @@ class EstimatorConfig(Section):
     sharing: Literal["fixed", "by_covariance", "none"] = "fixed"
     combination: Literal["information", "scalar", "covariance_intersection"] = "information"
     retention: float = Field(default=0.5, ge=0, le=1, description="of a partial reset: 0 is none, 1 a full one")
+    weighting: Literal["none", "normalised"] = Field(
+        default="none", description="normalised: a sample counts for less the nearer its detector is to an alarm"
+    )
     fusion_period_s: float = Field(default=1.0, ge=0, le=60)
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
     literal: bool = Field(
-        default=False, description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13"
+        default=False,
+        description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13; Zhou et al. 2025,"
+        " equations 22-25",
     )
 
     @model_validator(mode="before")
