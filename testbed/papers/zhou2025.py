@@ -12,19 +12,17 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nav.detection import ChiSquare, Detector, Glr, Reset, Sprt, eq20, exponential, glr_false_alarm
 from nav.samples import Array
 from testbed import loop, metrics
+from testbed.data import write_file
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report import COLOURS, FAULT
 from testbed.sensors.noise import stream
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 P = 1e-3  # false alarms and missed ones, per look
 STEP, GAP, RAMP = (40.0, 60.0), (60.0, 90.0), (90.0, 130.0)
@@ -34,10 +32,19 @@ SCORED_S, DURATION_S = 150.0, 216.0  # nothing is scored later
 RATES = (1, 5, 10)  # [Hz]
 BATCH, BATCHES = 50, 10  # seeds
 ONSET = 10.0  # evidence at which the likelihood ratio alarms, window full [nats]
-DRAWN = 5  # [Hz]
 
-FUSION_SEEDS = 20
-DRAWN_HZ = 2.0
+MAIN_RATE = 5  # [Hz] of what the paper's figures are compared with
+RECORD_HZ = 2.0
+
+FKF = "fkf"
+LABELS = {FKF: "traditional", "improved": "SPRT", "glr": "likelihood ratio", "literal": "weights as printed"}
+PRINTED, STEEP, HEALTHY = "ramp as printed", "ramp 0.1 sigma/s", "healthy"
+CASES: Mapping[str, Sequence[str]] = {
+    PRINTED: (),
+    STEEP: ("fault[2].slope=0.1", "fault[3].slope=0.1"),
+    HEALTHY: ("fault=[]",),
+}
+SEEDS = {PRINTED: 50, STEEP: 20, HEALTHY: 30}
 
 CHI2, FADING, FAST, COMPLETE, GLR = "chi-square", "fading", "fast reset", "complete reset", "likelihood ratio"
 FAST_EQ20, COMPLETE_EQ20, COMPLETE_N = "fast reset, Eq 20", "complete reset, Eq 20", "complete reset, Eq 17"
@@ -59,6 +66,10 @@ BUILD: Mapping[str, Callable[[int], Detector]] = {
     COMPLETE_EQ20: lambda rate: Sprt(P, eq20(0.9), Reset.COMPLETE, literal=True),
     COMPLETE_N: lambda rate: Sprt(P, _mean(rate), Reset.COMPLETE, literal=True),
 }
+
+MAIN = (CHI2, FADING, FAST, COMPLETE, GLR)
+# What Table 2 says is missed of each fault [s]; it has no likelihood ratio.
+TABLE_2 = {"hard": (0.0, 1.2, 1.2, 1.2, math.nan), "soft": (20.4, 9.2, 7.8, 1.5, math.nan)}
 
 
 class Hard(NamedTuple):
@@ -125,12 +136,9 @@ def replay(name: str, rate: int, first_seed: int, seeds: int) -> dict[str, Any]:
         assert step is not None
         gap = during(t[:start], GAP)
         end_lag = STEP[1] - STEP[0] if math.isnan(step.end_lag) else step.end_lag
-        hard.append(
-            Hard(
-                float(alarms[t[:start] < STEP[0] - 1e-9].mean()), step.delay, step.coverage, end_lag,
-                float(alarms[gap].mean()), float(statistics[gap].min()),
-            )  # fmt: skip
-        )
+        false_alarms, after = float(alarms[t[:start] < STEP[0] - 1e-9].mean()), float(alarms[gap].mean())
+        lowest = float(statistics[gap].min())
+        hard.append(Hard(false_alarms, step.delay, step.coverage, end_lag, after, lowest))
         for slope in SLOPES:
             later = t[start:]
             found, _, _ = watch(copy.deepcopy(detector), later, r[start:] + ramp(later, slope))
@@ -139,3 +147,263 @@ def replay(name: str, rate: int, first_seed: int, seeds: int) -> dict[str, Any]:
             end_lag = SCORED_S - RAMP[1] if math.isnan(score.end_lag) else score.end_lag
             soft[slope].append(Soft(score.delay, score.sustained_delay, score.coverage, end_lag))
     return {"detector": name, "rate": rate, "hard": hard, "soft": soft}
+
+
+# --- fusion on the square circuit
+
+
+def fly(case: str, seed: int) -> dict[str, Any]:
+    """One run: by estimator the RMSE north and east [m], the mean of the horizontal 1-sigma that it claims [m].
+
+    Of the first seed also the errors over time, for the figure.
+    """
+    result = loop.run(
+        scenario("zhou2025", [*CASES[case], f"seed={seed}", "record.imu=false", f"record.rate_hz={RECORD_HZ}"])
+    )
+    found: dict[str, Any] = {"case": case, "seed": seed, "rmse": {}, "sigma": {}, "errors": {}}
+    for name in LABELS:
+        e = metrics.errors(result.dataset, name, 0.0)
+        found["rmse"][name] = [float(np.sqrt(np.mean(e.position[:, axis] ** 2))) for axis in (0, 1)]
+        found["sigma"][name] = float(np.mean(e.sigma_position[:, :2]))
+        if seed == 1:
+            found["errors"][name] = e.position[:, :2].tolist()
+    return found
+
+
+def jobs() -> Iterator[Job]:
+    """Batches of seeds for each detector and rate, one run for each case and seed."""
+    for case, seeds in SEEDS.items():
+        for seed in range(1, seeds + 1):
+            yield Job(fly, (case, seed))
+    for rate in RATES:
+        for name in BUILD if rate == MAIN_RATE else MAIN:
+            for batch in range(BATCHES):
+                yield Job(replay, (name, rate, 1 + batch * BATCH, BATCH))
+
+
+# --- what comes out
+
+
+class Found:
+    """The results, sorted."""
+
+    def __init__(self, results: Sequence[Any]) -> None:
+        self._flights = [r for r in results if "case" in r]
+        self._replays = [r for r in results if "detector" in r]
+
+    def hard(self, name: str, field: str, rate: int = MAIN_RATE) -> list[float]:
+        """Mean of one field of `Hard` in each batch."""
+        index = Hard._fields.index(field)
+        return [_mean_of(row[index] for row in r["hard"]) for r in self._of(name, rate)]
+
+    def soft(self, name: str, field: str, slope: float, rate: int = MAIN_RATE) -> list[float]:
+        """Mean of one field of `Soft` over the seeds of each batch that have one."""
+        index = Soft._fields.index(field)
+        return [_mean_of(row[index] for row in r["soft"][slope]) for r in self._of(name, rate)]
+
+    def _of(self, name: str, rate: int) -> list[Any]:
+        return [r for r in self._replays if r["detector"] == name and r["rate"] == rate]
+
+    def rmse(self, case: str, name: str) -> Array:
+        """RMSE (seeds, 2) north and east [m]."""
+        return np.array([r["rmse"][name] for r in self._flights if r["case"] == case])
+
+    def ratio(self, case: str, name: str) -> Array:
+        """RMSE over all seeds, relative to the traditional filter's, (2,) north and east."""
+        square = [np.mean(self.rmse(case, one) ** 2, axis=0) for one in (name, FKF)]
+        ratio: Array = np.sqrt(square[0] / square[1])
+        return ratio
+
+    def sigma(self, case: str, name: str) -> list[float]:
+        """The 1-sigma that it claims, relative to the traditional filter's, by seed."""
+        return [r["sigma"][name] / r["sigma"][FKF] for r in self._flights if r["case"] == case]
+
+    def errors(self, case: str, name: str) -> Array:
+        """Errors (n, 2) north and east of the first seed [m]."""
+        return next(np.array(r["errors"][name]) for r in self._flights if r["case"] == case and r["seed"] == 1)
+
+
+def _mean_of(values: Any) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return math.fsum(known) / len(known) if known else math.nan
+
+
+def conclude(results: Sequence[Any]) -> list[Claim]:
+    """Detectors by means over batches of seeds, fusion by the RMSE over all seeds."""
+    found = Found(results)
+    return [*_hard_claims(found), *_soft_claims(found), *_false_alarm_claims(found), *_fusion_claims(found)]
+
+
+def _hard_claims(found: Found) -> Iterator[Claim]:
+    target = {1: 1.0, 5: 0.2, 10: 0.2}  # one look at 1 Hz
+    for rate in RATES:
+        for name, paper in ((COMPLETE, "1.2"), (GLR, "1.2 (complete reset)")):
+            what = f"hard fault at {rate} Hz, {name}"
+            yield Claim(f"{what}: delay", "s", paper, found.hard(name, "delay", rate), 1.2, target=target[rate])
+            yield Claim(f"{what}: end lag", "s", "0", found.hard(name, "end_lag", rate), 0.2)
+    # Near a mean of all looks: after n healthy ones k of size a tell when (k a)^2 / (2 (n + k)) = T
+    T, n = math.log((1 - P) / P), STEP[0] * MAIN_RATE
+    slowest = (T + math.sqrt(T * T + 2 * T * n * SIZE**2)) / SIZE**2 / MAIN_RATE
+    yield Claim(
+        f"hard fault at 5 Hz, {COMPLETE_EQ20}: delay", "s", "1.2", found.hard(COMPLETE_EQ20, "delay"), slowest,
+        impossible="the mean of Eq 20 holds the 40 s before the fault: 1.2 s would take 15 Hz, and the GNSS has 1 Hz",
+    )  # fmt: skip
+    yield Claim("hard fault, chi-square: delay", "s", "0", found.hard(CHI2, "delay"), 0.2)
+    yield Claim(f"hard fault, {FADING}: delay", "s", "1.2", found.hard(FADING, "delay"), 1.2)
+    yield Claim(f"hard fault, {FADING}: end lag", "s", "7.6", found.hard(FADING, "end_lag"), 5.0, at_least=True)
+    yield Claim(f"hard fault, {FAST}: end lag", "s", "0", found.hard(FAST, "end_lag"), 0.2)
+    for name in (FAST, FAST_EQ20):
+        lowest = found.hard(name, "lowest")
+        yield Claim(f"after the hard fault, {name}: lowest evidence", "", "below zero", lowest, 0.0, worst=True)
+
+
+def _soft_claims(found: Found) -> Iterator[Claim]:
+    low, high = SLOPES
+    for name in (COMPLETE, COMPLETE_EQ20, COMPLETE_N):
+        covered = found.soft(name, "coverage", high)
+        yield Claim(f"ramp 0.1 sigma/s, {name}: coverage", "", "0.96", covered, 0.45, at_least=True)
+    covered = found.soft(GLR, "coverage", high)
+    yield Claim(f"ramp 0.1 sigma/s, {GLR}: coverage", "", "0.96 (complete reset)", covered, 0.74, at_least=True)
+    evidence = MAIN_RATE * high**2 * 1.5**3 / 6
+    yield Claim(
+        f"ramp 0.1 sigma/s, {GLR}: delay", "s", "1.5 (complete reset)", found.soft(GLR, "delay", high), 10.5,
+        impossible=f"the looks of 1.5 s hold {evidence:.2f} nats of evidence, and the false alarms ask for {ONSET:g}",
+    )  # fmt: skip
+    glr, fading, fast = (found.soft(name, "delay", high) for name in (GLR, FADING, FAST))
+    chi2 = found.soft(CHI2, "sustained", high)
+    yield Claim(f"ramp 0.1 sigma/s, {GLR} before {FADING} by", "s", "", _less(fading, glr), 0.0, at_least=True)
+    yield Claim(
+        f"ramp 0.1 sigma/s, {FADING} before {CHI2} (sustained) by", "s", "11.2", _less(chi2, fading), 0.0, at_least=True
+    )
+    complete = found.soft(COMPLETE, "delay", high)
+    yield Claim(f"ramp 0.1 sigma/s, {COMPLETE} before {FADING} by", "s", "7.7", _less(fading, complete), 0.0, True)
+    yield Claim(f"ramp 0.1 sigma/s, {COMPLETE} before {FAST} by", "s", "6.3", _less(fast, complete), 0.0, True)
+    literal = _less(found.soft(FAST_EQ20, "delay", high), found.soft(COMPLETE_EQ20, "delay", high))
+    yield Claim("ramp 0.1 sigma/s, both with Eq 20: complete before fast reset by", "s", "6.3", literal, 6.3, True)
+    expected = (6 * ONSET / (MAIN_RATE * low**2)) ** (1 / 3)
+    ratio = [delay / expected for delay in found.soft(GLR, "delay", low)]
+    because = "0.02 sigma/s is 0.03 sigma after 1.5 s: no detector can see that before some 30 kHz"
+    what = f"ramp 0.02 sigma/s, {GLR}: delay over that of the expected evidence, {expected:.1f} s"
+    yield Claim(what, "", "0.05 (1.5 s, complete reset)", ratio, 1.05, impossible=because)
+    yield Claim(what, "", "0.05 (1.5 s, complete reset)", ratio, 0.75, at_least=True, impossible=because)
+
+
+def _less(later: Sequence[float], sooner: Sequence[float]) -> list[float]:
+    return [a - b for a, b in zip(later, sooner, strict=True)]
+
+
+def _false_alarm_claims(found: Found) -> Iterator[Claim]:
+    for rate in RATES:
+        for name in MAIN:
+            share = found.hard(name, "false_alarms", rate)
+            # chi-square has P by design: what chance makes of it in all looks
+            room = 3 * math.sqrt(P / (STEP[0] * rate * BATCH * BATCHES)) if name == CHI2 else 0.0
+            yield Claim(
+                f"alarms before the faults at {rate} Hz, {name}", "", "", [math.fsum(share) / len(share)], P + room
+            )
+            if name in (COMPLETE, FAST, GLR):
+                gap = found.hard(name, "gap", rate)
+                yield Claim(f"alarms between the faults at {rate} Hz, {name}", "", "0", gap, 0.01)
+    gap = found.hard(FADING, "gap")
+    yield Claim(f"alarms between the faults at {MAIN_RATE} Hz, {FADING}", "", "0.25", gap, 0.2, at_least=True)
+
+
+def _fusion_claims(found: Found) -> Iterator[Claim]:
+    paper = {"north": ("2.17", "1.10", "0.51 or 0.55", 0.55), "east": ("3.50", "2.25", "0.64", 0.65)}
+    for axis, (side, (fkf, improved, ratio, bound)) in enumerate(paper.items()):
+        plain = found.rmse(PRINTED, FKF)[:, axis]
+        yield Claim(f"{side} RMSE, improved", "m", improved, found.rmse(PRINTED, "improved")[:, axis].tolist(), 1.10)
+        yield Claim(f"{side} RMSE, traditional", "m", fkf, plain.tolist(), 0.0, at_least=True)
+        for case, name in ((PRINTED, "improved"), (PRINTED, "glr"), (STEEP, "improved"), (STEEP, "glr")):
+            what = f"{side} RMSE over the traditional, {case}, {LABELS[name]}"
+            yield Claim(what, "", ratio, [float(found.ratio(case, name)[axis])], bound, target=0.5 if not axis else 0.6)
+        for name in ("improved", "glr"):
+            what = f"{side} RMSE over the traditional, {HEALTHY}, {LABELS[name]}"
+            yield Claim(what, "", "", [float(found.ratio(HEALTHY, name)[axis])], 1.02)
+        what = f"{side} RMSE over the traditional, {HEALTHY}, weights as printed"
+        yield Claim(what, "", "", [float(found.ratio(HEALTHY, "literal")[axis])], 1.02, at_least=True)
+    claimed = found.sigma(HEALTHY, "literal")
+    yield Claim(f"claimed 1-sigma over the traditional, {HEALTHY}, weights as printed", "", "", claimed, 1.1, True)
+
+
+# --- figure
+
+
+def draw(results: Sequence[Any], out: Path) -> None:
+    """Statistics with thresholds and faults, Table 2 as bars, errors of both fusions: ``zhou2025.png``."""
+    import io
+
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    found = Found(results)
+    figure = Figure(figsize=(12, 7.4), dpi=80, layout="constrained")
+    FigureCanvasAgg(figure)
+    halves: Any = figure.subfigures(1, 2, width_ratios=(1.15, 1))
+    _draw_statistics(halves[0])
+    _draw_results(halves[1], found)
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    write_file(out / "zhou2025.png", data.getvalue())
+
+
+def _draw_statistics(figure: Any) -> None:
+    """One seed through the detectors, over the whole of the run."""
+    rows = figure.subplots(len(MAIN), 1, sharex=True)
+    t, r = residuals(MAIN_RATE, 1, DURATION_S)
+    for name, ax in zip(MAIN, rows, strict=True):
+        alarms, statistics, thresholds = watch(BUILD[name](MAIN_RATE), t, r + ramp(t, SLOPES[1]))
+        ax.axvspan(*STEP, color=FAULT, lw=0)
+        ax.axvspan(*RAMP, color=FAULT, lw=0)
+        ax.plot(t, statistics, color=COLOURS[0], lw=0.8)
+        ax.plot(t, thresholds, color="#000000", lw=0.9, ls="--")
+        reach = 5 * float(thresholds[-1])
+        ax.set_ylim(-0.8 * reach if name == FAST else -0.16 * reach, reach)
+        bottom = ax.get_ylim()[0]
+        ax.plot(t[alarms], np.full(alarms.sum(), 0.93 * bottom), "|", color=COLOURS[1], ms=5, mew=0.8)
+        ax.set_title(name, loc="left", fontsize=9, pad=2)
+        ax.grid(alpha=0.35, lw=0.6)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=8)
+    rows[0].set_xlim(0, DURATION_S)
+    rows[-1].set_xlabel("time [s]", fontsize=9)
+    figure.suptitle("Statistic, threshold (dashed), alarms (ticks); step 5 σ and ramp 0.1 σ/s at 5 Hz", fontsize=10)
+
+
+def _draw_results(figure: Any, found: Found) -> None:
+    """Table 2 as bars, and what the fusion makes of the faults."""
+    bars, north, east = figure.subplots(3, 1, height_ratios=(1.25, 1, 1))
+    place = np.arange(len(MAIN))
+    series = (
+        ("hard fault, paper", TABLE_2["hard"], COLOURS[4]),
+        ("hard fault, ours", [_mean_of(found.hard(name, "delay")) for name in MAIN], COLOURS[0]),
+        ("soft fault, paper", TABLE_2["soft"], COLOURS[5]),
+        ("soft fault 0.1 σ/s, ours", [_mean_of(found.soft(name, "sustained", SLOPES[1])) for name in MAIN], COLOURS[1]),
+    )
+    for k, (label, values, colour) in enumerate(series):
+        drawn = bars.bar(place + 0.2 * (k - 1.5), values, 0.2, color=colour, label=label)
+        bars.bar_label(drawn, [f"{v:.1f}" if v >= 0.05 else "0" if v == v else "" for v in values], fontsize=7)
+    bars.set_xticks(place, MAIN, fontsize=8)
+    bars.set_ylim(0, 45)
+    bars.set_ylabel("missed before [s]", fontsize=9)
+    bars.legend(fontsize=8, ncols=2, frameon=False, loc="upper right")
+    for axis, (side, ax) in enumerate((("north", north), ("east", east))):
+        ax.axvspan(*STEP, color=FAULT, lw=0)
+        ax.axvspan(*RAMP, color=FAULT, lw=0)
+        for k, name in ((1, FKF), (0, "improved"), (2, "glr")):
+            error = found.errors(STEEP, name)[:, axis]
+            t = np.arange(len(error)) / RECORD_HZ
+            ax.plot(t, error, color=COLOURS[k], lw=1, label=LABELS[name])
+        ax.set_ylabel(f"{side} error [m]", fontsize=9)
+        ax.set_xlim(0, DURATION_S)
+    north.legend(fontsize=8, ncols=3, frameon=False, loc="upper right")
+    north.set_xticklabels([])
+    east.set_xlabel("time [s]", fontsize=9)
+    for ax in (bars, north, east):
+        ax.grid(alpha=0.35, lw=0.6)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=8)
+    figure.suptitle("Table 2, and the position on the circuit", fontsize=10)
+
+
+PAPER = Paper("Zhou 2025: completely reset SPRT and adaptive normalised weights", lambda: list(jobs()), conclude, draw)
