@@ -311,9 +311,8 @@ def _false_alarm_claims(found: Found) -> Iterator[Claim]:
 def _fusion_claims(found: Found) -> Iterator[Claim]:
     paper = {"north": ("2.17", "1.10", "0.51 or 0.55", 0.55), "east": ("3.50", "2.25", "0.64", 0.65)}
     for axis, (side, (fkf, improved, ratio, bound)) in enumerate(paper.items()):
-        plain = found.rmse(PRINTED, FKF)[:, axis]
-        yield Claim(f"{side} RMSE, improved", "m", improved, found.rmse(PRINTED, "improved")[:, axis].tolist(), 1.10)
-        yield Claim(f"{side} RMSE, traditional", "m", fkf, plain.tolist(), 0.0, at_least=True)
+        what = f"{side} RMSE, improved (traditional: {np.mean(found.rmse(PRINTED, FKF)[:, axis]):.2f}; paper: {fkf})"
+        yield Claim(what, "m", improved, found.rmse(PRINTED, "improved")[:, axis].tolist(), float(improved))
         for case, name in ((PRINTED, "improved"), (PRINTED, "glr"), (STEEP, "improved"), (STEEP, "glr")):
             what = f"{side} RMSE over the traditional, {case}, {LABELS[name]}"
             yield Claim(what, "", ratio, [float(found.ratio(case, name)[axis])], bound, target=0.5 if not axis else 0.6)

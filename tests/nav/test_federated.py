@@ -10,7 +10,7 @@ from ins_world import CONSUMER, DEG, DT, FIELD_N, barometer, error, feed, flight
 from scipy.stats import chi2
 
 from nav.alignment import InitialState
-from nav.detection import ChiSquare, Eraim, Glr, Reset, Sprt, exponential
+from nav.detection import ChiSquare, Decision, Eraim, Event, Glr, Reset, Sprt, exponential
 from nav.error_model import POS, VEL
 from nav.federated import (
     Config,
@@ -26,6 +26,7 @@ from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
 from nav.samples import BarometerSample, FixType, ImuSamples, Status
+from nav.weighting import Weight
 
 INFORMATION = Config(CONSUMER, (Local("only", ()),))
 SCALAR = Config(CONSUMER, (Local("only", ()),), sharing="none", combination="scalar")
@@ -468,6 +469,67 @@ def test_nothing_of_the_spoofed_fixes_stays():
     apart = np.abs(federated.local("one")[0][POS : POS + 3] - federated.local("two")[0][POS : POS + 3])
     assert apart[0] < 1.0  # after 20 s, in which the spoofed receiver went 10 m
     assert math.sqrt(federated.local("one")[1][POS, POS]) > math.sqrt(federated.local("two")[1][POS, POS])
+
+
+class Suspects:
+    """A detector that suspects every look alike: statistic over threshold is ``ratio``; it never alarms."""
+
+    def __init__(self, ratio):
+        self.ratio = ratio
+
+    def step(self, nu, S, t):
+        return Decision(False, 8.0 * self.ratio, 8.0, np.full(len(nu), True), Event.NONE)
+
+
+def weights_of(reports, after):
+    """{sensor: the weights of its looks after a time}."""
+    found = {}
+    for r in reports:
+        if r.t > after and not r.reason:
+            found.setdefault(r.sensor, set()).add(round(r.weight, 6))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("ratios", "options", "expected"),
+    [
+        ((0.5, 0.0), {}, (0.5, 1.0)),  # B = 0.5 and 1, over the larger
+        ((0.6, 0.2), {}, (0.5, 1.0)),
+        ((0.5, 0.5), {}, (1.0, 1.0)),  # alike: nobody is weakened
+        ((-3.0, 0.5), {}, (1.0, 0.5)),  # evidence below zero makes nobody sounder than sound
+        ((0.5, 0.0), {"weighting": "none"}, (1.0, 1.0)),
+        ((0.0, 0.0), {"literal": True}, (0.5, 0.5)),  # as printed: both weakened though nothing is wrong
+    ],
+)
+def test_normalised_weights_of_two_receivers(ratios, options, expected):
+    _, increments, one, two, others = world(50)
+    pair = tuple(
+        Local(name, (Watched(GnssAid(name), lambda ratio=ratio: Suspects(ratio)),))
+        for name, ratio in zip(("gnss", "gnss2"), ratios, strict=True)
+    )
+    magnetic = tuple(s for s in others if s.sensor == "magnetometer")  # for the alignment
+    config = Config(CONSUMER, pair, alignment_aids=(MagnetometerAid(),), **({"weighting": "normalised"} | options))
+    _, _, reports = fly(config, one + two + list(magnetic), increments)
+    assert weights_of(reports, 20.0) == {"gnss": {expected[0]}, "gnss2": {expected[1]}}
+
+
+def test_a_weight_needs_somebody_to_compare_with_and_comes_after_the_own_policy():
+    """A sensor left alone is not weakened short of its limit; a suspect part speaks for the whole of its filter."""
+    _, increments, one, two, others = world(50)
+    locals_ = (
+        Local("one", (Watched(GnssAid(), lambda: Suspects(0.5), lambda: Weight(0.5)),)),
+        Local(
+            "two", (Watched(GnssAid("gnss2"), lambda: Suspects(0.0)), Watched(BarometerAid(), lambda: Suspects(0.3)))
+        ),
+    )
+    two = [fix for fix in two if fix.t < 30]
+    baro = [s for s in others if s.sensor == "barometer" and s.t < 30]
+    magnetic = [s for s in others if s.sensor == "magnetometer"]
+    config = Config(CONSUMER, locals_, weighting="normalised", alignment_aids=(MagnetometerAid(),))
+    _, _, reports = fly(config, one + two + baro + magnetic, increments)
+    together = [r for r in reports if 20 < r.t < 30]
+    assert weights_of(together, 0) == {"gnss": {round(0.5 * 0.5 / 0.7, 6)}, "gnss2": {1.0}, "barometer": {1.0}}
+    assert weights_of(reports, 33) == {"gnss": {0.5}}
 
 
 def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
