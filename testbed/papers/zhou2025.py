@@ -44,6 +44,11 @@ CASES: Mapping[str, Sequence[str]] = {
     STEEP: ("fault[2].slope=0.1", "fault[3].slope=0.1"),
     HEALTHY: ("fault=[]",),
 }
+FLOWN: Mapping[str, Sequence[str]] = {
+    PRINTED: (FKF, "improved"),
+    STEEP: (FKF, "improved", "glr"),
+    HEALTHY: (FKF, "improved", "glr", "literal"),
+}
 SEEDS = {PRINTED: 50, STEEP: 20, HEALTHY: 30}
 
 CHI2, FADING, FAST, COMPLETE, GLR = "chi-square", "fading", "fast reset", "complete reset", "likelihood ratio"
@@ -157,11 +162,11 @@ def fly(case: str, seed: int) -> dict[str, Any]:
 
     Of the first seed also the errors over time, for the figure.
     """
-    result = loop.run(
-        scenario("zhou2025", [*CASES[case], f"seed={seed}", "record.imu=false", f"record.rate_hz={RECORD_HZ}"])
-    )
+    whole = scenario("zhou2025", [*CASES[case], f"seed={seed}", "record.imu=false", f"record.rate_hz={RECORD_HZ}"])
+    flown = tuple(estimator for estimator in whole.estimator if estimator.name in FLOWN[case])
+    result = loop.run(whole.model_copy(update={"estimator": flown}))
     found: dict[str, Any] = {"case": case, "seed": seed, "rmse": {}, "sigma": {}, "errors": {}}
-    for name in LABELS:
+    for name in FLOWN[case]:
         e = metrics.errors(result.dataset, name, 0.0)
         found["rmse"][name] = [float(np.sqrt(np.mean(e.position[:, axis] ** 2))) for axis in (0, 1)]
         found["sigma"][name] = float(np.mean(e.sigma_position[:, :2]))
@@ -313,7 +318,7 @@ def _fusion_claims(found: Found) -> Iterator[Claim]:
     for axis, (side, (fkf, improved, ratio, bound)) in enumerate(paper.items()):
         what = f"{side} RMSE, improved (traditional: {np.mean(found.rmse(PRINTED, FKF)[:, axis]):.2f}; paper: {fkf})"
         yield Claim(what, "m", improved, found.rmse(PRINTED, "improved")[:, axis].tolist(), float(improved))
-        for case, name in ((PRINTED, "improved"), (PRINTED, "glr"), (STEEP, "improved"), (STEEP, "glr")):
+        for case, name in ((PRINTED, "improved"), (STEEP, "improved"), (STEEP, "glr")):
             what = f"{side} RMSE over the traditional, {case}, {LABELS[name]}"
             yield Claim(what, "", ratio, [float(found.ratio(case, name)[axis])], bound, target=0.5 if not axis else 0.6)
         for name in ("improved", "glr"):
