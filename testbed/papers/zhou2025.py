@@ -387,7 +387,7 @@ def _draw_results(figure: Any, found: Found) -> None:
     for k, (label, values, colour) in enumerate(series):
         drawn = bars.bar(place + 0.2 * (k - 1.5), values, 0.2, color=colour, label=label)
         bars.bar_label(drawn, [f"{v:.1f}" if v >= 0.05 else "0" if v == v else "" for v in values], fontsize=7)
-    bars.set_xticks(place, MAIN, fontsize=8)
+    bars.set_xticks(place, [name.replace(" ", "\n") for name in MAIN], fontsize=8)
     bars.set_ylim(0, 45)
     bars.set_ylabel("missed before [s]", fontsize=9)
     bars.legend(fontsize=8, ncols=2, frameon=False, loc="upper right")
