@@ -497,7 +497,7 @@ class Federated:
         self._reference.correct(state, master.x)
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
-        """The estimate at ``t`` from a ``state`` of its own; ``weights`` are those that the filters have in it."""
+        """The estimate at ``t`` from a ``state`` of its own."""
         status = Status.ALIGNING if state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE
@@ -513,8 +513,6 @@ class Federated:
             for name, where in self.model.slices.items()
             if where.start < self._common and name not in REPORTED
         }
-        if self.config.combination != "information":
-            extra["weights"] = master.weights, np.zeros(len(self.locals))
         for name, row, where in self._extra:
             extra[name] = (state.x[row, where].copy(), np.sqrt(state.P[row, where, where].diagonal()))
         return describe(state, imu, master.P, self.model, t, status, covariance, sigma, extra)
