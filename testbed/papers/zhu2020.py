@@ -47,6 +47,7 @@ COMMON = 15  # states that the local filters share
 P_N, P_E, V_N, V_E, HEADING = 0, 1, 3, 4, 8  # columns of errors
 LIMIT = chi_square_threshold(0.01, 2)
 CASES = 4000
+WEIGHTS = (weights_by_covariance, weights_eq13)
 
 
 class Flown(NamedTuple):
@@ -64,10 +65,11 @@ class Flown(NamedTuple):
 def fly(run: str, seed: int) -> dict[str, Flown]:
     """Every estimator of one of `RUNS`, by name."""
     name, overrides = RUNS[run]
-    return _fly(scenario(name, overrides), seed)
+    return navigate(scenario(name, overrides), seed)
 
 
-def _fly(chosen: Scenario, seed: int) -> dict[str, Flown]:
+def navigate(chosen: Scenario, seed: int) -> dict[str, Flown]:
+    """Every estimator of a scenario, by name, all of them started with the same errors."""
     rate = round(chosen.truth.rate_hz)
     source = loop.motion(chosen, seed)
     sensed = {name: sensors.build(name, config, rate, seed, chosen.site()) for name, config in chosen.sensors.items()}
@@ -84,7 +86,7 @@ def _fly(chosen: Scenario, seed: int) -> dict[str, Flown]:
         due = wanted[(wanted >= first) & (wanted < first + len(truth))] - first
         for name, one in filters.items():
             if first == 0 and one.handover is not None:
-                replace(one.handover, random=stream(seed, "zhu2020", "handover")).take_over(truth)  # all alike
+                replace(one.handover, random=stream(seed, "zhu2020", "handover")).take_over(truth)
             handed = [sample for aid in one.sensors for sample in samples[aid]]
             _, found = one.horizon.track(one.in_body_axes(samples[one.imu]), handed, truth.t[due].tolist())
             lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in found]).T
@@ -101,7 +103,7 @@ def _fly(chosen: Scenario, seed: int) -> dict[str, Flown]:
             assert isinstance(federated, Federated)
             if len(federated.locals) == 2:
                 P = np.stack([federated.local(local.name)[1][:COMMON, :COMMON] for local in federated.config.locals])
-                weights[name].append(np.array([weigh(P, COMMON, np.ones(2)) for weigh in _WEIGHTS]))
+                weights[name].append(np.array([weigh(P, COMMON, np.ones(2)) for weigh in WEIGHTS]))
     second = np.flatnonzero(wanted % rate == 0)
     at = np.searchsorted(wanted, wrong)
     flown = {}
@@ -111,9 +113,6 @@ def _fly(chosen: Scenario, seed: int) -> dict[str, Flown]:
         step = np.abs(error[at] - error[at - 1]) / sigma[at]
         flown[name] = Flown(error[second], step, betas[:, 0, 1], betas[:, 1, 1])
     return flown
-
-
-_WEIGHTS = (weights_by_covariance, weights_eq13)
 
 
 def solve(seed: int) -> dict[str, float]:

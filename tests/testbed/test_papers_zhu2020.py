@@ -82,7 +82,7 @@ def test_a_gross_error_can_be_left_out() -> None:
 
 
 def test_a_wrong_fix_moves_the_robust_filter_by_less_than_a_sigma() -> None:
-    flown = zhu2020._fly(scenario("zhu2020", SHORT), 3)
+    flown = zhu2020.navigate(scenario("zhu2020", SHORT), 3)
     assert set(flown) == {"frkf", "tfkf"}
     robust, plain = flown["frkf"], flown["tfkf"]
     assert robust.error.shape == (321, 9)
