@@ -88,7 +88,8 @@ def navigate(chosen: Scenario, seed: int) -> dict[str, Flown]:
             if first == 0 and one.handover is not None:
                 replace(one.handover, random=stream(seed, "zhu2020", "handover")).take_over(truth)
             handed = [sample for aid in one.sensors for sample in samples[aid]]
-            _, found = one.horizon.track(one.in_body_axes(samples[one.imu]), handed, truth.t[due].tolist())
+            increments, _ = one.increments(samples)
+            _, found = one.horizon.track(increments, handed, truth.t[due].tolist())
             lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in found]).T
             error = np.column_stack(
                 [
