@@ -176,6 +176,14 @@ class ChiSquare:
         return self._alarm.decide(self.statistic(gamma2), chi_square_threshold(self.false_alarm, m), m, sound)
 
 
+class Never:
+    """No alarm, whatever comes: for a sensor whose measurement policy alone shall answer (`nav.weighting`)."""
+
+    def step(self, nu: Array, S: Array, t: float) -> Decision:
+        """Judge one look; see `Detector`."""
+        return Decision(False, whiten(nu, S)[1], math.inf, _every_axis(len(nu)), Event.NONE)
+
+
 @dataclass
 class Eraim:
     """`ChiSquare`, and on alarm the axis of the largest w-test goes, again and again, until the rest passes.

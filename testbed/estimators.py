@@ -7,7 +7,7 @@ A filter knows the datasheets, never the errors that were drawn from them. Terms
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,19 +15,20 @@ import numpy as np
 
 from nav.ahrs import Ahrs, AhrsConfig
 from nav.alignment import InitialState
-from nav.detection import ChiSquare, Detector, Eraim, Glr, Reset, Sprt, exponential
+from nav.detection import ChiSquare, Detector, Eraim, Glr, Never, Reset, Sprt, exponential
 from nav.earth import STANDARD_GRAVITY, radii, wrap_longitude
 from nav.error_model import ImuModel
 from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
 from nav.ins import AIDS as INS_AIDS
 from nav.ins import Ins, InsConfig
-from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid, Watched
+from nav.local_filter import Aid, BodyVelocityAid, Policy, PositionFixAid, StarAid, Watched
 from nav.motion import LowDynamics
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_rotate
 from nav.samples import Array, ImuSamples, UpdateReport
 from nav.voting import Voter
-from testbed.scenario import DetectorConfig, EstimatorConfig, Scenario
+from nav.weighting import MahalanobisInflation
+from testbed.scenario import DetectorConfig, EstimatorConfig, PolicyConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -326,7 +327,9 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
     local_filters = tuple(
         Local(
             local.name,
-            tuple(Watched(aids[name], partial(_detector, local.detector)) for name in local.aids),
+            tuple(
+                Watched(aids[name], partial(_detector, local.detector), _policy(local.policy)) for name in local.aids
+            ),
             local.share,
         )
         for local in config.locals
@@ -371,6 +374,15 @@ def _detector(config: DetectorConfig) -> Detector:
             return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, mean, Reset(config.reset))
         case "glr":
             return Glr(config.false_alarm or GATHERED_FALSE_ALARM, config.window_s)
+        case "none":
+            return Never()
+
+
+def _policy(config: PolicyConfig | None) -> Callable[[], Policy] | None:
+    """What makes the measurement policy of a sensor, as the scenario says."""
+    if config is None:
+        return None
+    return partial(MahalanobisInflation, config.false_alarm, config.reject_above or math.inf)
 
 
 def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:

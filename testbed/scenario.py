@@ -159,7 +159,7 @@ def _sensor(table: object) -> Section:
 class DetectorConfig(Section):
     """What judges the samples of a local filter; ``false_alarm`` is the probability per look (`nav.detection`)."""
 
-    kind: Literal["chi_square", "eraim", "sprt", "glr"] = "chi_square"
+    kind: Literal["chi_square", "eraim", "sprt", "glr", "none"] = "chi_square"
     false_alarm: float | None = Field(default=None, gt=0, lt=0.5)
     forgetting: float = Field(default=0.95, gt=0, lt=1, description="sprt: what a look leaves of the weight before it")
     reset: Literal["none", "fast", "complete"] = "complete"
@@ -170,7 +170,20 @@ class DetectorConfig(Section):
         for key, kind in (("forgetting", "sprt"), ("reset", "sprt"), ("window_s", "glr")):
             if key in self.model_fields_set and kind != self.kind:
                 raise ValueError(f"{key} is a key of kind {kind!r}, not of {self.kind!r}: leave it out")
+        if self.kind == "none" and self.false_alarm is not None:
+            raise ValueError("false_alarm is no key of kind 'none', which condemns nothing: leave it out")
         return self
+
+
+class PolicyConfig(Section):
+    """What becomes of the variances of a sample that the detector has let pass (`nav.weighting`).
+
+    ``inflate`` makes a suspect sample's R so large that its distance is at the limit (`MahalanobisInflation`).
+    """
+
+    kind: Literal["inflate"]
+    false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="of the limit, probability per look")
+    reject_above: float | None = Field(default=None, gt=0, description="squared distance to leave out; none: never")
 
 
 class LocalConfig(Section):
@@ -180,6 +193,7 @@ class LocalConfig(Section):
     aids: Annotated[tuple[str, ...], Field(min_length=1)]
     share: float | None = Field(default=None, gt=0, le=1, description="of the information; all alike without")
     detector: DetectorConfig = DetectorConfig()
+    policy: PolicyConfig | None = Field(default=None, description="what it does to R; none: R is as told")
 
 
 class HandoverConfig(Section):
