@@ -126,7 +126,7 @@ def _scored(t: Array, alarm: metrics.Mask, window: metrics.Window) -> tuple[floa
 
 
 def replay(kind: Callable[[float], Detector], count: int) -> list[float]:
-    """Delays of a detector on white residuals of three axes: 60 sound looks, then 30 with one sigma more on one axis."""
+    """Delays of a detector on white residuals of three axes, 60 sound looks and 30 with one sigma more on one axis."""
     random = np.random.default_rng(2022)
     t, window = np.arange(90.0), (60.0, 90.0)
     delays = []
