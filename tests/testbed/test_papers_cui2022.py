@@ -38,14 +38,15 @@ def flights() -> list[Any]:
     return [
         cui2022.replay(Eraim, 50),
         cui2022.replay(Glr, 50),
-        cui2022.fly(3, True, True),
-        cui2022.fly(3, False, False),
+        cui2022.fly(3, (), True),
+        cui2022.fly(3, (*cui2022.HEALTHY, "duration_s=400"), False),
     ]
 
 
 def test_the_motion_is_the_paper_s(shipped: Scenario) -> None:
-    source = motion(shipped, 1)
-    block = source.advance(1200 * 200 + 1)
+    slow = papers.scenario("cui2022", ["truth.rate_hz=50", "sensors.imu.rate_hz=50"])
+    block = motion(slow, 1).advance(1200 * 50 + 1)
+    assert shipped.duration_s == block.t[-1]
     t, speed = block.t, np.linalg.norm(block.v_n, axis=1)
     assert speed[0] == pytest.approx(100)
     assert speed[t == 150.0][0] == pytest.approx(150, abs=0.1)
@@ -56,14 +57,14 @@ def test_the_motion_is_the_paper_s(shipped: Scenario) -> None:
 
 
 def test_the_faults_are_table_2(shipped: Scenario) -> None:
-    """In metres from arcminutes by an independent ellipsoid."""
+    """In metres from arcminutes, of 1852 m each, within what the ellipsoid makes of them."""
     by_name = {fault.name: fault for fault in shipped.fault}
     lat, lon, h = math.radians(34.0), math.radians(108.0), 1000.0
     arcmin = math.radians(1 / 60)
     _, east, _ = pymap3d.geodetic2ned(lat, lon + 0.3 * arcmin, h, lat, lon, h, deg=False)
     north, _, _ = pymap3d.geodetic2ned(lat + 1e-3 * arcmin, lon, h, lat, lon, h, deg=False)
-    assert by_name["longitude"].size == pytest.approx(east, rel=3e-3)  # type: ignore[union-attr]
-    assert by_name["latitude"].coefficient == pytest.approx(0.8 * north, rel=3e-3)  # type: ignore[union-attr]
+    assert by_name["longitude"].size == pytest.approx(east, rel=5e-3)  # type: ignore[union-attr]
+    assert by_name["latitude"].coefficient == pytest.approx(0.8 * north, rel=5e-3)  # type: ignore[union-attr]
     windows = {"longitude": (20, 50), "latitude": (100, 140), "east_velocity": (300, 330),
                "doppler_velocity": (500, 540), "height": (600, 650), "north_velocity": (1000, 1060)}  # fmt: skip
     assert {fault.name: fault.window for fault in shipped.fault} == windows
@@ -80,7 +81,7 @@ def test_a_body_that_never_turns_keeps_its_gyro_bias() -> None:
 
 def test_turn_rate_and_recall_reach_the_filters(shipped: Scenario) -> None:
     config = build(shipped, 1)["with_star"].horizon.estimator.config  # type: ignore[union-attr]
-    assert config.recall_s == 20.0
+    assert config.recall_s == 10.0
     assert math.degrees(config.imu.gyro_bias_sigma) * 3600 == pytest.approx(math.hypot(0.01, 0.005), rel=0.02)
 
 
@@ -99,7 +100,7 @@ def test_one_flight(flights: list[Any]) -> None:
     assert np.max(faulty["with_star"]["largest"]["attitude"]) < 6
     assert faulty["with_star"]["scores"]["missed.east_velocity"] == 1
     assert faulty["kept"] == pytest.approx(1.0)
-    assert healthy["with_star"]["refused"] == (0, 0, 4804)
+    assert healthy["with_star"]["refused"] == (0, 0, 1604)
 
 
 def test_claims_can_fail(flights: list[Any]) -> None:
@@ -113,7 +114,7 @@ def test_claims_can_fail(flights: list[Any]) -> None:
     scores["isolation_correct.latitude"] = 0.0
     spoilt[2]["with_star"]["largest"]["velocity"][2] = 0.6
     spoilt[2]["kept"] = 0.5
-    spoilt[3]["with_star"]["refused"] = (4, 3, 4804)
+    spoilt[3]["with_star"]["refused"] = (4, 3, 1604)
     spoilt[0] = [1.0] * 50
     changed = {claim.quantity for claim in PAPER.conclude(spoilt) if claim.verdict == "missed"}
     lost = changed - {name for name, claim in claims.items() if claim.verdict == "missed"}
@@ -166,7 +167,7 @@ def test_the_gain_of_eq_9_makes_the_variance_negative() -> None:
 
 
 def test_the_measurement_matrix_of_eq_35_would_see_the_misalignments() -> None:
-    """Printed: ones in the first three columns, twice; with the attitude first (Eq 12) they are that of the attitude."""
+    """Printed: ones in the first three columns, twice. There the attitude lies (Eq 12)."""
     scenario = papers.scenario("cui2022")
     estimator = build(scenario, 1)["with_star"].horizon.estimator
     reference = estimator._reference  # type: ignore[union-attr]
