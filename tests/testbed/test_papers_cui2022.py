@@ -17,7 +17,8 @@ from nav.error_model import POS, VEL
 from nav.kalman import correct, innovate
 from nav.local_filter import GnssAid, LocalFilter, Seat
 from nav.samples import FixType, GnssSample
-from testbed import metrics, papers
+from testbed import metrics, papers, run
+from testbed.__main__ import judge
 from testbed.estimators import build, imu_model
 from testbed.loop import motion
 from testbed.papers import Claim, cui2022
@@ -197,6 +198,13 @@ def _level() -> Any:
 
 
 # --- the whole campaign
+
+
+@pytest.mark.slow
+def test_the_scenario_keeps_its_promises(shipped: Scenario) -> None:
+    verdicts = judge(shipped.expect, run(shipped).metrics)
+    assert len(verdicts) > 10
+    assert all(verdicts.values()), verdicts
 
 
 @pytest.mark.slow
