@@ -36,6 +36,12 @@ each filter counting by the most suspect of its latest looks. A filter without o
 
 When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
 velocities are given up as in `nav.ins`, and the next fixes are believed.
+
+Starting again from the others is costly when they don't know what the isolated filter knew. With ``recall_s``, and
+without resets, each filter has two shadows, carried along without measurements and renewed in turn every ``recall_s``
+(two shadow filters: Da, 1994). An isolation then puts this one filter back to its older shadow, ``recall_s`` to twice
+that old, and leaves the others; what was told before the shadow was taken stays, so the fault must be found sooner. The
+isolated sensor is judged against the fused solution of all filters, which are sound then.
 """
 
 from __future__ import annotations
@@ -133,6 +139,7 @@ class Config:
     fusion_period_s: float = 1.0  # at the first aiding epoch after this; 0 is at every one
     isolate_after: int = 3  # consecutive condemned looks
     readmit_after: int = 10  # consecutive sound looks
+    recall_s: float | None = None  # age of what an isolated filter goes back to; None: to the others' solution
     patience_s: float = 30.0  # of refused positions and none fused
     covariance_period: int = 10  # IMU samples per covariance step
     mounting_sigma: float = 0.0  # between the axes of the IMU and of the body [rad]
@@ -148,6 +155,8 @@ class Config:
             raise ValueError("give every local filter a positive share so that they add up to 1, or none of them")
         if not 0 <= self.retention <= 1:
             raise ValueError(f"retention {self.retention} is no fraction from 0 to 1")
+        if self.recall_s is not None and self.structure != "no_reset":
+            raise ValueError(f"structure {self.structure!r} spreads what recall_s would take back from one filter")
         if self.combination == "information":
             if self.sharing == "none" and self.structure != "no_reset":
                 raise ValueError(f"structure {self.structure!r} counts information again and again without sharing it")
@@ -204,15 +213,17 @@ class Federated:
             for watched in local.sensors:
                 self._users.setdefault(watched.aid.sensor, []).append(filter_)
                 filter_.watch(watched, config.isolate_after, config.readmit_after)
+        # Rows of the state: the filters, then, with a recall, their younger shadows and their older ones.
+        self._copies = 1 if config.recall_s is None else 3
         self._reference = Reference(
-            [f.model for f in self.locals], self._told_shares(), config.covariance_period, field_n
+            [f.model for f in self.locals] * self._copies, self._told_shares(), config.covariance_period, field_n
         )
         self.model = self.locals[0].model
         self._common = self._reference.common
         self._state: State | None = None
         self._last_bad = self._last_fused = -math.inf
         self._refused_since = self._last_refused = -math.inf  # positions, without one fused in between
-        self._fused_at = -math.inf
+        self._fused_at = self._remembered_at = -math.inf
         self._aligning = self._alignment_aids()
         gnss = next((a for a in self._aligning.values() if isinstance(a, GnssAid)), GnssAid())
         magnetometer = next((a for a in self._aligning.values() if isinstance(a, MagnetometerAid)), MagnetometerAid())
@@ -282,12 +293,12 @@ class Federated:
 
     def start(self, initial: InitialState) -> None:
         """Begin at a given state instead of aligning."""
-        state = self._reference.start(initial, [self._renamed] * len(self.locals))
+        state = self._reference.start(initial, [self._renamed] * len(self._reference.models))
         common = self._common
         for row, share in enumerate(self._told_shares()):
             reset(state.x[row], state.P[row], np.zeros(common), state.P[row, :common, :common] / share)
         self._state = state
-        self.t = self._last_fused = self._fused_at = initial.t
+        self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
 
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
@@ -326,9 +337,13 @@ class Federated:
         reports: list[UpdateReport] = []
         for filter_ in self._users.get(sample.sensor, ()):
             reports += self._use(state, filter_, sample)
-        if sample.t - self._fused_at >= self.config.fusion_period_s - TIME_TOLERANCE:
+        config = self.config
+        if sample.t - self._fused_at >= config.fusion_period_s - TIME_TOLERANCE:
             self._fuse(state)
             self._fused_at = sample.t
+            if config.recall_s is not None and sample.t - self._remembered_at >= config.recall_s - TIME_TOLERANCE:
+                self._remember(state)
+                self._remembered_at = sample.t
         return reports
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
@@ -392,7 +407,10 @@ class Federated:
         if changed:
             self._note(t, filter_, sample.sensor, part, watch)
             if changed is Change.ISOLATED:
-                self._start_again(state, filter_, sample.sensor)
+                if self.config.recall_s is None:
+                    self._start_again(state, filter_, sample.sensor)
+                else:
+                    self._recall(state, filter_)
                 nu, S, nis = filter_.innovate(state, look)
         suspect, out = any(w.suspect for w in watches), any(w.out for w in watches)
         weight, reason = 0.0, withheld
@@ -423,9 +441,13 @@ class Federated:
         return Weight(N) if watch.policy is None else InOrder([watch.policy, Weight(N)])
 
     def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
-        """Innovation and covariance of a look against the fused solution of the healthy filters."""
-        healthy = self._healthy()
-        master = self._combine(state, healthy if healthy.any() else np.ones(len(self.locals)))
+        """Innovation and covariance of a look against the fused solution of the healthy filters.
+
+        With a recall, of all of them: then the filter was put back to what it knew before the fault.
+        """
+        everyone = np.ones(len(self.locals))
+        healthy = everyone if self.config.recall_s is not None else self._healthy()
+        master = self._combine(state, healthy if healthy.any() else everyone)
         common, row = self._common, filter_.row
         H, own = look.H[:, :common], look.H[:, common:]
         nu = look.nu - H @ master.x
@@ -454,6 +476,19 @@ class Federated:
                 forget(state.P[row], where.start, model.sigma[where] ** 2)
         for i, share in enumerate(self._reset_shares()):
             reset(state.x[i], state.P[i], master.x, master.P / share)
+
+    def _remember(self, state: State) -> None:
+        """The younger shadows become the older ones, and the filters the younger."""
+        n = len(self.locals)
+        for values in (state.x, state.P):
+            values[2 * n :] = values[n : 2 * n]
+            values[n : 2 * n] = values[:n]
+
+    def _recall(self, state: State, faulty: LocalFilter) -> None:
+        """Put a filter back to its older shadow; the younger may hold some of the fault."""
+        n, row = len(self.locals), faulty.row
+        for values in (state.x, state.P):
+            values[row] = values[n + row] = values[2 * n + row]
 
     def _recover(self, state: State, sample: Sample) -> None:
         """Give up positions and velocities when every fix was refused for long."""
@@ -484,32 +519,34 @@ class Federated:
             nu, S, nis = filter_.innovate(state, look)
             if part == "gnss_velocity" and nis <= filter_.gate.threshold(3):
                 continue
-            for i, share in enumerate(self._reset_shares()):
+            for i, share in enumerate(np.tile(self._reset_shares(), self._copies)):
                 forget(state.P[i], start, (nu**2 + np.diag(S)) / share)
 
     # --- the master
 
     def _told_shares(self) -> Array:
-        """The shares by which noise and covariance are divided: ones when information is not shared."""
-        return np.ones(len(self.locals)) if self.config.sharing == "none" else self.shares
+        """By which noise and covariance are divided, for each row: ones when information is not shared."""
+        shares = np.ones(len(self.locals)) if self.config.sharing == "none" else self.shares
+        return np.tile(shares, self._copies)
 
     def _reset_shares(self) -> Array:
-        """The shares of a fused covariance: ones when the combination does not add information up."""
+        """The shares of a fused covariance, for each filter: ones when the combination does not add information up."""
         return self.shares if self.config.combination == "information" else np.ones(len(self.locals))
 
     def _combine(self, state: State, members: Array) -> Master:
         """The fused solution of the ``members`` (filters,), one or zero each."""
-        return combine(state.x, state.P, self._common, members, self.config)
+        n = len(self.locals)
+        return combine(state.x[:n], state.P[:n], self._common, members, self.config)
 
     def _fuse(self, state: State) -> None:
         """Fuse, correct the nominal state, reset the filters as the structure says."""
         config = self.config
         everyone = np.ones(len(self.locals))
         if config.sharing == "by_covariance":
-            by = weights_by_covariance(state.P, self._common, everyone, self.shares)
+            by = weights_by_covariance(state.P[: len(self.locals)], self._common, everyone, self.shares)
             by = np.maximum(by, LEAST_SHARE)
             self.shares = by / by.sum()
-            self._reference.share_noise(self.shares)
+            self._reference.share_noise(self._told_shares())
         master = self._combine(state, everyone)
         retention = {"no_reset": 0.0, "full_reset": 1.0, "partial": config.retention}[config.structure]
         if retention > 0:

@@ -167,12 +167,13 @@ def build(scenario: Scenario, seed: int) -> dict[str, Running]:
     return {config.name: kinds[config.kind](config, scenario, seed) for config in scenario.estimator}
 
 
-def imu_model(errors: ImuErrors) -> ImuModel:
+def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE) -> ImuModel:
     """The datasheet as the filter's error model.
 
     In-run instability (Gauss-Markov, sigma and tau) becomes a random walk of the same driving noise,
     q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two cannot be told apart. Scale factor,
-    misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk too.
+    misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk too, that of the
+    gyros as large as the usual ``turn_rate`` [rad/s] makes it.
     """
     level = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, errors.accel_scale)
     turn = math.hypot(errors.gyro_misalignment, errors.gyro_nonorthogonality, errors.gyro_scale)
@@ -182,7 +183,7 @@ def imu_model(errors: ImuErrors) -> ImuModel:
         gyro_noise=errors.gyro_noise,
         accel_noise=errors.accel_noise,
         gyro_bias_sigma=math.hypot(
-            errors.gyro_turn_on, errors.gyro_in_run, errors.gyro_temperature * WARM_UP_K, pull, turn * TURN_RATE
+            errors.gyro_turn_on, errors.gyro_in_run, errors.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
         ),
         accel_bias_sigma=math.hypot(
             errors.accel_turn_on, errors.accel_in_run, errors.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
@@ -190,7 +191,7 @@ def imu_model(errors: ImuErrors) -> ImuModel:
         gyro_bias_walk=math.hypot(
             errors.gyro_random_walk,
             _drive(errors.gyro_in_run, errors.gyro_in_run_tau),
-            turn * TURN_RATE * changes,
+            turn * turn_rate * changes,
             pull * LOAD_CHANGE * changes,
         ),
         accel_bias_walk=math.hypot(
@@ -220,7 +221,7 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     others = {name: _other(name, scenario.sensors[name], config) for name in config.aids}
     ins = Ins(
         InsConfig(
-            imu_model(errors),
+            imu_model(errors, math.radians(config.turn_degps)),
             aids,
             tuple(aid for aid in others.values() if aid is not None),
             mounting_sigma=errors.accel_misalignment,
@@ -336,7 +337,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
     )
     federated = Federated(
         Config(
-            imu_model(errors),
+            imu_model(errors, math.radians(config.turn_degps)),
             local_filters,
             structure=config.structure,
             sharing=config.sharing,
@@ -347,6 +348,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
             fusion_period_s=config.fusion_period_s,
             isolate_after=config.isolate_after,
             readmit_after=config.readmit_after,
+            recall_s=config.recall_s,
             mounting_sigma=errors.accel_misalignment,
             alignment_aids=tuple(aids.values()),
         ),
@@ -412,7 +414,7 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
     ahrs = Ahrs(
         AhrsConfig(
-            imu_model(errors),
+            imu_model(errors, math.radians(config.turn_degps)),
             site.lat,
             site.h,
             tuple(aids),

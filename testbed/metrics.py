@@ -18,7 +18,8 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Faults are scored one by one, under their names, for the estimators that take samples of the faulty sensor. A look is
   one sample of the sensor; it is an alarm when the estimator refused any part of it, probation apart.
   ``detection_delay_s``: from the beginning to the first alarm; ``missed``: 1 when there is none in the window;
-  ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a sample is used again;
+  ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a sample is used again,
+  with every axis;
   ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window.
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
   while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
@@ -39,6 +40,7 @@ import numpy.typing as npt
 
 from nav import earth
 from nav.detection import Verdict
+from nav.local_filter import ISOLATED
 from nav.samples import Array, FixType, Status
 from testbed.data import write_file
 from testbed.sensors.faults import FaultTruth
@@ -381,8 +383,8 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
 class _Reports:
     """What became of the samples of one aid, or of one sensor, each (N,).
 
-    ``used``; ``gated`` refused by the gate; ``alarm`` refused because the sample looked wrong; ``judged`` used or
-    refused for its innovation.
+    ``used`` with one axis at least; ``gated`` refused by the gate, on one axis at least; ``alarm`` refused, so, because
+    the sample looked wrong; ``judged`` used or refused for its innovation.
     """
 
     t: Array
@@ -401,7 +403,8 @@ def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     tested = np.isfinite(value)  # an unsound sample has no innovation
     withheld = np.char.endswith(reason, Verdict.PROBATION.value)
     withheld |= np.char.startswith(reason, "position ") & tested  # velocity, whose position was refused
-    alarm = ~used & ~withheld
+    refused = (reason == Verdict.REJECT.value) | (reason == ISOLATED)  # other axes may have been used
+    alarm = (~used | refused) & ~withheld
     return _Reports(
         t=column(dataset, f"{own}/sample_time"),
         sensor=column(dataset, f"{own}/sensor").astype(str),
@@ -486,7 +489,7 @@ def faults(dataset: xarray.DataTree) -> list[FaultTruth]:
 
 
 def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Array, Mask, Mask]]:
-    """Times of the samples of each sensor, whether any part of one raised an alarm, and whether none was used."""
+    """Times of the samples of each sensor, whether any part of one raised an alarm, whether it was not used whole."""
     found = [_reports(dataset, estimator, aid) for aid in aids(dataset, estimator)]
     result = {}
     for sensor in dict.fromkeys(name for reports in found for name in np.unique(reports.sensor).tolist()):
@@ -495,7 +498,7 @@ def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Arra
         alarm, used = np.zeros(len(t), bool), np.zeros(len(t), bool)
         np.logical_or.at(alarm, row, np.concatenate([reports.alarm[mine] for reports, mine in own]))
         np.logical_or.at(used, row, np.concatenate([reports.used[mine] for reports, mine in own]))
-        result[sensor] = (t, alarm, ~used)
+        result[sensor] = (t, alarm, ~used | alarm)
     return result
 
 

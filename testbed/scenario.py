@@ -59,7 +59,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         (
             "locals", "structure", "sharing", "combination", "retention", "weighting", "fusion_period_s",
-            "isolate_after", "readmit_after",
+            "isolate_after", "readmit_after", "recall_s",
         ),
         ("federated",),
     ),
@@ -231,6 +231,9 @@ class EstimatorConfig(Section):
     imu: str = "imu"
     spare_imus: Annotated[tuple[str, ...], Field(max_length=3)] = ()  # voted with the first, of its kind and beside it
     aids: tuple[str, ...]
+    turn_degps: float = Field(
+        default=math.degrees(0.06), ge=0, le=360, description="usual rate of turn: how far gyro scale errors count"
+    )
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
     handover: HandoverConfig | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: float | None = Field(
@@ -250,6 +253,9 @@ class EstimatorConfig(Section):
     fusion_period_s: float = Field(default=1.0, ge=0, le=60)
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
+    recall_s: float | None = Field(
+        default=None, ge=1, le=600, description="isolated, a filter goes back by this; none: to the others' solution"
+    )
     literal: bool = Field(
         default=False,
         description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13; Zhou et al. 2025,"
@@ -640,6 +646,8 @@ def _federated_faults(
     shares = [local.share for local in config.locals if local.share is not None]
     if shares and (len(shares) < len(names) or abs(sum(shares) - 1) > 1e-6):
         yield (*path, "locals"), f"the shares of all local filters must add up to 1, not {sum(shares):g}: or give none"
+    if config.recall_s is not None and config.structure != "no_reset":
+        yield (*path, "recall_s"), f"structure {config.structure!r} spreads what it would take back: leave one out"
     if config.combination == "information" and config.sharing == "none" and config.structure != "no_reset":
         yield (
             (*path, "sharing"),

@@ -224,6 +224,7 @@ def test_printed_weights_do_not_see_a_lost_position():
         ({"locals": (Local("a", (), 0.5), Local("b", ()))}, "add up to 1"),
         ({"locals": (Local("a", (), 0.5), Local("b", (), 0.4))}, "add up to 1"),
         ({"retention": 1.5}, "fraction"),
+        ({"recall_s": 20.0, "structure": "full_reset"}, "spreads"),
         ({"imu": dataclasses.replace(CONSUMER, gyro_bias_sigma=0.0)}, "sigma above zero"),
         ({"sharing": "none", "structure": "full_reset"}, "again and again"),
         ({"combination": "scalar"}, "sharing must be 'none'"),
@@ -542,6 +543,45 @@ def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
     assert len(during) > 180
     assert all((r.weight, r.reason) == (0.0, "isolated") for r in during)
     assert {e.part for e in federated.events} == {"gnss_velocity"}
+
+
+def alone(recall_s):
+    """One receiver, and aids that know no position across."""
+    locals_ = (Local("one", (Watched(GnssAid(), DETECTORS["eraim"]),)), three()[2])
+    return Config(CONSUMER, locals_, recall_s=recall_s)
+
+
+def test_a_filter_alone_in_knowing_the_position_recalls_it():
+    """The others' solution has lost the position for long, what the filter itself knew before the fault has not."""
+    truth, increments, one, _, others = world(180)
+    bad = ramp(one, 100, 140, 10.0, False)
+    _, estimates, _ = fly(alone(None), bad + others, increments)
+    assert max(horizontal(estimates, truth, 90).values()) > 20
+    federated, estimates, _ = fly(alone(10.0), bad + others, increments)
+    assert max(horizontal(estimates, truth, 90).values()) < 4.0
+    assert [bool(sum(e.isolated)) for e in federated.events] == [True, False]
+    isolated, readmitted = federated.events
+    assert 100 < isolated.t < 104
+    assert 140 < readmitted.t < 143
+    assert (np.abs(error(estimates[-1], truth)) < 4 * np.sqrt(np.diag(estimates[-1].covariance))).all()
+
+
+def test_a_recall_takes_back_all_that_was_told_since():
+    """Whatever the fixes of the last seconds before the isolation said: a trace of a metre, or none."""
+    truth, increments, one, _, others = world(120)
+    bad = ramp(one, 100, 120, 10.0, False)
+    # Others in the second before: believed, and not so far off that anything else changes.
+    pulled = [dataclasses.replace(f, lat=f.lat - 1.0 / 6.37e6) if 99 <= f.t < 100 else f for f in bad]
+
+    def apart(config, t):
+        flights = [fly(config, fixes + others, increments) for fixes in (bad, pulled)]
+        assert flights[0][0].events[0].t == flights[1][0].events[0].t < t
+        one, two = (next(e for e in estimates if abs(e.t - t) < 1e-6) for _, estimates, _ in flights)
+        return np.abs(error(one, truth)[:3] - error(two, truth)[:3]).max()
+
+    assert apart(alone(5.0), 105.0) < 0.001
+    # Taken as shadow at 99.8 s or later, it holds them.
+    assert apart(alone(0.2), 105.0) > 0.03
 
 
 def test_a_faulty_axis_leaves_the_others_in_use():

@@ -258,6 +258,22 @@ def test_faults_are_scored_by_name() -> None:
     assert found["ins.false_alarms_per_look"] == pytest.approx(1 / (3 * 5 * healthy_s), rel=5e-3)
 
 
+def test_one_axis_refused_is_an_alarm() -> None:
+    """The other axes of the sample were used."""
+    run = faulty(("jump", "gnss", 100.0, 120.0))
+    t = run["estimators/ins/innovations/gnss_position"]["sample_time"].values
+    for when in t[(t > 103.0 - 1e-6) & (t < 122.0 - 1e-6)]:
+        relabel(run, "gnss_position", when, 2 / 3, "outside the gate" if when < 104 else "isolated")
+    found = metrics.compute(run)
+    assert found["ins.detection_delay_s.jump"] == pytest.approx(3.0)
+    assert found["ins.coverage.jump"] == pytest.approx(0.85)
+    assert found["ins.end_lag_s.jump"] == pytest.approx(2.0)
+    assert found["ins.isolation_correct.jump"] == 1
+    assert found["ins.false_alarms_per_look"] == 0.0
+    relabel(run, "gnss_position", 150.0, 2 / 3, "outside the gate")
+    assert metrics.compute(run)["ins.false_alarms_per_look"] > 0.0
+
+
 def test_faults_that_overlap_end_when_they_end() -> None:
     run = faulty(("long", "gnss", 100.0, 130.0), ("short", "gnss", 105.0, 110.0), ("next", "gnss", 140.0, 150.0))
     refuse(run, "gnss_position", 100.0, 133.0)
