@@ -551,7 +551,7 @@ class LocalFilter:
 
     def _whole(self, state: State) -> Array:
         """All estimated values beyond the motion (n,) of a closed filter, those of the inertial sensors too."""
-        x = state.x[self.row].copy()
+        x: Array = state.x[self.row].copy()
         x[: len(state.imu)] = state.imu
         return x
 

@@ -224,7 +224,7 @@ class FadingConfig(Section):
     """Covariance made as large as the innovations say when they diverge (`nav.weighting.Fading`)."""
 
     window: int = Field(default=10, ge=1, le=1000, description="looks")
-    alpha: float = Field(default=1.5, ge=1, le=100, description="times the expected innovation is divergence")
+    alpha: float = Field(default=20.0, ge=1, le=100, description="times the expected innovation is divergence")
     looks: Annotated[tuple[Literal["gnss_position", "gnss_velocity", "gnss_course"], ...], Field(min_length=1)] = (
         "gnss_position", "gnss_velocity", "gnss_course",
     )  # fmt: skip
