@@ -203,7 +203,7 @@ class Ins:
         policies: Mapping[str, Policy] | None = None,
         fadings: Mapping[str, Fading] | None = None,
     ) -> None:
-        self.config = config
+        self.config, self.field_n = config, field_n
         self.t = math.nan
         self._by_type = {type_: config.aid_of(kind) for type_, kind in KINDS.items() if kind in config.aids}
         self._others = {aid.sensor: aid for aid in config.others}
