@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 from typing import NamedTuple, Protocol, TypeAlias
@@ -538,15 +538,13 @@ class LocalFilter:
             return look
         root = unscented.factor(state.P[self.row], CURVED)
         points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
-        at_points = np.empty((len(points.x), len(look.nu)))
+        at_points, there = np.empty((len(points.x), len(look.nu))), state.copy()
         for k, (q_nb, v_n, lla, x) in enumerate(zip(*points, strict=True)):
-            errors = np.empty_like(state.errors)
-            sensor_errors(errors, x, reference.driven)
-            there = aid.look(
-                part, sample, Seat(reference, replace(state, q_nb=q_nb, v_n=v_n, lla=lla, errors=errors), x, starts)
-            )
-            assert there is not None  # as whether there is a look depends on the sample alone
-            at_points[k] = there.nu
+            there.q_nb[:], there.v_n[:], there.lla[:] = q_nb, v_n, lla
+            sensor_errors(there.errors, x, reference.driven)
+            at_point = aid.look(part, sample, Seat(reference, there, x, starts))
+            assert at_point is not None  # as whether there is a look depends on the sample alone
+            at_points[k] = at_point.nu
         return look._replace(at_points=at_points)
 
     def _whole(self, state: State) -> Array:
