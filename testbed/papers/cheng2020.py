@@ -40,7 +40,7 @@ _MORE_NOISE = ", ".join(
 )
 
 
-def _of(estimators: Sequence[str], overrides: Sequence[str] = ()) -> Scenario:
+def selected(estimators: Sequence[str], overrides: Sequence[str] = ()) -> Scenario:
     """The scenario with these of its estimators."""
     whole = scenario("cheng2020", overrides)
     return whole.model_copy(update={"estimator": tuple(one for one in whole.estimator if one.name in estimators)})
@@ -48,7 +48,7 @@ def _of(estimators: Sequence[str], overrides: Sequence[str] = ()) -> Scenario:
 
 def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any]:
     """One run: what each of the estimators made of it. Angles in deg."""
-    dataset = run(_of(estimators, [f"duration_s={duration_s}"]), seed=seed).dataset
+    dataset = run(selected(estimators, [f"duration_s={duration_s}"]), seed=seed).dataset
     t = metrics.column(dataset, "truth/time")
     rate = np.abs(metrics.column(dataset, "truth/omega_b")[:, 2])
     speed = np.linalg.norm(metrics.column(dataset, "truth/v_n"), axis=1)
@@ -87,7 +87,7 @@ def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any
 def noisier(seed: int) -> dict[str, float]:
     """By how much the learned variance is off, some looks after the receiver's became four times as large."""
     end = NOISIER_S + LEARNED_S
-    dataset = run(_of(["improved"], [f"duration_s={end + 1}", f"fault=[{_MORE_NOISE}]"]), seed=seed).dataset
+    dataset = run(selected(["improved"], [f"duration_s={end + 1}", f"fault=[{_MORE_NOISE}]"]), seed=seed).dataset
     off = {}
     for aid in ("gnss_position", "gnss_velocity"):
         own = f"estimators/improved/innovations/{aid}"
@@ -103,7 +103,7 @@ def straight(seed: int) -> tuple[float, float]:
         "truth.start.speed_mps=3",
         'truth.segments=[{ leg = "straight", duration_s = 1e4 }]',
     ]
-    e = metrics.errors(run(_of(["no_course"], overrides), seed=seed).dataset, "no_course", 0.0)
+    e = metrics.errors(run(selected(["no_course"], overrides), seed=seed).dataset, "no_course", 0.0)
     sigma = e.sigma_attitude[:, 2]
     return math.degrees(e.attitude[-1, 2]), float(sigma[-1] / sigma[0])
 
