@@ -520,14 +520,14 @@ class Glr:
 class ChiSquareGate:
     """Accept an innovation when nu' S^-1 nu stays below the chi-square quantile of its dimension.
 
-    ``false_rejection`` is the probability that a sound measurement of a consistent filter is turned away.
+    ``false_rejection`` is the probability that a sound measurement of a consistent filter is turned away; 0: no gate.
     """
 
     false_rejection: float
     thresholds: tuple[float, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not 0 < self.false_rejection < 1:
+        if not 0 <= self.false_rejection < 1:
             raise ValueError(f"a probability between 0 and 1 is needed, not {self.false_rejection}")
         object.__setattr__(self, "thresholds", tuple(float(chdtri(m, self.false_rejection)) for m in range(1, 7)))
 

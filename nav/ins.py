@@ -22,6 +22,7 @@ from nav.local_filter import (
     Aid,
     AirspeedAid,
     BarometerAid,
+    Course,
     GnssAid,
     LocalFilter,
     MagnetometerAid,
@@ -29,6 +30,7 @@ from nav.local_filter import (
     aid_blocks,
     refusals,
 )
+from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
     FUSED,
@@ -59,6 +61,8 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.unscented import Scaling
+from nav.weighting import Fading
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
 
@@ -83,6 +87,7 @@ class InsConfig:
     others: tuple[Aid, ...] = ()
     mounting_sigma: float = 0.0  # between the axes of the IMU, whose attitude is found, and of the body, reported [rad]
     covariance_period: int = 10  # IMU samples per covariance step; 50 ms and less lose nothing on an aircraft
+    scaling: Scaling | None = None  # of sigma points instead of derivatives
 
     # GNSS: the receiver's own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)
     gnss_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # IMU to antenna [m]
@@ -91,6 +96,7 @@ class InsConfig:
     gnss_position_error_correlation_s: float = 100.0
     gnss_velocity_error_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m/s]
     gnss_velocity_error_correlation_s: float = 20.0
+    course: Course | None = None
 
     # Barometer, as pressure altitude
     barometer_sigma: float = 0.5  # [m]
@@ -115,7 +121,7 @@ class InsConfig:
     gust_correlation_s: float = 5.0
 
     # Belief
-    false_rejection: float = 1e-3  # probability that the gate turns a sound measurement away
+    false_rejection: float = 1e-3  # probability that the gate turns a sound measurement away; 0: there is no gate
     outage_s: float = 10.0  # this long without a fused position is an outage
     probation_s: float = 1.0  # fixes must agree with each other for this long after it
     recovery_s: float = 4.0  # after an outage, fixes that agree for this long overrule the filter
@@ -143,6 +149,7 @@ class InsConfig:
                     position_error_correlation_s=self.gnss_position_error_correlation_s,
                     velocity_error_sigma=self.gnss_velocity_error_sigma,
                     velocity_error_correlation_s=self.gnss_velocity_error_correlation_s,
+                    course=self.course,
                 )
             case "barometer":
                 return BarometerAid(
@@ -185,22 +192,27 @@ class Ins:
     """Strapdown closed by one local filter; see the estimator protocol in `nav.horizon`.
 
     ``field_n`` gives the reference magnetic field (3,) [T], NED, at (lat, lon, h); without it the magnetometer is not
-    used. ``policies`` may weigh looks by the name of their aid, such as ``gnss_velocity``. The filter aligns itself
-    from the samples it is given; `start` sets it at a known state instead.
+    used. ``policies`` may weigh looks by the name of their aid, such as ``gnss_velocity``, and ``fadings`` the P that
+    they meet. The filter aligns itself from the samples it is given; `start` sets it at a known state instead.
     """
 
     def __init__(
-        self, config: InsConfig, field_n: FieldModel | None = None, policies: Mapping[str, Policy] | None = None
+        self,
+        config: InsConfig,
+        field_n: FieldModel | None = None,
+        policies: Mapping[str, Policy] | None = None,
+        fadings: Mapping[str, Fading] | None = None,
     ) -> None:
-        self.config = config
+        self.config, self.field_n = config, field_n
         self.t = math.nan
         self._by_type = {type_: config.aid_of(kind) for type_, kind in KINDS.items() if kind in config.aids}
         self._others = {aid.sensor: aid for aid in config.others}
         self._gate = ChiSquareGate(config.false_rejection)
-        self._filter = LocalFilter(config.imu, config.used(), self._gate)
-        self._filter.policies = policies or {}
+        self._filter = LocalFilter(config.imu, config.used(), self._gate, scaling=config.scaling)
+        self._filter.policies, self._filter.fadings = policies or {}, fadings or {}
         self.model = self._filter.model
-        self._reference = Reference([self.model], [1.0], config.covariance_period, field_n)
+        self._reference = Reference([self.model], [1.0], config.covariance_period, field_n, config.scaling)
+        self._turns = TurnDetector(config.course.max_turn_rate, config.course.quiet_s) if config.course else None
         self._monitor = GnssMonitor(
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
@@ -246,6 +258,8 @@ class Ins:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
         if len(imu) == 0:
             return
+        if self._turns is not None:
+            self._turns.push(imu)
         if self._state is None:
             self._alignment.propagate(imu)
         else:
@@ -323,8 +337,8 @@ class Ins:
     def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
         look = self._filter.look(self._reference, state, aid, "gnss_position", sample)
         assert look is not None
-        nu, H, R, _ = look
-        S, nis = self._filter.absorb(self._reference, state, nu, H, R, -math.inf)
+        nu, H, R, _, at_points = look
+        S, nis = self._filter.absorb(self._reference, state, nu, H, R, -math.inf, at_points)
         with_velocity = aiding.has_velocity(sample)
         v_n, sigma_v = (
             (sample.v_n, sample.sigma_velocity_n)
@@ -337,18 +351,23 @@ class Ins:
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         weight, reason = 0.0, verdict.value
-        policy = self._filter.policies.get("gnss_position")
-        if verdict is Verdict.FUSE and policy is not None:
-            weight, reason = self._filter.take(self._reference, state, look, nu, S, np.full(3, True), policy, sample.t)
-        elif verdict in (Verdict.FUSE, Verdict.RECOVER):
+        if verdict is Verdict.FUSE:
+            weight, reason = self._filter.weigh(self._reference, state, sample, "gnss_position", look, S)
+        elif verdict is Verdict.RECOVER:
             weight = 1.0
-            S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf)
+            wide = self._filter.look(self._reference, state, aid, "gnss_position", sample)
+            assert wide is not None
+            S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
         withheld = "" if weight else f"position {reason}"
         reports = [UpdateReport(sample.t, sample.sensor, "gnss_position", nu, S, nis, threshold, weight, reason)]
         if use_velocity:
             velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             reports.append(self._filter.fuse(self._reference, state, sample, "gnss_velocity", velocity, withheld))
+        if self._turns is not None and self._turns.straight(sample.t):
+            course = self._filter.look(self._reference, state, aid, "gnss_course", sample)
+            if course is not None:
+                reports.append(self._filter.fuse(self._reference, state, sample, "gnss_course", course, withheld))
         return reports
 
     def _give_up_position(
@@ -362,8 +381,8 @@ class Ins:
         if use_velocity:
             velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
-            nu_v, H, R, _ = velocity
-            S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf)
+            nu_v, H, R, _, at_points = velocity
+            S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, at_points)
             if not nis <= self._gate.threshold(3):
                 forget(P, VEL, nu_v**2 + np.diag(S_v))
                 wind = self.model.start("wind")

@@ -16,11 +16,11 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from nav import aiding
+from nav import aiding, unscented
 from nav._jit import njit
 from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask
 from nav.earth import pressure_altitude
-from nav.error_model import Block, ErrorModel, ImuModel, Indices, markov
+from nav.error_model import MOTION, Block, ErrorModel, ImuModel, Indices, markov, sensor_errors
 from nav.kalman import innovate
 from nav.reference import Reference, State, absorb
 from nav.samples import (
@@ -35,6 +35,8 @@ from nav.samples import (
     StarSample,
     UpdateReport,
 )
+from nav.unscented import CURVED, Scaling
+from nav.weighting import Fading, InOrder, SageHusa, residual
 
 Axes: TypeAlias = tuple[float, float, float]
 
@@ -51,12 +53,16 @@ class Policy(Protocol):
 
 
 class Look(NamedTuple):
-    """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,), why it must not be used."""
+    """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,), why it must not be used.
+
+    ``at_points`` (7, m) are the innovations at the sigma points of an unscented filter.
+    """
 
     nu: Array
     H: Array
     R: Array
     withheld: str = ""
+    at_points: Array | None = None
 
 
 class Seat(NamedTuple):
@@ -96,6 +102,20 @@ class Aid(Protocol):
 
 
 @dataclass(frozen=True)
+class Course:
+    """Course over ground as a look at the heading (Cheng et al. 2020, Eq 22-24): see `nav.aiding.gnss_course`.
+
+    It is worth the receiver's velocity and the ``slip`` of the body, over the speed; nothing below ``minimum`` speed.
+    Where it turned faster than ``max_turn_rate`` within the last ``quiet_s`` there is no look (`nav.motion`).
+    """
+
+    max_turn_rate: float = math.inf  # [rad/s]
+    quiet_s: float = 0.0
+    slip: float = 0.0  # sideways through the air, 1 sigma [m/s]
+    minimum: float = 1.0  # [m/s]
+
+
+@dataclass(frozen=True)
 class GnssAid:
     """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)."""
 
@@ -106,20 +126,23 @@ class GnssAid:
     position_error_correlation_s: float = 100.0
     velocity_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m/s]
     velocity_error_correlation_s: float = 20.0
+    course: Course | None = None
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
         """See `Aid`."""
-        return (("gnss_position", 3), ("gnss_velocity", 3)) if self.use_velocity else (("gnss_position", 3),)
+        velocity = (("gnss_velocity", 3),) if self.use_velocity else ()
+        return (("gnss_position", 3), *velocity, *((("gnss_course", 1),) if self.course else ()))
 
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        return f"{self.sensor}_position_error", f"{self.sensor}_velocity_error"
+        own = f"{self.sensor}_position_error", f"{self.sensor}_velocity_error"
+        return (*own, "wind", "gust") if self.course else own
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        position, velocity = self.states
+        position, velocity = self.states[:2]
         return [
             markov(position, 3, self.position_error_sigma, self.position_error_correlation_s),
             markov(velocity, 3, self.velocity_error_sigma, self.velocity_error_correlation_s),
@@ -145,11 +168,22 @@ class GnssAid:
             return Look(nu, H, _white(sample.sigma_position_n, self._correlated[0]))
         if not aiding.has_velocity(sample):
             return None
+        if part == "gnss_course":
+            return self._course(sample, seat)
         nu, H = aiding.gnss_velocity(
             state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven,
             self.arm, seat.starts[1], sample.v_n,
         )  # fmt: skip
         return Look(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]))
+
+    def _course(self, sample: GnssSample, seat: Seat) -> Look | None:
+        assert self.course is not None
+        speed2 = float(sample.v_n[0] ** 2 + sample.v_n[1] ** 2)
+        if not speed2 > self.course.minimum**2:
+            return None
+        nu, H = aiding.gnss_course(seat.state.q_nb, seat.state.v_n, seat.x, seat.starts[2], seat.starts[3], sample.v_n)
+        sigma2 = float(sample.sigma_velocity_n[:2] @ sample.sigma_velocity_n[:2]) / 2
+        return Look(nu, H, np.array([(sigma2 + self.course.slip**2) / speed2]))
 
 
 @dataclass(frozen=True)
@@ -467,20 +501,28 @@ class Watch:
 class LocalFilter:
     """One filter's aids and what becomes of their looks; the numbers are rows ``row`` of a `State`.
 
-    ``closed`` filters put each correction into the nominal state at once. Parts without a `Watch` pass the ``gate``.
+    ``closed`` filters put each correction into the nominal state at once; only these may work by sigma points, with a
+    ``scaling``. Parts without a `Watch` pass the ``gate``.
     """
 
     def __init__(
-        self, imu: ImuModel, aids: Sequence[Aid], gate: ChiSquareGate, row: int = 0, closed: bool = True
+        self,
+        imu: ImuModel,
+        aids: Sequence[Aid],
+        gate: ChiSquareGate,
+        row: int = 0,
+        closed: bool = True,
+        scaling: Scaling | None = None,
     ) -> None:
         self.aids = {aid.sensor: aid for aid in aids}
         if len(self.aids) < len(aids):
             raise ValueError(f"a sensor is listed twice: {[aid.sensor for aid in aids]}")
         self.model = ErrorModel(imu, aid_blocks(aids))
-        self.gate, self.row, self.closed = gate, row, closed
+        self.gate, self.row, self.closed, self.scaling = gate, row, closed, scaling
         self.watches: dict[tuple[str, str], Watch] = {}
         self.of_sensor: dict[str, list[Watch]] = {}
         self.policies: Mapping[str, Policy] = {}
+        self.fadings: Mapping[str, Fading] = {}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
 
     def watch(self, watched: Watched, isolate_after: int, readmit_after: int) -> None:
@@ -494,21 +536,65 @@ class LocalFilter:
 
     def look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
         """One part of a sample at the nominal state and the filter's own errors of aids."""
-        return aid.look(part, sample, Seat(reference, state, state.x[self.row], self._starts[aid.sensor]))
+        starts = self._starts[aid.sensor]
+        look = aid.look(part, sample, Seat(reference, state, state.x[self.row], starts))
+        if look is None or self.scaling is None:
+            return look
+        root = unscented.factor(state.P[self.row], CURVED)
+        points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
+        at_points, there = np.empty((len(points.x), len(look.nu))), state.copy()
+        for k, (q_nb, v_n, lla, x) in enumerate(zip(*points, strict=True)):
+            there.q_nb[:], there.v_n[:], there.lla[:] = q_nb, v_n, lla
+            sensor_errors(there.errors, x, reference.driven)
+            at_point = aid.look(part, sample, Seat(reference, there, x, starts))
+            assert at_point is not None  # as whether there is a look depends on the sample alone
+            at_points[k] = at_point.nu
+        return look._replace(at_points=at_points)
+
+    def _whole(self, state: State) -> Array:
+        """All estimated values beyond the motion (n,) of a closed filter, those of the inertial sensors too."""
+        x: Array = state.x[self.row].copy()
+        x[: len(state.imu)] = state.imu
+        return x
 
     def innovate(self, state: State, look: Look) -> tuple[Array, Array, float]:
         """(nu, S, nis) of a look at the filter's own estimate."""
         return _innovate(state.P[self.row], state.x[self.row], len(state.imu), look.H, look.R, look.nu)
 
     def absorb(
-        self, reference: Reference, state: State, nu: Array, H: Array, R: Array, threshold: float
+        self,
+        reference: Reference,
+        state: State,
+        nu: Array,
+        H: Array,
+        R: Array,
+        threshold: float,
+        at_points: Array | None = None,
     ) -> tuple[Array, float]:
         """Correct if nis is at most ``threshold``; (S, nis). ``nu`` is at the filter's own estimate."""
         s = state
+        if self.scaling is not None:
+            assert at_points is not None
+            return self._absorb_points(reference, s, -at_points, H, R, threshold)
         return absorb(
             s.q_nb, s.v_n, s.lla, s.imu, s.x[self.row], s.P[self.row], s.errors, reference.driven,
             nu, H, R, threshold, self.closed,
         )  # fmt: skip
+
+    def _absorb_points(
+        self, reference: Reference, state: State, Z: Array, H: Array, R: Array, threshold: float
+    ) -> tuple[Array, float]:
+        """`absorb` by sigma points: ``Z`` (7, m) is prediction - measurement at each, so that zero is measured."""
+        s, P, scaling = state, state.P[self.row], self.scaling
+        assert scaling is not None
+        root = unscented.factor(P, len(P))
+        nu, S, A, bend, nis = unscented.innovate(Z, np.zeros(len(R)), R, root, H, scaling.spread, scaling.excess)
+        if nis <= threshold:
+            x, common = self._whole(s), len(s.imu)
+            unscented.remove(s.q_nb, s.v_n, s.lla, x, unscented.correct(P, root, A, bend, R, nu))
+            s.imu[MOTION:], s.x[self.row, common:] = x[MOTION:common], x[common:]
+            sensor_errors(s.errors, s.imu, reference.driven)
+        return S, nis
 
     def fuse(
         self, reference: Reference, state: State, sample: Sample, part: str, look: Look, withheld: str = ""
@@ -516,18 +602,30 @@ class LocalFilter:
         """Gate, policy and correction of a closed filter, whatever ``withheld`` says against its use."""
         withheld = withheld or look.withheld
         threshold = self.gate.threshold(len(look.nu))
-        policy = self.policies.get(part)
-        if policy is not None:
-            S, nis = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf)
-            sound = not withheld and nis <= threshold
-            weight, reason = self.take(
-                reference, state, look, look.nu, S, np.full(len(look.nu), sound), policy, sample.t
-            )
-            reason = withheld or ("" if nis <= threshold else OUTSIDE) or reason
-            return UpdateReport(sample.t, sample.sensor, part, look.nu, S, nis, threshold, weight, reason)
-        S, nis = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf if withheld else threshold)
+        nu, H, R, _, at_points = look
+        simple = part not in self.policies and part not in self.fadings
+        limit = threshold if simple and not withheld else -math.inf
+        S, nis = self.absorb(reference, state, nu, H, R, limit, at_points)
         reason = withheld or ("" if nis <= threshold else OUTSIDE)
-        return UpdateReport(sample.t, sample.sensor, part, look.nu, S, nis, threshold, 0.0 if reason else 1.0, reason)
+        weight = 0.0 if reason else 1.0
+        if not simple and not reason:
+            weight, reason = self.weigh(reference, state, sample, part, look, S)
+        return UpdateReport(sample.t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
+
+    def weigh(
+        self, reference: Reference, state: State, sample: Sample, part: str, look: Look, S: Array
+    ) -> tuple[float, str]:
+        """Correct a closed filter with a look that passed its gate, as fading and policy say: see `take`."""
+        fading = self.fadings.get(part)
+        factor = fading.factor(look.nu, S) if fading is not None else 1.0
+        if factor > 1.0:
+            state.P[self.row] *= factor
+            again = self.look(reference, state, self.aids[sample.sensor], part, sample)
+            assert again is not None
+            look = again
+            S, _ = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf, look.at_points)
+        every = np.full(len(look.nu), True)
+        return self.take(reference, state, look, look.nu, S, every, self.policies.get(part), sample.t)
 
     def take(
         self,
@@ -542,16 +640,19 @@ class LocalFilter:
     ) -> tuple[float, str]:
         """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason)."""
         if policy is None and used.all():
-            self.absorb(reference, state, nu, look.H, look.R, math.inf)
+            self.absorb(reference, state, nu, look.H, look.R, math.inf, look.at_points)
             return 1.0, ""
         R = look.R
         if policy is not None and used.any():
             R = policy.adapt(nu, S, R, t)
             used = used & np.isfinite(R)
+            if isinstance(policy, (SageHusa, InOrder)):
+                policy.learn(*residual(nu, S - np.diag(look.R), np.where(used, R, np.inf)))
             if not used.any():
                 return 0.0, LEFT_OUT
         if used.any():
-            self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf)
+            at_points = None if look.at_points is None else look.at_points[:, used]
+            self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf, at_points)
         return float(np.mean(np.where(used, look.R / R, 0.0))), ""
 
 

@@ -20,12 +20,15 @@ from nav.kalman import correct, innovate, predict
 from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.strapdown import step
+from nav.unscented import Scaling, remove
+from nav.unscented import predict as predict_points
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
 RECENT_S = 2.0  # a position this fresh counts as aided
 FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
+NEVER = 1 << 62
 PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
 
 # Order of the covariance in an estimate; and the blocks that have a place of their own there
@@ -83,13 +86,18 @@ class Reference:
     Filter i is told ``1 / shares[i]`` times the noise and the initial covariance of the common states, so that a fusion
     of all may add up their information as if they were independent (Cui et al. 2022, Eq 7). Filters with fewer states
     than the largest have dead ones behind. ``field_n`` gives the reference magnetic field (3,) [T], NED, at (lat, lon,
-    h). A covariance step takes ``period`` samples.
+    h). A covariance step takes ``period`` samples, by sigma points with a ``scaling`` (of one closed filter only).
     """
 
     def __init__(
-        self, models: Sequence[ErrorModel], shares: Sequence[float] | Array, period: int, field_n: FieldModel | None
+        self,
+        models: Sequence[ErrorModel],
+        shares: Sequence[float] | Array,
+        period: int,
+        field_n: FieldModel | None,
+        scaling: Scaling | None = None,
     ) -> None:
-        self.models, self.period = models, period
+        self.models, self.period, self.scaling = models, period, scaling
         self.common = models[0].mixing
         self.driven = models[0].driven
         self.size = max(model.size for model in models)
@@ -141,17 +149,32 @@ class Reference:
         The time of the last increment that was not usable, -inf when all were: it is bridged with the last sound rates.
         """
         s = state
-        bad = _propagate(
-            s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
-            self.driven, self._decay_rate, self._variance_rate, *self._scratch,
-            self.period * periods, imu.dtheta, imu.dv, imu.dt,
-        )  # fmt: skip
-        return float(imu.t[bad]) if bad >= 0 else -math.inf
+        period, first, last_bad = self.period * periods, 0, -math.inf
+        while first < len(imu):
+            # the kernel takes linear steps only: sigma points stop it before one is due
+            stop = len(imu) if self.scaling is None else first + max(1, period - int(s.elapsed[1]))
+            part = slice(first, stop)
+            bad = _propagate(
+                s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
+                self.driven, self._decay_rate, self._variance_rate, *self._scratch,
+                period if self.scaling is None else NEVER, imu.dtheta[part], imu.dv[part], imu.dt[part],
+            )  # fmt: skip
+            if bad >= 0:
+                last_bad = float(imu.t[first + bad])
+            if self.scaling is not None and s.elapsed[1] >= period:
+                self.settle(s)
+            first = stop
+        return last_bad
 
     def settle(self, state: State) -> None:
         """Bring the covariances up to the time of the motion."""
         s = state
-        if s.elapsed[0] > 0:
+        if s.elapsed[0] > 0 and self.scaling is not None:
+            _sigma_step(
+                s.q_nb, s.v_n, s.lla, s.imu, s.x[0], s.P[0], s.errors, s.sums, s.elapsed, self.driven,
+                self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
+            )  # fmt: skip
+        elif s.elapsed[0] > 0:
             _covariance_step(
                 s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed,
                 self.driven, self._decay_rate, self._variance_rate, *self._scratch,
@@ -311,6 +334,32 @@ def _covariance_step(
             for i in range(MOTION, common):
                 imu[i] *= decay[i]
         predict(P[f], Phi, decay, half_noise, work)
+    sensor_errors(errors, imu, driven)
+    sums[:] = 0.0
+    elapsed[:] = 0.0
+
+
+@njit
+def _sigma_step(
+    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
+    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
+    work: Array, spread: float, excess: float,
+) -> None:  # fmt: skip
+    """`_covariance_step` of one closed filter by sigma points, whose mean error is taken out of the motion."""
+    T = elapsed[0]
+    transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
+    push_n = np.empty(3)
+    for i in range(3):
+        push_n[i] = sums[2, i, 0] + sums[2, i, 1] + sums[2, i, 2]
+    for i in range(len(x)):
+        half_noise[i] = 0.5 * T * variance_rate[i]
+        decay[i] = math.exp(-T * decay_rate[i]) if decay_rate[i] > 0.0 else 1.0
+    for i in range(MOTION, len(x)):
+        x[i] *= decay[i]
+    for i in range(MOTION, len(imu)):
+        imu[i] *= decay[i]
+    error = predict_points(P, Phi, decay, half_noise, work, push_n, T, spread, excess)
+    remove(q_nb, v_n, lla, imu, error[: len(imu)])
     sensor_errors(errors, imu, driven)
     sums[:] = 0.0
     elapsed[:] = 0.0

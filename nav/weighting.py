@@ -214,6 +214,21 @@ class SageHusa:
         self.ratio = np.where(np.isfinite(residual), learned, self.ratio)
 
 
+def residual(nu: Array, HPH: Array, R: Array) -> tuple[Array, Array]:
+    """(z - h(x+) (m,), H P+ H' (m, m)) that an update with variances ``R`` (m,) leaves, of a linear measurement.
+
+    With S = H P H' + diag(R): R S^-1 nu and R - R S^-1 R. An axis of infinite variance is NaN in the first.
+    """
+    kept = np.isfinite(R)
+    rows = np.ix_(kept, kept)
+    left, after = np.full(len(R), np.nan), np.zeros_like(HPH)
+    if kept.any():
+        gain = R[kept, None] * np.linalg.inv(HPH[rows] + np.diag(R[kept]))
+        left[kept] = gain @ nu[kept]
+        after[rows] = np.diag(R[kept]) - gain * R[kept]
+    return left, after
+
+
 class InOrder:
     """Policies one after the other, each with the S that belongs to the R of the one before.
 

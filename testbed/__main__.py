@@ -388,6 +388,7 @@ def _fly(
 
 def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool) -> None:
     from testbed import report as reports
+    from testbed import visibility
 
     console = _console()
     console.print(reports.summary_table(metrics))
@@ -395,7 +396,8 @@ def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: 
     if faults is not None:
         console.print(faults)
     if report:
-        print(f"report: {reports.write_report(dataset, metrics, run_file.parent)}")
+        seen = visibility.table(visibility.of_run(dataset))
+        print(f"report: {reports.write_report(dataset, metrics, run_file.parent, seen)}")
     print(f"record: {run_file}")
 
 

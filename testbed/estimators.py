@@ -22,13 +22,14 @@ from nav.federated import Config, Federated, Local
 from nav.horizon import FusionHorizon
 from nav.ins import AIDS as INS_AIDS
 from nav.ins import Ins, InsConfig
-from nav.local_filter import Aid, BodyVelocityAid, Policy, PositionFixAid, StarAid, Watched
+from nav.local_filter import Aid, BodyVelocityAid, Course, Policy, PositionFixAid, StarAid, Watched
 from nav.motion import LowDynamics
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_rotate
 from nav.samples import Array, ImuSamples, UpdateReport
+from nav.unscented import Scaling
 from nav.voting import Voter
-from nav.weighting import MahalanobisInflation
-from testbed.scenario import DetectorConfig, EstimatorConfig, PolicyConfig, Scenario
+from nav.weighting import Fading, MahalanobisInflation, SageHusa
+from testbed.scenario import CourseConfig, DetectorConfig, EstimatorConfig, PolicyConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -58,6 +59,7 @@ VOTED_OUT, DISAGREE = "voted out", "the units left disagree"
 SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
 LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
 IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
+GNSS_LOOKS = ("gnss_position", "gnss_velocity", "gnss_course")
 NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 
 
@@ -218,16 +220,26 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     kinds: Mapping[str, SensorConfig] = {kind: scenario.sensors[name] for kind, name in offered.items()}
     errors = imu.errors()
     told = _told(kinds, errors, config.gust_mps)
+    if config.course is not None:
+        # With the wind, course says what the constraint of no sideslip says: both would count it twice.
+        slip = told.pop("sideslip_sigma", 0.0) if "airspeed" in aids else 0.0
+        told |= {"course": _course(config.course, slip), "sideslip_sigma": None}
     others = {name: _other(name, scenario.sensors[name], config) for name in config.aids}
+    learning = config.sage_husa
+    fading = config.fading
     ins = Ins(
         InsConfig(
             imu_model(errors, math.radians(config.turn_degps)),
             aids,
             tuple(aid for aid in others.values() if aid is not None),
             mounting_sigma=errors.accel_misalignment,
+            scaling=Scaling() if config.engine == "unscented" else None,
+            false_rejection=config.false_rejection,
             **told,  # type: ignore[arg-type]
         ),
         partial(geomagnetic_field_n, date=scenario.date),
+        {part: SageHusa(learning.b) for part in GNSS_LOOKS} if learning else None,
+        {part: Fading(fading.window, fading.alpha) for part in fading.looks} if fading else None,
     )
     used = dict.fromkeys((*offered.values(), *(name for name, aid in others.items() if aid is not None)))
     imus, voter = _imus(config, scenario)
@@ -238,6 +250,13 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         _handover(config, ins, errors, seed),
         voter,
     )
+
+
+def _course(config: CourseConfig, slip: object) -> Course:
+    """Course with the slip [m/s] that the constraint of no sideslip would be told, none on a road."""
+    assert isinstance(slip, float)
+    limit = math.inf if config.max_turn_rate_degps is None else math.radians(config.max_turn_rate_degps)
+    return Course(limit, config.quiet_s, slip)
 
 
 def _lag_s(scenario: Scenario, names: Iterable[str]) -> float:

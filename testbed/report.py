@@ -691,10 +691,13 @@ def _figures(run: _Run) -> Iterator[tuple[str, str, Figure | None]]:
         yield f"{name}_innovations", f"{name}: what each aid said that was not expected.", innovations(run, name)
 
 
-def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder: Path) -> Path:
+def write_report(
+    dataset: xarray.DataTree, metrics: Mapping[str, float], folder: Path, seen: Sequence[Sequence[str]] = ()
+) -> Path:
     """Write ``report.html`` and one PNG per figure into ``folder`` and return the page's path.
 
-    The page holds everything it shows. Raises UserError when the folder can't be written.
+    ``seen`` are the rows of a table of which states can be seen, and when, with its head. The page holds everything it
+    shows. Raises UserError when the folder can't be written.
     """
     run = _Run(dataset)
     try:
@@ -707,7 +710,7 @@ def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder:
                 write_file(folder / f"{name}.png", png.getvalue())
                 shown.append((caption, png.getvalue()))
         page = folder / "report.html"
-        write_file(page, _page(run, metrics, shown).encode())
+        write_file(page, _page(run, metrics, shown, seen).encode())
     except OSError as error:
         raise UserError(
             f"{folder}: can't write the report ({error.strerror or error}); choose another --out"
@@ -720,11 +723,14 @@ body{font:15px/1.45 system-ui,sans-serif;color:#222;max-width:1080px;margin:2em 
 h1{font-size:1.5em;margin-bottom:.1em} table{border-collapse:collapse;margin:1em 0}
 td,th{padding:.2em .9em;border-bottom:1px solid #ddd;text-align:right;font-variant-numeric:tabular-nums}
 td:first-child,th:first-child{text-align:left} figure{margin:2em 0} img{max-width:100%}
+.seen{font-size:.85em} .seen td,.seen th{padding:.05em .9em}
 figcaption{color:#444} pre{background:#f6f6f6;padding:1em;overflow:auto} .warning{color:#a30}
 """
 
 
-def _page(run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, bytes]]) -> str:
+def _page(
+    run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, bytes]], seen: Sequence[Sequence[str]]
+) -> str:
     attributes = run.dataset.attrs
     title = html.escape(str(attributes.get("title", "Run")))
     parts = [
@@ -747,6 +753,7 @@ def _page(run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, 
         parts.append(
             f"<figure><img alt='{text}' src='data:image/png;base64,{data}'><figcaption>{text}</figcaption></figure>"
         )
+    parts.append(_html_seen(seen))
     parts.append(_html_events(run))
     for summary, key in (("Scenario", "scenario"), ("Overrides", "overrides"), ("Versions", "versions")):
         if attributes.get(key):
@@ -782,6 +789,23 @@ def _html_faults(run: _Run, metrics: Mapping[str, float]) -> str:
     head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in shown)
     return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _html_seen(rows: Sequence[Sequence[str]]) -> str:
+    """Which states can be seen, and when."""
+    if not rows or len(rows[0]) < 2:
+        return ""
+    head, *body = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+    text = (
+        "Which states the aids can show along this way, and from when on: an error as large as it was once aligned"
+        " moves what is measured within five seconds by its noise. In brackets the share that shows of one that is"
+        " never seen alone."
+    )
+    lines = "".join(f"<tr>{row}</tr>" for row in body)
+    return (
+        f"<figure><table class='seen'><tr>{head.replace('td>', 'th>')}</tr>{lines}</table>"
+        f"<figcaption>{text}</figcaption></figure>"
+    )
 
 
 def _html_events(run: _Run) -> str:

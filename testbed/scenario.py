@@ -65,6 +65,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
     ),
     **dict.fromkeys(("heading_deg", "levelling", "level"), ("ahrs",)),
     **dict.fromkeys(("handover", "nonholonomic_mps"), ("ins", "federated")),
+    **dict.fromkeys(("engine", "course", "sage_husa", "fading", "false_rejection"), ("ins",)),
     "literal": ("federated", "ahrs"),
 }  # fmt: skip
 
@@ -220,6 +221,29 @@ class LevelConfig(Section):
     gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
 
 
+class CourseConfig(Section):
+    """GNSS course as a look at the heading: with the wind where airspeed aids, taken for heading where it does not."""
+
+    max_turn_rate_degps: float | None = Field(default=None, gt=0, le=360, description="none: in turns as well")
+    quiet_s: float = Field(default=2.0, ge=0, le=60, description="for how long it must not have turned faster")
+
+
+class SageHusaConfig(Section):
+    """Measurement noise learned from the residuals (`nav.weighting.SageHusa`)."""
+
+    b: float = Field(default=0.97, ge=0.5, lt=1, description="forgetting factor per look")
+
+
+class FadingConfig(Section):
+    """Covariance made as large as the innovations say when they diverge (`nav.weighting.Fading`)."""
+
+    window: int = Field(default=10, ge=1, le=1000, description="looks")
+    alpha: float = Field(default=20.0, ge=1, le=100, description="times the expected innovation is divergence")
+    looks: Annotated[tuple[Literal["gnss_position", "gnss_velocity", "gnss_course"], ...], Field(min_length=1)] = (
+        "gnss_position", "gnss_velocity", "gnss_course",
+    )  # fmt: skip
+
+
 class EstimatorConfig(Section):
     """One ``[[estimator]]``: which IMU it integrates and which sensors aid it.
 
@@ -239,6 +263,11 @@ class EstimatorConfig(Section):
     nonholonomic_mps: float | None = Field(
         default=None, gt=0, le=10, description="slip of wheels where body velocity aids; none: no constraint"
     )
+    engine: Literal["linear", "unscented"] = Field(default="linear", description="derivatives or sigma points")
+    course: CourseConfig | None = Field(default=None, description="of its GNSS receiver; none: not used")
+    sage_husa: SageHusaConfig | None = Field(default=None, description="none: the receiver's sigmas are believed")
+    fading: FadingConfig | None = None
+    false_rejection: float = Field(default=1e-3, ge=0, lt=0.5, description="of sound samples by the gate; 0: no gate")
     heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
     levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
     level: LevelConfig | None = Field(default=None, description="how an AHRS levels; none: as light turbulence wants")
@@ -609,6 +638,9 @@ def _estimator_faults(
         yield from _federated_faults(path, config, kinds, usable)
         return
     yield from _aid_faults(path, config.kind, config.aids, kinds, usable)
+    for key in ("course", "sage_husa", "fading"):
+        if getattr(config, key) is not None and "gnss" not in [kinds.get(aid) for aid in config.aids]:
+            yield (*path, key), "needs a GNSS receiver among the aids: add one, or leave it out"
     for index, aid in enumerate(config.aids):
         if aid in config.aids[:index] or aid not in usable:
             continue

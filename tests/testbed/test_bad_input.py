@@ -523,3 +523,12 @@ def test_only_clean_loads_or_clean_errors_at_length(text: str, overrides: list[s
     scenario = loads_or_complains(text, overrides)
     if scenario is not None and scenario.truth.source == "kinematic":
         run(scenario.model_copy(update={"duration_s": 3.0}))
+
+
+def test_keys_of_an_ins() -> None:
+    blind = complaint(U_TURN, 'estimator.ins.aids=["barometer"]', "estimator.ins.course={}")
+    assert "estimator[0].course: needs a GNSS receiver among the aids" in blind
+    ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.engine="unscented"')
+    assert "estimator[2].engine: is a key of kind 'ins', not of 'ahrs'" in ahrs
+    assert "fading.looks" in complaint(U_TURN, 'estimator.ins.fading={ looks = ["gnss_heading"] }')
+    assert "sage_husa.b" in complaint(U_TURN, "estimator.ins.sage_husa={ b = 1.0 }")

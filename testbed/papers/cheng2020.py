@@ -1,0 +1,279 @@
+"""Cheng et al. 2020: heading on the road from GNSS course, with a turn rule and an adaptive unscented filter.
+
+`scenarios/papers/cheng2020.toml` holds the assumptions. The paper runs it for 3 h, and so does one job; what is asked
+of every seed is in the first 1000 s: two stops, two turns and the beginning of the straight after the third.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nav.earth import OMEGA_IE, gravity
+from nav.error_model import ErrorModel, ImuModel
+from nav.observability import Segment, analyse, continuous, derivatives, stripped
+from nav.rotation import quat_from_euler
+from nav.samples import Array
+from testbed import metrics
+from testbed.data import write_file
+from testbed.loop import run
+from testbed.papers import Claim, Job, Paper, scenario
+from testbed.scenario import Scenario
+
+SEEDS = range(1, 11)
+SHORT_S, LONG_S, STRAIGHT_S = 1000, 10_800, 300
+SETTLED_S = 300.0  # from here on the paper's figures are to hold
+DRIFT_DEG = 3.0  # of the scenario's turns
+KAPPA = math.radians(2.0)
+AFTER_TURN_S = 10
+NOISIER_S, LEARNED_S = 400, 200  # when the receiver gets worse, and how many looks there are to find out
+NEARLY_ALL = 0.9973  # of a normal error that lies within three sigma
+
+_MORE_NOISE = ", ".join(
+    f'{{ sensor = "gnss", channel = "{channel}", kind = "noise", factor = 2, window = [{NOISIER_S}, {LONG_S}] }}'
+    for channel in ("north", "east", "down", "v_north", "v_east", "v_down")
+)
+
+
+def selected(estimators: Sequence[str], overrides: Sequence[str] = ()) -> Scenario:
+    """The scenario with these of its estimators."""
+    whole = scenario("cheng2020", overrides)
+    return whole.model_copy(update={"estimator": tuple(one for one in whole.estimator if one.name in estimators)})
+
+
+def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any]:
+    """One run: what each of the estimators made of it. Angles in deg."""
+    dataset = run(selected(estimators, [f"duration_s={duration_s}"]), seed=seed).dataset
+    t = metrics.column(dataset, "truth/time")
+    rate = np.abs(metrics.column(dataset, "truth/omega_b")[:, 2])
+    speed = np.linalg.norm(metrics.column(dataset, "truth/v_n"), axis=1)
+    turning = rate > KAPPA
+    near_turn = np.convolve(turning, np.ones(AFTER_TURN_S + 1))[: len(t)] > 0
+    first_turn = t[np.argmax(turning)]
+    result: dict[str, Any] = {}
+    for name in estimators:
+        e = metrics.errors(dataset, name, 0.0)
+        heading, level = np.degrees(e.attitude[:, 2]), np.degrees(e.attitude[:, :2])
+        settled, turned = e.t > SETTLED_S, e.t > first_turn + AFTER_TURN_S
+        own = f"estimators/{name}/innovations"
+        learned = {
+            aid: 1 / metrics.column(dataset, f"{own}/{aid}/weight") for aid in metrics.aids(dataset, name)
+        }  # of R, to what was told
+        result[name] = {
+            "heading_straight": _largest(heading[settled & ~near_turn]),
+            "heading_turn": _largest(heading[settled & near_turn]),
+            "level_before": _largest(level[e.t < first_turn]),
+            "level_rms": _rms(level[turned]),
+            "level_nearly_all": float(np.quantile(np.abs(level[turned]), NEARLY_ALL)),
+            "velocity": float(np.quantile(np.abs(e.velocity[settled, :2]), NEARLY_ALL)),
+            "position_rms": _rms(e.position[settled, :2]),
+            "position_largest": _largest(e.position[settled, :2]),
+            "least_R": float(min(ratio.min() for ratio in learned.values())),
+        }
+        if "gnss_course" in learned:
+            at = np.searchsorted(t, metrics.column(dataset, f"{own}/gnss_course/sample_time") - metrics.SAME_TIME_S)
+            result[name] |= {"course_looks": len(at), "course_amiss": int(np.sum(turning[at] | (speed[at] < 1.0)))}
+        if seed == SEEDS[0]:
+            result[name] |= {"t": e.t.tolist(), "heading": heading.tolist(), "level": level.tolist()}
+    result["turns"] = t[turning & ~np.roll(turning, 1)].tolist()
+    return result
+
+
+def noisier(seed: int) -> dict[str, float]:
+    """By how much the learned variance is off, some looks after the receiver's became four times as large."""
+    end = NOISIER_S + LEARNED_S
+    dataset = run(selected(["improved"], [f"duration_s={end + 1}", f"fault=[{_MORE_NOISE}]"]), seed=seed).dataset
+    off = {}
+    for aid in ("gnss_position", "gnss_velocity"):
+        own = f"estimators/improved/innovations/{aid}"
+        last = np.searchsorted(metrics.column(dataset, f"{own}/sample_time"), end)
+        off[aid] = abs(1 / float(metrics.column(dataset, f"{own}/weight")[last]) / 4 - 1)
+    return off
+
+
+def straight(seed: int) -> tuple[float, float]:
+    """Heading error [deg] of a filter without course after a straight, and its own sigma relative to the initial."""
+    overrides = [
+        f"duration_s={STRAIGHT_S}",
+        "truth.start.speed_mps=3",
+        'truth.segments=[{ leg = "straight", duration_s = 1e4 }]',
+    ]
+    e = metrics.errors(run(selected(["no_course"], overrides), seed=seed).dataset, "no_course", 0.0)
+    sigma = e.sigma_attitude[:, 2]
+    return math.degrees(e.attitude[-1, 2]), float(sigma[-1] / sigma[0])
+
+
+def table_1() -> dict[str, Any]:
+    """The singular values of Table 1's velocity column, and the ranks: of the paper's states, at rest at its start."""
+    lat = math.radians(scenario("cheng2020").truth.start.lat_deg)
+    model = ErrorModel(ImuModel(1e-4, 1e-3, 1e-4, 0.05))
+    of = {name: model.start(name) for name in ("phi", "dv", "dp", "gyro_bias", "accel_bias")}
+    # the paper has no vertical velocity and position
+    kept = [k for k in range(model.size) if k not in (of["dv"] + 2, of["dp"] + 2)]
+    place = {k: i for i, k in enumerate(kept)}
+
+    def segment(heading: float, rows: Sequence[int]) -> Segment:
+        q_nb, f_b = quat_from_euler(0.0, 0.0, heading), np.array([0.0, 0.0, -gravity(lat, 0.0)])
+        F = continuous(model, q_nb, np.zeros(3), np.array([lat, 0.0, 0.0]), f_b, np.zeros(3))
+        return Segment(F[np.ix_(kept, kept)], np.eye(model.size)[np.ix_(rows, kept)], 60.0)
+
+    velocity, position, heading = [of["dv"], of["dv"] + 1], [of["dp"], of["dp"] + 1], [of["phi"] + 2]
+    every = velocity + position + heading
+    matrices = [
+        *(derivatives(segment(0.0, rows)) for rows in (velocity, velocity + position, every)),
+        stripped([segment(0.0, every), segment(math.pi / 2, every)]),
+    ]
+    degree = analyse(matrices[0], 1e-8, reference=place[of["dv"]]).degree
+    return {
+        "ranks": [analyse(Q, 1e-8).rank for Q in matrices],
+        "phi": degree[[place[of["phi"]], place[of["phi"] + 1]]].tolist(),
+        "eps": degree[[place[of["gyro_bias"]], place[of["gyro_bias"] + 1]]].tolist(),
+        "eps_down": float(degree[place[of["gyro_bias"] + 2]]),
+        "dv": degree[[place[k] for k in velocity]].tolist(),
+        "unseen": float(degree[[place[of["phi"] + 2], *(place[of["accel_bias"] + k] for k in range(3))]].max()),
+        "g_earth_rate": float(gravity(lat, 0.0)) * OMEGA_IE * math.cos(lat),
+    }
+
+
+def _largest(values: Array) -> float:
+    return float(np.abs(values).max())
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+ALL = ("improved", "ungated", "no_course")
+
+
+def _jobs() -> list[Job]:
+    return [
+        Job(road, (SEEDS[-1] + 1, LONG_S, ("improved",))),
+        *(Job(road, (seed, SHORT_S, ALL)) for seed in SEEDS),
+        *(Job(noisier, (seed,)) for seed in SEEDS),
+        *(Job(straight, (seed,)) for seed in SEEDS),
+        Job(table_1, ()),
+    ]
+
+
+def _conclude(results: Sequence[Any]) -> list[Claim]:
+    n = len(SEEDS)
+    roads, noises, straights, table = results[: n + 1], results[n + 1 : -n - 1], results[-n - 1 : -1], results[-1]
+
+    left, claimed = np.array(straights).T
+
+    def of(name: str, key: str) -> list[float]:
+        return [one[name][key] for one in roads if name in one]
+
+    def improved(key: str) -> list[float]:
+        return of("improved", key)
+
+    return [
+        Claim(
+            "heading on straights from 300 s, largest", "deg", "0.1", improved("heading_straight"), 0.1, worst=True,
+            target=0.08,
+        ),
+        Claim("heading in turns and 10 s after, largest", "deg", "0.1", improved("heading_turn"), 0.3, worst=True),
+        Claim(
+            "the same without the turn rule", "deg", "large oscillation", of("ungated", "heading_turn"),
+            DRIFT_DEG / 2, at_least=True, worst=True,
+        ),
+        Claim(
+            "heading after 300 s of straight, without course, RMS over the seeds", "deg", "constant offset",
+            [_rms(left)], 1.0, at_least=True,
+        ),
+        Claim(
+            "its own 1 sigma then, of the initial one", "1", "offset whatever the initial error", claimed, 0.9,
+            at_least=True, worst=True,
+            impossible="nothing there shows the heading (Table 1: phi_U 0): what was wrong stays, and drifts",
+        ),
+        Claim(
+            "level before the first turn, largest", "deg", "0.01", improved("level_before"), 0.3,
+            impossible="at one heading a tilt can't be told from the accelerometer's bias (Table 1: nabla 0)",
+        ),
+        Claim("level after the first turn, RMS", "deg", "0.01", improved("level_rms"), 0.02, worst=True),
+        Claim("level after the first turn, 99.7 % of the time", "deg", "0.01", improved("level_nearly_all"), 0.02),
+        Claim("velocity, each axis, 99.7 % of the time", "m/s", "0.02", improved("velocity"), 0.02, worst=True),
+        Claim(
+            "position, each axis, RMS", "m", "1", improved("position_rms"), 0.6, target=0.6,
+        ),
+        Claim("position, each axis, largest", "m", "1", improved("position_largest"), 1.5),
+        Claim(
+            "courses used in a turn or below 1 m/s", "", "0", improved("course_amiss"), 0, worst=True,
+        ),
+        Claim("courses used on straights, of 3 h", "", "all", [max(improved("course_looks"))], 5000, at_least=True),
+        Claim(
+            "smallest learned variance, of the nominal", "1", "may be negative (Eq 29)", improved("least_R"), 0.25,
+            at_least=True, worst=True,
+        ),
+        *(
+            Claim(
+                f"{what} variance x 4: learned within, after 200 looks", "1", "", [one[aid] for one in noises], 0.25
+            )
+            for what, aid in (("position", "gnss_position"), ("velocity", "gnss_velocity"))
+        ),
+        Claim(
+            "Table 1, velocity: phi, eps, dV off the print by", "%", "9.86, 9.80, 1",
+            [
+                100 * abs(ours / printed - 1)
+                for key, printed in (("phi", 9.86), ("eps", 9.80), ("dv", 1.0))
+                for ours in table[key]
+            ],
+            0.6, worst=True,
+        ),
+        Claim("Table 1, velocity: phi_U, nabla", "", "0", [table["unseen"]], 1e-9),
+        Claim(
+            "Table 1, velocity: eps_U", "", "5.66e-4", [table["eps_down"]], 1.01 * table["g_earth_rate"],
+            impossible="it is g w_ie cos 45 deg = 5.06e-4",
+        ),
+        Claim(
+            "ranks with velocity, position, heading, a turn: off by", "", "7, 9, 10, 12",
+            [abs(ours - printed) for ours, printed in zip(table["ranks"], (7, 9, 10, 12), strict=True)], 0, worst=True,
+        ),
+    ]  # fmt: skip
+
+
+def _draw(results: Sequence[Any], out: Path) -> None:
+    from matplotlib.figure import Figure
+
+    drawn = next(one for one in results if isinstance(one, dict) and "t" in one.get("improved", {}))
+    figure = Figure(figsize=(8, 7), layout="constrained")
+    whole, near, level = figure.subplots(3, 1, sharex=True)
+    colours = {"improved": "#0072B2", "ungated": "#D55E00", "no_course": "#009E73"}
+    labels = {
+        "improved": "course, turn rule, adaptive",
+        "ungated": "the same without the turn rule",
+        "no_course": "no course",
+    }
+    for name in ("ungated", "no_course", "improved"):
+        for ax in (whole, near):
+            ax.plot(drawn[name]["t"], drawn[name]["heading"], color=colours[name], label=labels[name], lw=1)
+    level.plot(drawn["improved"]["t"], drawn["improved"]["level"], lw=1, label=["about north", "about east"])
+    for ax, limit, title in (
+        (whole, 3.2, "heading error [deg]"),
+        (near, 0.3, "the same, enlarged [deg]"),
+        (level, 0.12, "level error about north and east [deg]"),
+    ):
+        ax.set_ylim(-limit, limit)
+        ax.set_title(title, loc="left", fontsize=10)
+        ax.grid(alpha=0.3)
+        for turn in drawn["turns"]:
+            ax.axvspan(turn, turn + 4, color="#DDDDDD", zorder=0)
+    for ax in (near, level):
+        ax.axhline(0.1 if ax is near else 0.02, color="black", lw=0.8, ls=":")
+        ax.axhline(-0.1 if ax is near else -0.02, color="black", lw=0.8, ls=":")
+    whole.legend(fontsize=8, loc="lower left", ncols=3)
+    level.legend(fontsize=8, ncols=2)
+    level.set_xlabel("time [s]; turns shaded")
+    level.set_xlim(0, SHORT_S)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png", dpi=100)
+    write_file(out / "cheng2020.png", picture.getvalue())
+
+
+PAPER = Paper("Cheng et al. 2020: heading from GNSS course on the road", _jobs, _conclude, _draw)
