@@ -431,7 +431,8 @@ class Watch:
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
     consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
-    ``suspect`` says that some axis is isolated, ``out`` that every one is.
+    ``suspect`` says that some axis is isolated, ``out`` that every one is; ``evidence`` is the statistic of the last
+    look over its threshold.
     """
 
     def __init__(
@@ -441,12 +442,14 @@ class Watch:
         self._isolate_after, self._readmit_after = isolate_after, readmit_after
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
+        self.evidence = 0.0
         self._bad, self._good = np.zeros(size), np.zeros(size)
         self._clean = True
 
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
         decision = self.detector.step(nu, S, t)
+        self.evidence = decision.statistic / decision.threshold
         if not decision.alarm and self._clean:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated
@@ -458,6 +461,12 @@ class Watch:
         if (self.isolated & ~before).any():
             return decision, Change.ISOLATED
         return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
+
+    def convict(self) -> None:
+        """Isolate every axis, whatever the detector found."""
+        self.isolated, self._good = np.full(len(self.isolated), True), np.zeros(len(self.isolated))
+        self.suspect = self.out = True
+        self._clean = False
 
 
 class LocalFilter:

@@ -343,6 +343,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
             fusion_period_s=config.fusion_period_s,
             isolate_after=config.isolate_after,
             readmit_after=config.readmit_after,
+            cross_check=config.cross_check,
             mounting_sigma=errors.accel_misalignment,
             alignment_aids=tuple(aids.values()),
         ),

@@ -59,7 +59,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         (
             "locals", "structure", "sharing", "combination", "retention", "fusion_period_s", "isolate_after",
-            "readmit_after",
+            "readmit_after", "cross_check",
         ),
         ("federated",),
     ),
@@ -233,6 +233,7 @@ class EstimatorConfig(Section):
     fusion_period_s: float = Field(default=1.0, ge=0, le=60)
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
+    cross_check: bool = Field(default=False, description="of the local filters with each other; needs no_reset")
     literal: bool = Field(
         default=False, description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13"
     )
@@ -626,6 +627,9 @@ def _federated_faults(
             (*path, "sharing"),
             f"structure {config.structure!r} would count the same information again and again: share it",
         )
+    if config.cross_check and (config.structure != "no_reset" or config.combination != "information"):
+        text = 'compares independent filters: it needs structure = "no_reset" and combination = "information"'
+        yield (*path, "cross_check"), text
     if config.combination != "information" and config.sharing != "none":
         yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
 
