@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -18,7 +19,7 @@ import numpy as np
 
 from nav import aiding
 from nav._jit import njit
-from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask
+from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask, chi_square_threshold
 from nav.earth import pressure_altitude
 from nav.error_model import Block, ErrorModel, ImuModel, Indices, markov
 from nav.kalman import innovate
@@ -39,6 +40,7 @@ from nav.samples import (
 Axes: TypeAlias = tuple[float, float, float]
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Watch`
 OUTSIDE, ISOLATED, LEFT_OUT = "outside the gate", "isolated", "left out by the measurement policy"
 
 
@@ -430,7 +432,9 @@ class Watch:
     """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
-    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
+    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones, or when
+    each of `PATIENT` times as many would be sound alone: while a sensor is isolated nothing estimates its slow errors,
+    its innovations are correlated, and a detector that gathers them might never let it go. It begins anew then.
     ``suspect`` says that some axis is isolated, ``out`` that every one is; ``evidence`` is the statistic of the last
     look over its threshold.
     """
@@ -443,8 +447,9 @@ class Watch:
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
         self.evidence = 0.0
-        self._bad, self._good = np.zeros(size), np.zeros(size)
+        self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
         self._clean = True
+        self._new_detector = deepcopy(detector)
 
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
@@ -455,7 +460,14 @@ class Watch:
         sound, before = decision.axis_mask, self.isolated
         self._bad = np.where(sound, 0.0, self._bad + 1.0)
         self._good = np.where(sound, self._good + 1.0, 0.0)
-        self.isolated = np.where(before, self._good < self._readmit_after, self._bad >= self._isolate_after)
+        alone = nu * nu <= chi_square_threshold(ALONE_FALSE_ALARM, 1) * S.diagonal()
+        self._alone = np.where(before & alone, self._alone + 1.0, 0.0)
+        patient = self._alone >= PATIENT * self._readmit_after
+        self.isolated = np.where(
+            before, (self._good < self._readmit_after) & ~patient, self._bad >= self._isolate_after
+        )
+        if patient.any():
+            self.detector, self._alone = deepcopy(self._new_detector), np.zeros(len(nu))
         self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
         self._clean = not self.suspect and not self._bad.any()
         if (self.isolated & ~before).any():
