@@ -432,9 +432,11 @@ class Watch:
     """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
-    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones, or when
-    each of `PATIENT` times as many would be sound alone: while a sensor is isolated nothing estimates its slow errors,
-    its innovations are correlated, and a detector that gathers them might never let it go. It begins anew then.
+    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones, or
+    when all isolated axes would each be sound alone in `PATIENT` times as many: while a sensor is isolated nothing
+    estimates its slow errors, its innovations are correlated, and a detector that gathers them might never let it go.
+    It begins anew then.
+
     ``suspect`` says that some axis is isolated, ``out`` that every one is; ``evidence`` is the statistic of the last
     look over its threshold.
     """
@@ -462,11 +464,10 @@ class Watch:
         self._good = np.where(sound, self._good + 1.0, 0.0)
         alone = nu * nu <= chi_square_threshold(ALONE_FALSE_ALARM, 1) * S.diagonal()
         self._alone = np.where(before & alone, self._alone + 1.0, 0.0)
-        patient = self._alone >= PATIENT * self._readmit_after
-        self.isolated = np.where(
-            before, (self._good < self._readmit_after) & ~patient, self._bad >= self._isolate_after
-        )
-        if patient.any():
+        patient = self.suspect and bool((self._alone[before] >= PATIENT * self._readmit_after).all())
+        kept = before & (self._good < self._readmit_after) & (not patient)
+        self.isolated = kept | (~before & (self._bad >= self._isolate_after))
+        if patient:
             self.detector, self._alone = deepcopy(self._new_detector), np.zeros(len(nu))
         self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
         self._clean = not self.suspect and not self._bad.any()
