@@ -397,15 +397,20 @@ class _Reports:
     judged: Mask
 
 
+def refused(weight: Array, reason: npt.NDArray[np.str_]) -> Mask:
+    """Which samples (N,) were not used, or not with every axis."""
+    return (weight <= 0) | np.isin(reason, (OUTSIDE, ISOLATED))
+
+
 def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     own = f"estimators/{estimator}/innovations/{aid}"
     reason, value = column(dataset, f"{own}/reason").astype(str), column(dataset, f"{own}/nis")
-    used = column(dataset, f"{own}/weight") > 0
+    weight = column(dataset, f"{own}/weight")
+    used = weight > 0
     tested = np.isfinite(value)  # an unsound sample has no innovation
     withheld = np.char.endswith(reason, Verdict.PROBATION.value)
     withheld |= np.char.startswith(reason, "position ") & tested  # velocity, whose position was refused
-    partly = used & np.isin(reason, (OUTSIDE, ISOLATED))  # the axes that look sound are used
-    alarm = ~used & ~withheld | partly
+    alarm = refused(weight, reason) & ~withheld
     return _Reports(
         t=column(dataset, f"{own}/sample_time"),
         sensor=column(dataset, f"{own}/sensor").astype(str),
