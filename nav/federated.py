@@ -21,14 +21,26 @@ axis is isolated as a whole. While any part of a sensor is isolated it is judged
 filters without an isolated part, since its own filter drifts, or is wrong. A fault
 that grows slowly has pulled its filter before it is found. Therefore on every isolation all filters start again from
 the fused solution of those without an isolated part, P_i = P_g / beta_i: what the faulty sensor told stays in none,
-nothing is counted twice, and the Markov errors of its aid go back to their first variance. When all filters have an
-isolated part, they are left as they are.
+nothing is counted twice, and the Markov errors of its aid go back to their first variance. Filters with an isolated
+part get next to no share of it: what they hold is lost when another part is isolated. When all filters have an isolated
+part, they are left as they are.
 
 Which structure finds faults: with ``no_reset`` a fault stays in its own filter until it is found, but a filter that is
-alone with a poor IMU follows a spoofer whose velocity grows slowly together with its position, and never notices. With
-``full_reset`` the fault reaches all filters until it is found, but every look is judged by what all sensors predict,
-and the sound receiver keeps that prediction with the IMU. Without aid in an outage ``full_reset`` is as good as one
-filter with every sensor; without resets nobody combines one filter's wind with another's heading.
+alone with a poor IMU follows a spoofer whose velocity grows slowly together with its position, and never notices: that
+takes a cross-check. With ``full_reset`` the fault reaches all filters until it is found, but every look is judged by
+what all sensors predict, and the sound receiver keeps that prediction with the IMU. Without aid in an outage
+``full_reset`` is as good as one filter with every sensor; without resets nobody combines one filter's wind with
+another's heading.
+
+Cross-check. A fault that grows as smoothly as the aircraft could move drags its own filter along and is never seen
+there; but then the filters contradict each other. With ``cross_check``, before a fusion each filter without an isolated
+part is compared with the fused solution of the others in position and velocity, which the sharing has made independent:
+(x_i - x_o)' (P_i + P_o)^-1 (x_i - x_o) is chi-square of six degrees of freedom at most. When one exceeds its limit, a
+filter is wrong: of two that contradict each other as strongly it is the one whose own detectors have more evidence
+(`Watch.suspicion`): little, but the other has none, provided that they remember the onset as `nav.detection.Glr` does.
+That sensor is isolated. With resets all filters tell the same and nothing can be compared: it needs ``no_reset``.
+Without a third to tell who is wrong, that is the weakest link: a fault so slow that no detector has evidence of its
+onset is found, but may be laid on the wrong one of two receivers.
 
 Weighting. ``normalised`` weakens a look before its detector condemns it: its variances become R / N with the weight of
 `nav.weighting.normalised_weights` (Zhou et al. 2025, Eq 22-26) from its own statistic and that of every other filter,
@@ -55,8 +67,8 @@ import numpy as np
 from nav import aiding
 from nav._jit import njit
 from nav.alignment import AidSigmas, Alignment, InitialState
-from nav.detection import ChiSquareGate
-from nav.error_model import POS, VEL, ImuModel
+from nav.detection import ChiSquareGate, chi_square_threshold, whiten
+from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import (
     ISOLATED,
     OUTSIDE,
@@ -106,8 +118,10 @@ Sharing = Literal["fixed", "by_covariance", "none"]
 Combination = Literal["information", "scalar", "covariance_intersection"]
 Weighting = Literal["none", "normalised"]
 
+CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
+CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
-LEAST_SHARE = 0.02  # of a filter when shares follow the covariances: it must be able to come back
+LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
 
 @dataclass(frozen=True)
@@ -140,6 +154,7 @@ class Config:
     isolate_after: int = 3  # consecutive condemned looks
     readmit_after: int = 10  # consecutive sound looks
     recall_s: float | None = None  # age of what an isolated filter goes back to; None: to the others' solution
+    cross_check: bool = False  # of the filters' solutions, at every fusion
     patience_s: float = 30.0  # of refused positions and none fused
     covariance_period: int = 10  # IMU samples per covariance step
     mounting_sigma: float = 0.0  # between the axes of the IMU and of the body [rad]
@@ -157,6 +172,8 @@ class Config:
             raise ValueError(f"retention {self.retention} is no fraction from 0 to 1")
         if self.recall_s is not None and self.structure != "no_reset":
             raise ValueError(f"structure {self.structure!r} spreads what recall_s would take back from one filter")
+        if self.cross_check and (self.structure != "no_reset" or self.combination != "information"):
+            raise ValueError("cross_check compares independent filters: structure no_reset and information needed")
         if self.combination == "information":
             if self.sharing == "none" and self.structure != "no_reset":
                 raise ValueError(f"structure {self.structure!r} counts information again and again without sharing it")
@@ -339,6 +356,8 @@ class Federated:
             reports += self._use(state, filter_, sample)
         config = self.config
         if sample.t - self._fused_at >= config.fusion_period_s - TIME_TOLERANCE:
+            if config.cross_check:
+                self._cross_check(state, sample.t)
             self._fuse(state)
             self._fused_at = sample.t
             if config.recall_s is not None and sample.t - self._remembered_at >= config.recall_s - TIME_TOLERANCE:
@@ -443,16 +462,18 @@ class Federated:
     def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
         """Innovation and covariance of a look against the fused solution of the healthy filters.
 
-        With a recall, of all of them: then the filter was put back to what it knew before the fault.
+        What its own filter knows of the sensor's error given the common states goes with it. With a recall all filters
+        are healthy: then its own was put back to what it knew before the fault.
         """
         everyone = np.ones(len(self.locals))
         healthy = everyone if self.config.recall_s is not None else self._healthy()
         master = self._combine(state, healthy if healthy.any() else everyone)
-        common, row = self._common, filter_.row
-        H, own = look.H[:, :common], look.H[:, common:]
-        nu = look.nu - H @ master.x
-        S = H @ master.P @ H.T + own @ state.P[row, common:, common:] @ own.T + np.diag(look.R)
-        return nu, S
+        x, P, common = state.x[filter_.row].copy(), state.P[filter_.row].copy(), self._common
+        change = -x
+        change[:common] = 0.0  # the nominal state is without what the filter would add to it
+        reset(x, P, master.x, master.P)
+        change += x
+        return look.nu - look.H @ change, look.H @ P @ look.H.T + np.diag(look.R)
 
     def _healthy(self) -> Array:
         """1 for each local filter without an isolated part, 0 for the others."""
@@ -469,12 +490,18 @@ class Federated:
             return
         master = self._combine(state, healthy)
         row, model = faulty.row, faulty.model
+        shares = self._reset_shares()
+        if self.config.combination == "information":
+            shares = np.where(healthy > 0, shares, 0.0)
+            shares = np.where(
+                healthy > 0, shares / shares.sum() * (1 - LEAST_SHARE * np.sum(healthy == 0)), LEAST_SHARE
+            )
         for name in faulty.aids[sensor].states:
             if name in model.slices and model.decay_rate[model.slices[name].start] > 0:
                 where = model.slices[name]
                 state.x[row, where] = 0.0
                 forget(state.P[row], where.start, model.sigma[where] ** 2)
-        for i, share in enumerate(self._reset_shares()):
+        for i, share in enumerate(shares):
             reset(state.x[i], state.P[i], master.x, master.P / share)
 
     def _remember(self, state: State) -> None:
@@ -489,6 +516,26 @@ class Federated:
         n, row = len(self.locals), faulty.row
         for values in (state.x, state.P):
             values[row] = values[n + row] = values[2 * n + row]
+
+    def _cross_check(self, state: State, t: float) -> None:
+        """Isolate the sensor behind a contradiction between filters."""
+        healthy = self._healthy()
+        against = np.zeros(len(healthy))
+        if healthy.sum() >= 2:
+            for i in np.flatnonzero(healthy):
+                others = self._combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
+                S = state.P[i, VEL:MOTION, VEL:MOTION] + others.P[VEL:MOTION, VEL:MOTION]
+                against[i] = whiten(state.x[i, VEL:MOTION] - others.x[VEL:MOTION], S)[1]
+        if not against.max() > chi_square_threshold(CROSS_CHECK_FALSE_ALARM, MOTION - VEL):
+            return
+        suspects = [self.locals[i] for i in np.flatnonzero(against >= CONTRADICTION_SHARE * against.max())]
+        evidence = {(f, key): watch.suspicion for f in suspects for key, watch in f.watches.items()}
+        filter_, (sensor, _) = max(evidence, key=lambda which: evidence[which])
+        for (name, part), watch in filter_.watches.items():
+            if name == sensor:
+                watch.convict()
+                self._note(t, filter_, sensor, part, watch)
+        self._start_again(state, filter_, sensor)
 
     def _recover(self, state: State, sample: Sample) -> None:
         """Give up positions and velocities when every fix was refused for long."""

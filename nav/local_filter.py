@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
@@ -18,7 +19,7 @@ import numpy as np
 
 from nav import aiding, unscented
 from nav._jit import njit
-from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask
+from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask, chi_square_threshold
 from nav.earth import pressure_altitude
 from nav.error_model import MOTION, Block, ErrorModel, ImuModel, Indices, markov, sensor_errors
 from nav.kalman import innovate
@@ -41,6 +42,7 @@ from nav.weighting import Fading, InOrder, SageHusa, residual
 Axes: TypeAlias = tuple[float, float, float]
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Watch`
 OUTSIDE, ISOLATED, LEFT_OUT = "outside the gate", "isolated", "left out by the measurement policy"
 
 
@@ -464,7 +466,11 @@ class Watch:
     """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
 
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
-    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones.
+    consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones, or
+    when all isolated axes would each be sound alone in `PATIENT` times as many: while a sensor is isolated nothing
+    estimates its slow errors, its innovations are correlated, and a detector that gathers them might never let it go.
+    It begins anew then.
+
     ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
     look over its threshold, infinite when there is none; ``judged`` the time of that look [s].
     """
@@ -477,8 +483,9 @@ class Watch:
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
         self.suspicion, self.judged = 0.0, -math.inf
-        self._bad, self._good = np.zeros(size), np.zeros(size)
+        self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
         self._clean = True
+        self._new_detector = deepcopy(detector)
 
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on one look, and what it changes; an axis isolated outweighs one readmitted."""
@@ -490,12 +497,24 @@ class Watch:
         sound, before = decision.axis_mask, self.isolated
         self._bad = np.where(sound, 0.0, self._bad + 1.0)
         self._good = np.where(sound, self._good + 1.0, 0.0)
-        self.isolated = np.where(before, self._good < self._readmit_after, self._bad >= self._isolate_after)
+        alone = nu * nu <= chi_square_threshold(ALONE_FALSE_ALARM, 1) * S.diagonal()
+        self._alone = np.where(before & alone, self._alone + 1.0, 0.0)
+        patient = self.suspect and bool((self._alone[before] >= PATIENT * self._readmit_after).all())
+        kept = before & (self._good < self._readmit_after) & (not patient)
+        self.isolated = kept | (~before & (self._bad >= self._isolate_after))
+        if patient:
+            self.detector, self._alone = deepcopy(self._new_detector), np.zeros(len(nu))
         self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
         self._clean = not self.suspect and not self._bad.any()
         if (self.isolated & ~before).any():
             return decision, Change.ISOLATED
         return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
+
+    def convict(self) -> None:
+        """Isolate every axis, whatever the detector found."""
+        self.isolated, self._good = np.full(len(self.isolated), True), np.zeros(len(self.isolated))
+        self.suspect = self.out = True
+        self._clean = False
 
 
 class LocalFilter:

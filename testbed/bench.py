@@ -54,6 +54,9 @@ GYRO_WALK, ACCEL_WALK = 1e-6, 1e-5  # [rad/s/sqrt(s)], [m/s^2/sqrt(s)]
 GNSS_SIGMA = 1.0  # [m]
 REST_S, REST_HZ = 600.0, 200  # of the comparisons without a peer
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+TWO_ESTIMATORS = (
+    "estimator=[{name='ins', aids=['gnss', 'barometer', 'magnetometer', 'airspeed']}, {name='dead_reckoning', aids=[]}]"
+)
 IMU_COLUMNS = ("gyro", "accel")  # as pyins names them
 
 
@@ -98,7 +101,7 @@ def whole_run() -> list[Row]:
     from testbed.flight import Aircraft
     from testbed.scenario import FlightTruth
 
-    scenario = Scenario.load(MAIN)
+    scenario = Scenario.load(MAIN, [TWO_ESTIMATORS, "expect={}"])
     assert isinstance(scenario.truth, FlightTruth)
     truth = scenario.truth
     ticks = round(scenario.duration_s * truth.rate_hz)

@@ -368,6 +368,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
             isolate_after=config.isolate_after,
             readmit_after=config.readmit_after,
             recall_s=config.recall_s,
+            cross_check=config.cross_check,
             mounting_sigma=errors.accel_misalignment,
             alignment_aids=tuple(aids.values()),
         ),

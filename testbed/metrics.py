@@ -16,10 +16,10 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
   the gate judged, whether it let it pass or not, and ``rejected_fraction`` is the share that it did not. What was
   withheld for another reason, such as probation after an outage, is in neither.
 * Faults are scored one by one, under their names, for the estimators that take samples of the faulty sensor. A look is
-  one sample of the sensor; it is an alarm when the estimator refused any part of it, probation apart.
+  one sample of the sensor; it is an alarm when the estimator refused any part of it, be it one axis, probation apart.
   ``detection_delay_s``: from the beginning to the first alarm; ``missed``: 1 when there is none in the window;
-  ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a sample is used again,
-  with every axis;
+  ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a whole sample is used
+  again;
   ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window.
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
   while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
@@ -40,7 +40,7 @@ import numpy.typing as npt
 
 from nav import earth
 from nav.detection import Verdict
-from nav.local_filter import ISOLATED
+from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, FixType, Status
 from testbed.data import write_file
 from testbed.sensors.faults import FaultTruth
@@ -307,12 +307,13 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
     tilt, heading = np.rad2deg(e.tilt[mask]), np.rad2deg(e.attitude[mask, 2])
     result = {}
     if not e.attitude_only:
-        horizontal = e.horizontal[mask]
+        horizontal, speed = e.horizontal[mask], np.linalg.norm(e.velocity[mask], axis=1)
         result = {
             "position_horizontal_rms_m": _rms(horizontal),
             "position_horizontal_max_m": float(horizontal.max()),
             "position_vertical_rms_m": _rms(e.position[mask, 2]),
-            "velocity_rms_mps": _rms(np.linalg.norm(e.velocity[mask], axis=1)),
+            "velocity_rms_mps": _rms(speed),
+            "velocity_max_mps": float(speed.max()),
         }
     result |= {
         "roll_pitch_rms_deg": _rms(tilt),
@@ -383,8 +384,8 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
 class _Reports:
     """What became of the samples of one aid, or of one sensor, each (N,).
 
-    ``used`` with one axis at least; ``gated`` refused by the gate, on one axis at least; ``alarm`` refused, so, because
-    the sample looked wrong; ``judged`` used or refused for its innovation.
+    ``used``, in part at least; ``gated`` refused by the gate; ``alarm`` refused, in part at least, because the sample
+    looked wrong; ``judged`` used or refused for its innovation.
     """
 
     t: Array
@@ -396,21 +397,26 @@ class _Reports:
     judged: Mask
 
 
+def refused(weight: Array, reason: npt.NDArray[np.str_]) -> Mask:
+    """Which samples (N,) were not used, or not with every axis."""
+    return (weight <= 0) | np.isin(reason, (OUTSIDE, ISOLATED))
+
+
 def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     own = f"estimators/{estimator}/innovations/{aid}"
     reason, value = column(dataset, f"{own}/reason").astype(str), column(dataset, f"{own}/nis")
-    used = column(dataset, f"{own}/weight") > 0
+    weight = column(dataset, f"{own}/weight")
+    used = weight > 0
     tested = np.isfinite(value)  # an unsound sample has no innovation
     withheld = np.char.endswith(reason, Verdict.PROBATION.value)
     withheld |= np.char.startswith(reason, "position ") & tested  # velocity, whose position was refused
-    refused = (reason == Verdict.REJECT.value) | (reason == ISOLATED)  # other axes may have been used
-    alarm = (~used | refused) & ~withheld
+    alarm = refused(weight, reason) & ~withheld
     return _Reports(
         t=column(dataset, f"{own}/sample_time"),
         sensor=column(dataset, f"{own}/sensor").astype(str),
         nis=value,
         used=used,
-        gated=alarm & (reason == Verdict.REJECT.value),
+        gated=alarm & (reason == OUTSIDE),
         alarm=alarm,
         judged=(used | alarm) & tested,
     )
@@ -418,7 +424,7 @@ def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
 
 def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
     reports = _reports(dataset, estimator, aid)
-    judged = (reports.t >= start) & (reports.used | reports.gated) & np.isfinite(reports.nis)
+    judged = (reports.t >= start) & (reports.used & ~reports.alarm | reports.gated) & np.isfinite(reports.nis)
     own = dataset[f"estimators/{estimator}/innovations/{aid}"]
     if not judged.any() or "innovation" not in own:  # the parity of redundant units has none
         return {}
@@ -517,7 +523,7 @@ def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, floa
         if fault.sensor in looks:
             t, alarm, unused = looks[fault.sensor]
             # What was refused as faulty may be on probation before it is used again.
-            score = detection(t, np.where(t < fault.end - SAME_TIME_S, alarm, unused), window, until)
+            score = detection(t, alarm | unused & (t >= fault.end - SAME_TIME_S), window, until)
         if score is None:
             spans.append((fault.start, fault.end + RECOVERY_WINDOW_S))
             continue

@@ -375,9 +375,10 @@ def comparison(run: _Run) -> Figure:
         ax.set_ylabel(label)
         _focus_log(ax, [size(e)[e.valid] for e in shown.values()])
     _against_time(run, axes)
-    for k, ax in enumerate(axes[:, 0]):
-        if k == 0 or panels[k][0] != panels[k - 1][0]:
-            _legend(run, ax, shade=k == 0)
+    for name in run.aligned:  # one legend of them all, also of those without a position
+        if name not in panels[0][0]:
+            axes[0, 0].plot([], [], color=run.colours[name], lw=1.1, label=name)
+    _legend(run, axes[0, 0])
     return figure
 
 
@@ -574,6 +575,7 @@ def innovations(run: _Run, name: str) -> Figure | None:
         own = f"innovations/{aid}"
         t, weight = run.estimate(name, f"{own}/sample_time"), run.estimate(name, f"{own}/weight")
         S, z = run.estimate(name, f"{own}/S"), run.estimate(name, f"{own}/innovation")
+        refused = scores.refused(weight, run.estimate(name, f"{own}/reason").astype(str))
         gate = np.sqrt(run.estimate(name, f"{own}/threshold"))
         with np.errstate(invalid="ignore", divide="ignore"):
             normalised = z / np.sqrt(np.diagonal(S, axis1=1, axis2=2))
@@ -584,10 +586,10 @@ def innovations(run: _Run, name: str) -> Figure | None:
         some = slice(None, None, max(1, len(t) // 4000))
         for k in range(z.shape[1]):
             label = labels[k] if z.shape[1] > 1 else None
-            fused = weight[some] > 0
+            fused = ~refused[some]
             colour = AXIS_COLOURS[k] if z.shape[1] > 1 else run.colours[name]
             ax.plot(t[some][fused], shown[some, k][fused], ".", ms=1.6, color=colour, label=label)
-            ax.plot(t[weight <= 0], shown[weight <= 0, k], "x", ms=4, color=REFUSED, mew=0.9)
+            ax.plot(t[refused], shown[refused, k], "x", ms=4, color=REFUSED, mew=0.9)
         mine = set(run.estimate(name, f"{own}/sensor").astype(str).tolist())
         for fault in run.faults:
             if fault.sensor in mine and fault.start < run.t[-1]:
@@ -595,7 +597,7 @@ def innovations(run: _Run, name: str) -> Figure | None:
         for sign in (-1, 1):
             ax.plot(t, sign * gate, color="#444444", lw=0.8, ls="--")
         ax.set_ylim(-limit, limit)
-        ax.set_title(f"{aid}: {np.mean(weight <= 0):.2%} refused", fontsize=10, loc="left")
+        ax.set_title(f"{aid}: {np.mean(refused):.2%} refused", fontsize=10, loc="left")
         if z.shape[1] > 1:
             ax.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False, fontsize=9, markerscale=5)
     figure.supylabel("innovation / its sigma", fontsize=10)
@@ -603,7 +605,13 @@ def innovations(run: _Run, name: str) -> Figure | None:
     gates = [run.estimate(name, f"innovations/{aid}/threshold") for aid in aids]
     gate_key = Line2D([], [], color="#444444", lw=0.8, ls="--", label="gate")
     refused_key = Line2D(
-        [], [], color=REFUSED, marker="x", ls="", ms=5, label="refused (beyond the axes: at their edge)"
+        [],
+        [],
+        color=REFUSED,
+        marker="x",
+        ls="",
+        ms=5,
+        label="refused, one axis at least (beyond the axes: at their edge)",
     )
     fault_key = [Patch(color=FAULT, label="fault of the sensor")] if run.faults else []
     gated = [gate_key, refused_key] if any(np.isfinite(gate).any() for gate in gates) else []

@@ -59,7 +59,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(
         (
             "locals", "structure", "sharing", "combination", "retention", "weighting", "fusion_period_s",
-            "isolate_after", "readmit_after", "recall_s",
+            "isolate_after", "readmit_after", "recall_s", "cross_check",
         ),
         ("federated",),
     ),
@@ -285,6 +285,7 @@ class EstimatorConfig(Section):
     recall_s: float | None = Field(
         default=None, ge=1, le=600, description="isolated, a filter goes back by this; none: to the others' solution"
     )
+    cross_check: bool = Field(default=False, description="of the local filters with each other; needs no_reset")
     literal: bool = Field(
         default=False,
         description="as printed: Jiang et al. 2021, equation 10; Zhu et al. 2020, equation 13; Zhou et al. 2025,"
@@ -685,6 +686,9 @@ def _federated_faults(
             (*path, "sharing"),
             f"structure {config.structure!r} would count the same information again and again: share it",
         )
+    if config.cross_check and (config.structure != "no_reset" or config.combination != "information"):
+        text = 'compares independent filters: it needs structure = "no_reset" and combination = "information"'
+        yield (*path, "cross_check"), text
     if config.combination != "information" and config.sharing != "none":
         yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
 

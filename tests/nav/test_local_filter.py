@@ -8,7 +8,7 @@ import pytest
 from ins_world import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
 
 from nav.alignment import InitialState
-from nav.detection import ChiSquare, ChiSquareGate, Decision, Event
+from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import AirspeedAid, BarometerAid, Change, GnssAid, LocalFilter, Watch, aid_blocks
@@ -48,6 +48,31 @@ def test_readmission_needs_consecutive_passes():
     rows = changes([bad] * 3 + [None] * 3 + [bad] + [None] * 4 + [bad] * 2)
     assert [change for change, *_ in rows][3:] == [Change.NONE] * 7 + [Change.READMITTED] + [Change.NONE] * 2
     assert not rows[-1][2]
+
+
+def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
+    """Ten times four looks, of all isolated axes; then the detector begins anew."""
+    watch = Watch(Glr(1e-6), None, 2, 3, 4)
+    nu = np.array([1.2, 1.2])  # a sound look, and a fault for one that gathers them
+    rows = [watch.judge(nu, np.eye(2), 0.2 * k) for k in range(200)]
+    changed = [(k, change) for k, (_, change) in enumerate(rows) if change]
+    (isolated, first), (readmitted, second) = changed[:2]
+    assert (first, second) == (Change.ISOLATED, Change.READMITTED)
+    assert readmitted == isolated + 40
+    assert not rows[readmitted + 1][0].alarm
+    watch = Watch(Glr(1e-6), None, 2, 3, 4)
+    for k in range(200):
+        watch.judge(np.array([1.2, 5.0]), np.eye(2), 0.2 * k)
+    assert watch.suspect  # one of them is not sound
+
+
+def test_a_conviction_holds_until_looks_are_sound():
+    watch = Watch(ChiSquare(1e-3), None, 2, 3, 4)
+    watch.convict()
+    assert watch.out
+    assert watch.suspect
+    found = [watch.judge(np.zeros(2), np.eye(2), float(k))[1] for k in range(4)]
+    assert found == [Change.NONE] * 3 + [Change.READMITTED]
 
 
 def test_a_change_that_is_none_is_false():

@@ -128,6 +128,14 @@ def relabel(run: Any, aid: str, t: float, weight: float, reason: str, nis: float
         reports["nis"].values[k] = nis
 
 
+def take_all(run: Any, *aids: str) -> None:
+    """No refusals but those that a test makes."""
+    for aid in aids:
+        reports = run[f"estimators/ins/innovations/{aid}"]
+        reports["weight"].values[:] = 1.0
+        reports["reason"].values[:] = ""
+
+
 def test_nis_is_of_all_that_the_gate_judged(run: Any, computed: dict[str, float]) -> None:
     reports = run["estimators/ins/innovations/gnss_position"]
     after = reports["sample_time"].values >= 65
@@ -141,7 +149,7 @@ def test_what_was_withheld_is_not_the_gate_s() -> None:
     run = synthetic_run.dataset(100.0, estimators={"ins": Errors(aligned_after=0.0)})
     for aid in ("gnss_position", "gnss_velocity"):
         run[f"estimators/ins/innovations/{aid}"]["nis"].values[:] = 2.0
-        run[f"estimators/ins/innovations/{aid}"]["weight"].values[:] = 1.0
+        take_all(run, aid)
     relabel(run, "gnss_position", 70.0, 0.0, "outside the gate", 50.0)
     relabel(run, "gnss_velocity", 70.0, 0.0, "position outside the gate", 700.0)
     for t in (72.0, 72.2, 72.4):
@@ -224,8 +232,7 @@ def faulty(*injected: tuple[Any, ...], chunk: int = 200) -> Any:
     recorder.faults([FaultTruth(name, sensor, "x", "step", a, b, 3.0, "m") for name, sensor, a, b in injected])
     synthetic_run.record(recorder, circle(200.0), {"ins": Errors(aligned_after=0.0)}, chunk=chunk)
     run = recorder.dataset()
-    for aid in ("gnss_position", "gnss_velocity", "barometer"):
-        run[f"estimators/ins/innovations/{aid}"]["weight"].values[:] = 1.0
+    take_all(run, "gnss_position", "gnss_velocity", "barometer")
     return run
 
 
@@ -289,6 +296,23 @@ def test_faults_that_overlap_end_when_they_end() -> None:
     assert metrics.compute(run)["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
 
 
+def test_axes_left_out_of_a_sample_that_is_used_are_an_alarm() -> None:
+    run = faulty(("slow", "gnss", 100.0, 120.0))
+    for t in np.arange(104.0, 121.9, 0.2):  # one axis of three
+        relabel(run, "gnss_position", t, 2 / 3, "isolated", 300.0)
+    relabel(run, "gnss_position", 150.0, 2 / 3, "outside the gate", 40.0)
+    relabel(run, "gnss_position", 160.0, 1.0, "outside the gate, but consistent for long: covariance reset")
+    relabel(run, "gnss_position", 170.0, 0.5, "")  # a policy's weight
+    found = metrics.compute(run)
+    assert found["ins.detection_delay_s.slow"] == pytest.approx(4.0)
+    assert found["ins.coverage.slow"] == pytest.approx(0.8)
+    assert found["ins.end_lag_s.slow"] == pytest.approx(2.0)
+    assert found["ins.isolation_correct.slow"] == 1
+    healthy_s = (100.0 - 60.0) + (200.1 - 132.0)
+    assert found["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
+    assert found["ins.nis_mean.gnss_position"] < 1.5  # what was isolated is in no mean
+
+
 def test_the_wrong_sensor_is_no_isolation() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0))
     refuse(run, "gnss_position", 110.0, 120.0)
@@ -299,8 +323,7 @@ def test_the_wrong_sensor_is_no_isolation() -> None:
 
 def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
     dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
-    for aid in ("barometer", "gnss_position", "gnss_velocity"):
-        dataset[f"estimators/ins/innovations/{aid}"]["weight"][:] = 1.0
+    take_all(dataset, "barometer", "gnss_position", "gnss_velocity")
     barometer = dataset["estimators/ins/innovations/barometer"]
     for t in (30.0, 80.0, 90.2, 120.0, 190.0):  # aligned at 5 s, and settled a minute later; 120 s is in the outage
         barometer["weight"][round(t * 5)] = 0.0

@@ -1,0 +1,169 @@
+"""Federated filters on the flown aircraft: whether they know how wrong they are, and cry wolf only by chance.
+
+The sensors are those of the shipped scenarios: correlated GNSS, turbulence, misaligned, vibrating IMU, soft iron.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nav.local_filter import ISOLATED
+from testbed import Scenario, estimators, metrics, run
+
+SEEDS = 10
+HEALTHY = ["fault=[]", "sensors.gnss1.denied=[]", "sensors.gnss2.denied=[]", "expect={}"]
+HEALTHY_S = 3600.0
+LOCALS = (
+    '[{name="gnss", aids=["gnss"]}, {name="air", aids=["airspeed", "barometer"]}, {name="mag", aids=["magnetometer"]}]'
+)
+RESETS = f'{{name="resets", kind="federated", structure="full_reset", locals={LOCALS}}}'
+NO_RESET = f'{{name="no_reset", kind="federated", structure="no_reset", locals={LOCALS}}}'
+
+
+def fly(scenario: Scenario, seed: int) -> tuple[dict[str, float], dict[str, int]]:
+    """Metrics of a run, and how many parts of samples each estimator had isolated."""
+    result = run(scenario, seed=seed)
+    isolated = {
+        name: sum(
+            int(np.sum(metrics.column(result.dataset, f"estimators/{name}/innovations/{aid}/reason") == ISOLATED))
+            for aid in metrics.aids(result.dataset, name)
+        )
+        for name in metrics.names(result.dataset)
+    }
+    return result.metrics, isolated
+
+
+def outage(seed: int) -> tuple[dict[str, float], dict[str, int]]:
+    overrides = [f"estimator=[{RESETS}, {NO_RESET}]", "duration_s=1260", "expect={}", "record.imu=false"]
+    return fly(Scenario.load("loiter_gnss_outage", overrides), seed)
+
+
+def healthy(seed: int) -> tuple[dict[str, float], dict[str, int]]:
+    overrides = [*HEALTHY, f"duration_s={HEALTHY_S}", "record.imu=false"]
+    return fly(Scenario.load("loiter_fault_tolerant", overrides), seed)
+
+
+def every(work: Any) -> list[Any]:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(work, range(SEEDS)))
+
+
+@pytest.fixture(scope="module")
+def outages() -> list[Any]:
+    return every(outage)
+
+
+@pytest.fixture(scope="module")
+def hours() -> list[Any]:
+    return every(healthy)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["resets", "no_reset"])
+@pytest.mark.parametrize("what", ["position", "velocity", "attitude"])
+def test_mean_nees_per_degree_of_freedom(outages: list[Any], name: str, what: str) -> None:
+    aided = np.mean([found[f"{name}.{what}_nees_mean"] for found, _ in outages])
+    denied = np.mean([found[f"{name}.outage_{what}_nees_mean"] for found, _ in outages])
+    print(f"{name}, {what} NEES per degree of freedom: {aided:.3f} with GNSS, {denied:.3f} in the outage")
+    assert 0.6 <= aided <= 1.5
+    assert 0.4 <= denied <= 2.0
+
+
+@pytest.mark.slow
+def test_resets_keep_the_wind_that_was_learned(outages: list[Any]) -> None:
+    for seconds, bound in ((120, 60.0), (600, 300.0)):
+        at = [found[f"resets.outage_position_horizontal_at_{seconds}s_m"] for found, _ in outages]
+        print(f"after {seconds} s: median {np.median(at):.1f} m, worst {max(at):.1f} m")
+        assert np.median(at) <= bound
+
+
+@pytest.mark.slow
+def test_no_sensor_is_isolated_in_ten_hours_of_healthy_flight(hours: list[Any]) -> None:
+    """Designed: 1e-6 for each of 15 looks a second of GNSS and air data, and 10 of the magnetometer, 0.9 in 10 h.
+
+    More than five of them have a chance of 3e-4, and an isolation takes three in a row.
+    """
+    assert len(hours) * HEALTHY_S >= 10 * 3600
+    isolated = [count["federated"] for _, count in hours]
+    refused = [found["federated.false_alarms_per_h"] * HEALTHY_S / 3600 for found, _ in hours]
+    print(f"{len(hours)} flights: isolated {isolated}, refused {np.round(refused)}")
+    assert sum(isolated) == 0
+    assert sum(refused) <= 5
+
+
+@pytest.mark.slow
+def test_healthy_federation_of_two_receivers_is_consistent(hours: list[Any]) -> None:
+    for what in ("position", "velocity", "attitude"):
+        mean = np.mean([found[f"federated.{what}_nees_mean"] for found, _ in hours])
+        print(f"{what} NEES per degree of freedom: {mean:.3f}")
+        assert 0.6 <= mean <= 1.5
+
+
+def seconds(scenario: Scenario, patch: pytest.MonkeyPatch) -> dict[str, float]:
+    """What each estimator spends in its fusion horizon during one run."""
+    spent = {one.name: 0.0 for one in scenario.estimator}
+    build = estimators.build
+
+    def clock(name: str, track: Any) -> Any:
+        def clocked(*given: Any) -> Any:
+            began = time.perf_counter()
+            done = track(*given)
+            spent[name] += time.perf_counter() - began
+            return done
+
+        return clocked
+
+    def clocked_build(*given: Any) -> dict[str, estimators.Running]:
+        built = build(*given)
+        for name, running in built.items():
+            patch.setattr(running.horizon, "track", clock(name, running.horizon.track))
+        return built
+
+    with patch.context() as inner:
+        inner.setattr(estimators, "build", clocked_build)
+        run(scenario)
+    return spent
+
+
+INS = '{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}'
+
+
+def test_costs_at_most_four_times_the_ins(monkeypatch: pytest.MonkeyPatch) -> None:
+    overrides = [f"estimator=[{INS}, {RESETS}, {NO_RESET}]", "duration_s=90", "sensors.gnss.denied=[]", "expect={}"]
+    scenario = Scenario.load("loiter_gnss_outage", overrides)
+    rounds = [seconds(scenario, monkeypatch) for _ in range(3)]
+    least = {name: min(one[name] for one in rounds) for name in rounds[0]}
+    print({name: f"{spent / 90 * 1e3:.2f} ms per second of flight" for name, spent in least.items()})
+    assert least["resets"] <= 4.0 * least["ins"]
+    assert least["no_reset"] <= 4.0 * least["ins"]
+    assert least["ins"] > 0.0
+
+
+def test_two_minutes_of_healthy_flight() -> None:
+    """A shortened version of what the slow tests fly."""
+    found, isolated = fly(Scenario.load("loiter_fault_tolerant", [*HEALTHY, "duration_s=120"]), 1)
+    assert isolated["federated"] == 0
+    assert found["federated.position_horizontal_max_m"] < 5.0
+    assert 0.05 < found["federated.velocity_nees_mean"] < 4.0
+
+
+def test_faults_in_a_minute() -> None:
+    """Three of the shipped faults, closer together."""
+    spoof = '{name="spoof", sensor="gnss1", kind="drag_off", window=[90, 130], bearing_deg=60, acceleration_mps2=0.05}'
+    pressure = '{name="pressure", sensor="barometer", channel="height", kind="step", window=[110, 120], size=40}'
+    magnet = '{name="magnet", sensor="magnetometer", channel="x", kind="step", window=[125, 135], size=15}'
+    faults = [*HEALTHY[1:], f"fault=[{spoof}, {pressure}, {magnet}]", "duration_s=150"]
+    found = run(Scenario.load("loiter_fault_tolerant", faults)).metrics
+    assert found["federated.position_horizontal_max_m"] < 10.0
+    assert found["federated.velocity_max_mps"] < 0.5
+    assert found["ins.position_horizontal_max_m"] > 20.0
+    for name, delay in (("spoof", 10.0), ("pressure", 1.0), ("magnet", 1.0)):
+        assert found[f"federated.detection_delay_s.{name}"] <= delay
+        assert found[f"federated.isolation_correct.{name}"] == 1
+        assert found[f"federated.end_lag_s.{name}"] <= 3.0
