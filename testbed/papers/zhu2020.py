@@ -260,11 +260,12 @@ def draw(results: Sequence[Any], out: Path) -> None:
 
     seeds = len(results) // len(RUNS)
     first = {run: results[k * seeds] for k, run in enumerate(RUNS)}
-    figure = Figure(figsize=(11.0, 7.6), dpi=95, layout="constrained")
+    figure = Figure(figsize=(11.0, 7.6), dpi=78, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(4, 2, height_ratios=(1, 1, 1, 1))
     blue, orange, green, pink = COLOURS[:4]
     river, outage = first["30 s"], first["outage"]
+    shown = np.arange(0, 3601, 10)
     rows = (
         (P_N, "latitude error [m]"),
         (P_E, "longitude error [m]"),
@@ -273,7 +274,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     )
     for ax, (column, label) in zip(panels[:, 0], rows, strict=True):
         for name, text, colour in (("tfkf", "traditional", orange), ("frkf", "robust", blue)):
-            ax.plot(river[name].error[:, column], color=colour, lw=0.9, label=text)
+            ax.plot(shown, river[name].error[shown, column], color=colour, lw=0.9, label=text)
         ax.plot(
             OUTLIERS,
             np.full(len(OUTLIERS), 0.97),
@@ -295,7 +296,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     )
     for ax, (column, label) in zip(panels[:2, 1], rows, strict=False):
         for name, text, colour in alone:
-            ax.plot(outage[name].error[:, column], color=colour, lw=1.1, label=text)
+            ax.plot(shown, outage[name].error[shown, column], color=colour, lw=1.1, label=text)
         ax.set_ylabel(label)
         ax.set_ylim(-100, 60)
     panels[0, 1].set_title("No fix from 1500 s to 2500 s", fontsize=10)
