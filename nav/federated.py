@@ -118,7 +118,7 @@ Sharing = Literal["fixed", "by_covariance", "none"]
 Combination = Literal["information", "scalar", "covariance_intersection"]
 Weighting = Literal["none", "normalised"]
 
-CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
+CROSS_CHECK_FALSE_ALARM = 1e-9  # of a filter at a fusion: the filters share errors that they do not know of
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
