@@ -18,7 +18,7 @@ SHORT_S = 400.0
 
 def test_the_promised_scenarios_are_shipped() -> None:
     promised = {"loiter_gnss_outage", "u_turn", "survey_racetrack_wind", "jammer_zone", "static_bench"}
-    promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_fault_tolerant"}
+    promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
     assert promised <= set(SCENARIOS)
 
 
