@@ -119,6 +119,7 @@ Combination = Literal["information", "scalar", "covariance_intersection"]
 Weighting = Literal["none", "normalised"]
 
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
+LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
@@ -522,7 +523,8 @@ class Federated:
         healthy = self._healthy()
         against = np.zeros(len(healthy))
         if healthy.sum() >= 2:
-            for i in np.flatnonzero(healthy):
+            positions = state.P[:, range(POS, POS + 3), range(POS, POS + 3)]
+            for i in np.flatnonzero((healthy > 0) & (positions.max(axis=1) < LOST_M**2)):
                 others = self._combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
                 S = state.P[i, VEL:MOTION, VEL:MOTION] + others.P[VEL:MOTION, VEL:MOTION]
                 against[i] = whiten(state.x[i, VEL:MOTION] - others.x[VEL:MOTION], S)[1]

@@ -193,6 +193,15 @@ EXTRA = {
     "correction_counter": Variable("1", "corrections of the attitude among them"),
 }
 
+
+def _extra(name: str) -> Variable:
+    """What a further state is; receivers have names of their own, and a local filter's may stand in front."""
+    for known, variable in EXTRA.items():
+        if name == known or name.endswith(("_" + known, known.removeprefix("gnss"))):
+            return variable
+    return Variable("unknown", "further state", (f"{name}_component",))
+
+
 # Unit of the innovation of each aid, and its components.
 AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "gnss_position": ("m", ("ned",)),
@@ -394,7 +403,7 @@ def _pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Var
         block[name] = sigma[:, 3 * k : 3 * k + 3]
     for name in dict.fromkeys(key for e in estimates for key in e.extra):
         width = next(len(e.extra[name][0]) for e in estimates if name in e.extra)
-        variable = EXTRA.get(name, Variable("unknown", "further state", (f"{name}_component",)))
+        variable = _extra(name)
         blank = (np.full(width, np.nan), np.full(width, np.nan))
         pairs = [e.extra.get(name, blank) for e in estimates]
         for k, column in enumerate((name, f"sigma_{name}")):

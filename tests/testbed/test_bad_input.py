@@ -306,6 +306,11 @@ def test_same_name_for_two_estimators() -> None:
         ('estimator[0].locals[1].aids=["imu"]', "aids[0]: 'imu' is of kind 'imu', which does not aid 'federated'"),
         ("estimator[0].locals[1].share=0.4", "estimator[0].locals: the shares of all local filters must add up to 1"),
         ('estimator[0].aids=["gnss"]', "estimator[0].aids: a federated estimator lists its aids by local filter"),
+        (
+            "estimator[0]={name='ins', kind='federated', cross_check=true, structure='partial', "
+            "locals=[{name='a', aids=['gnss']}]}",
+            "compares independent filters",
+        ),
         ('estimator[0].combination="scalar"', "combination 'scalar' needs no shares: set sharing = \"none\""),
         ('estimator[0].structure="no_rest"', 'can\'t be "no_rest": did you mean no_reset?'),
         ('estimator[0].locals[0].detector={kind="gl"}', 'detector.kind: can\'t be "gl": did you mean glr?'),

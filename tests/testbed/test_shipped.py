@@ -18,7 +18,7 @@ SHORT_S = 400.0
 
 def test_the_promised_scenarios_are_shipped() -> None:
     promised = {"loiter_gnss_outage", "u_turn", "survey_racetrack_wind", "jammer_zone", "static_bench"}
-    promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading"}
+    promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
     assert promised <= set(SCENARIOS)
 
 
@@ -32,7 +32,9 @@ def test_loads_and_says_what_it_shows(name: str) -> None:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_all_that_is_recorded_has_a_known_unit(name: str) -> None:
-    recorded = run(Scenario.load(name, ["duration_s=8", "sensors.gnss.denied=[]"])).dataset
+    whole = Scenario.load(name)
+    healthy = [f"sensors.{sensor}.denied=[]" for sensor, config in whole.sensors.items() if config.kind == "gnss"]
+    recorded = run(Scenario.load(name, ["duration_s=8", "fault=[]", *healthy])).dataset
     units = {
         f"{node.path}/{variable}": values.attrs.get("units")
         for node in recorded.subtree
