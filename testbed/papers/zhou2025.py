@@ -301,8 +301,9 @@ def _false_alarm_claims(found: Found) -> Iterator[Claim]:
     for rate in RATES:
         for name in MAIN:
             share = found.hard(name, "false_alarms", rate)
-            # chi-square has P by design: what chance makes of it in all looks
-            room = 3 * math.sqrt(P / (STEP[0] * rate * BATCH * BATCHES)) if name == CHI2 else 0.0
+            # Two have P by design: away from the main rate, what chance makes of it in all looks.
+            by_chance = rate != MAIN_RATE and name in (CHI2, COMPLETE)
+            room = 3 * math.sqrt(P / (STEP[0] * rate * BATCH * BATCHES)) if by_chance else 0.0
             yield Claim(
                 f"alarms before the faults at {rate} Hz, {name}", "", "", [math.fsum(share) / len(share)], P + room
             )
