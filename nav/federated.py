@@ -51,9 +51,9 @@ velocities are given up as in `nav.ins`, and the next fixes are believed.
 
 Starting again from the others is costly when they don't know what the isolated filter knew. With ``recall_s``, and
 without resets, each filter has two shadows, carried along without measurements and renewed in turn every ``recall_s``
-(two shadow filters: Da, 1994). An isolation then puts this one filter back to its older shadow, ``recall_s`` to twice
-that old, and leaves the others; what was told before the shadow was taken stays, so the fault must be found sooner. The
-isolated sensor is judged against the fused solution of all filters, which are sound then.
+(two shadow filters: Da, J. Guidance 17, 1994). An isolation then puts this one filter back to its older shadow,
+``recall_s`` to twice that old, and leaves the others; what was told before the shadow was taken stays, so the fault
+must be found sooner. The isolated sensor is judged against the fused solution of all filters, which are sound then.
 """
 
 from __future__ import annotations

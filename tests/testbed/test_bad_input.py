@@ -338,6 +338,15 @@ def test_federated_without_sharing() -> None:
     assert "would count the same information again and again" in complaint(U_TURN, override, "expect={}")
 
 
+def test_federated_recall_needs_filters_of_their_own() -> None:
+    override = (
+        'estimator=[{name="fed", kind="federated", structure="full_reset", recall_s=20,'
+        ' locals=[{name="one", aids=["gnss"]}]}]'
+    )
+    message = complaint(U_TURN, override, "expect={}")
+    assert "recall_s: structure 'full_reset' spreads what it would take back" in message
+
+
 def test_two_aids_of_a_kind() -> None:
     message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
     assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message

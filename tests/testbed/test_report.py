@@ -90,7 +90,7 @@ def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
     page = report.write_report(run, found, tmp_path).read_text()
     rows = re.findall(r"<tr><td>(.*?)</td></tr>", page)
     cells = {row.partition(":")[0]: row.split("</td><td>")[1:] for row in rows if ": " in row}
-    assert cells["jump"] == ["ins", "2.0", "90%", "0.0", "yes"]  # velocity was used all the time
+    assert cells["jump"] == ["ins", "2.0", "90%", "5.0", "yes"]  # velocity was used all the time, position was not
     assert cells["rise"] == ["ins", "missed", "0%", "0.0", "no"]
     assert cells["unseen"][0] == "none looked"
     assert "gnss x step 3 m, 80 to 100 s" in page
