@@ -36,7 +36,7 @@ SCRIPTS = [line[1:] for line in LINES if line[0] == "python"]
 
 def test_there_is_something_to_test() -> None:
     assert {command[0] for command in COMMANDS} == {
-        "scenarios", "run", "check", "report", "export", "campaign", "bench"
+        "scenarios", "run", "check", "report", "export", "campaign", "papers", "bench"
     }  # fmt: skip
     assert SCRIPTS
     assert blocks("toml")
