@@ -446,9 +446,9 @@ def _increments(imu: Any) -> ImuSamples:
 
 def _fixes(fixes: Any) -> list[Sample]:
     """The hour's fixes as samples: position only."""
-    sigma, unknown, still = np.full(3, GNSS_SIGMA), np.full(3, np.nan), np.zeros(3)
+    sigma, unknown = np.full(3, GNSS_SIGMA), np.full(3, np.nan)
     return [
-        GnssSample(t, t, lat * DEG, lon * DEG, alt, still, sigma, unknown, FixType.FIX_3D, 12, hdop=1.0, vdop=1.0)
+        GnssSample(t, t, lat * DEG, lon * DEG, alt, unknown, sigma, unknown, FixType.FIX_3D, 12, hdop=1.0, vdop=1.0)
         for t, (lat, lon, alt) in zip(fixes.index, fixes[["lat", "lon", "alt"]].to_numpy(), strict=True)
     ]
 
