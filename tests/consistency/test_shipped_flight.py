@@ -14,11 +14,11 @@ import pytest
 from testbed import Scenario, run
 
 SEEDS = 20
-NO_DEAD_RECKONING = 'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}]'
+INS_ALONE = 'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}]'
 
 
 def fly(seed: int) -> dict[str, float]:
-    scenario = Scenario.load("loiter_gnss_outage", [NO_DEAD_RECKONING, "duration_s=1260", "expect={}"])
+    scenario = Scenario.load("loiter_gnss_outage", [INS_ALONE, "duration_s=1260", "expect={}"])
     return run(scenario, seed=seed).metrics
 
 
