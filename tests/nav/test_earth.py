@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pyins.earth
 import pymap3d
 import pymap3d.rcurve
 import pytest
@@ -52,6 +53,15 @@ def test_gravity_is_the_gradient_of_the_normal_potential(lat_deg, h):
     difference = normal_potential(x + step * up_x, z + step * up_z) - normal_potential(x - step * up_x, z - step * up_z)
     # On the ellipsoid Somigliana is exact to the printed digits; above, the series leaves out f^2 and h^3.
     assert earth.gravity(float(lat), h) == pytest.approx(float(-difference / (2 * step)), abs=2e-9 + 1.2e-10 * h)
+
+
+@given(st.floats(-90, 90), st.floats(-100, 1000))
+def test_gravity_is_that_of_an_independent_library(lat_deg, h):
+    """pyins has the free-air term to first order; what is left out is 3 g (h / a)^2 and 2 g h / a times f + m."""
+    left_out = 30 * (h / earth.A) ** 2 + 20 * abs(h) / earth.A * 0.007
+    assert earth.gravity(math.radians(lat_deg), h) == pytest.approx(
+        float(pyins.earth.gravity(lat_deg, h)), abs=1e-9 + left_out
+    )
 
 
 def test_gravity_table_values():
