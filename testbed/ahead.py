@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import traceback
+import warnings
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
@@ -35,7 +36,10 @@ class Ahead:
         self._blocks, theirs = context.Pipe(duplex=False)
         fcntl.fcntl(theirs.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
         self._process = context.Process(target=_fly, args=(make, chunk, ticks, theirs, self._blocks), daemon=True)
-        self._process.start()
+        with warnings.catch_warnings():
+            # Python warns of forks beside other threads, whose locks the child might wait for: this one takes none.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._process.start()
         theirs.close()
 
     @staticmethod
