@@ -163,7 +163,9 @@ class ErrorModel:
 @njit
 def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
     """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values."""
-    errors[:] = 0.0
+    for kind in range(len(errors)):
+        for axis in range(3):
+            errors[kind, axis] = 0.0
     for block in range(len(driven)):
         kind, start = driven[block, 0], driven[block, 1]
         for axis in range(3):
@@ -179,7 +181,9 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
     F averaged over the interval. The remaining rows of the whole transition are diagonal and not formed here.
     """
     mixing = Phi.shape[1]
-    FT[:] = 0.0
+    for i in range(MOTION):  # a loop compiles in a tenth of the time of an assignment to all
+        for j in range(mixing):
+            FT[i, j] = 0.0
     sin_lat, cos_lat = math.sin(lat), math.cos(lat)
     tan_lat = sin_lat / cos_lat
     R_M, R_N = radii(lat)

@@ -321,7 +321,11 @@ def _covariance_step(
         for i in range(x.shape[1]):
             half_noise[i] = 0.5 * T * variance_rate[f, i]
             decay[i] = math.exp(-T * decay_rate[f, i]) if decay_rate[f, i] > 0.0 else 1.0
-        if np.any(x[f, :common]):
+        estimated = False
+        for i in range(common):
+            if x[f, i] != 0.0:
+                estimated = True
+        if estimated:
             for i in range(MOTION):
                 work[i, 0] = 0.0
                 for j in range(common):
@@ -335,8 +339,17 @@ def _covariance_step(
                 imu[i] *= decay[i]
         predict(P[f], Phi, decay, half_noise, work)
     sensor_errors(errors, imu, driven)
-    sums[:] = 0.0
-    elapsed[:] = 0.0
+    _empty(sums, elapsed)
+
+
+@njit
+def _empty(sums: Array, elapsed: Array) -> None:
+    """Begin the integrals anew."""
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                sums[i, j, k] = 0.0
+    elapsed[0] = elapsed[1] = 0.0
 
 
 @njit
@@ -361,8 +374,7 @@ def _sigma_step(
     error = predict_points(P, Phi, decay, half_noise, work, push_n, T, spread, excess)
     remove(q_nb, v_n, lla, imu, error[: len(imu)])
     sensor_errors(errors, imu, driven)
-    sums[:] = 0.0
-    elapsed[:] = 0.0
+    _empty(sums, elapsed)
 
 
 @njit
