@@ -258,7 +258,7 @@ def test_a_misspelt_key_is_not_missing_as_well() -> None:
 
 
 def test_a_window_may_reach_beyond_the_end() -> None:
-    Scenario.parse(U_TURN, ["sensors.gnss.denied=[[150, 400]]"])
+    assert Scenario.parse(U_TURN, ["sensors.gnss.denied=[[150, 400]]"]).sensors["gnss"].denied == ((150.0, 400.0),)
 
 
 def test_rates_divide_the_tick_and_offsets_are_whole_ticks() -> None:
