@@ -27,7 +27,7 @@ from nav import aiding
 from nav._jit import njit
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import ImuModel
-from nav.kalman import correct, innovate, predict
+from nav.kalman import predict, update
 from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
 from nav.rotation import (
     quat_from_euler,
@@ -440,8 +440,7 @@ def _fresh(period_end: float) -> _State:
 def _fuse(s: _State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:
     """Update the error states with ``z`` = H x + noise."""
     nu = z - H @ s.x
-    S, S_inverse, HP, nis = innovate(s.P, H, R, nu)
-    s.x += correct(s.P, H, R, HP, S_inverse, nu)
+    S, nis = update(s.x, s.P, H, R, nu, math.inf)
     return UpdateReport(t, sensor, aid, nu, S, nis, math.inf, 1.0)
 
 

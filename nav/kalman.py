@@ -1,4 +1,4 @@
-"""The Kalman filter's three steps on a symmetric covariance, in place and without dense matrices of the full size.
+"""The Kalman filter's steps on a symmetric covariance, in place and without dense matrices of the full size.
 
 Errors are estimate minus truth: a measurement ``z = h(x) + noise`` has the innovation ``nu = z - h(x_hat)``, and
 ``H = dh/dx`` at the estimate. `correct` returns what must be *added* to the estimate.
@@ -79,6 +79,17 @@ def innovate(P: Array, H: Array, R: Array, nu: Array) -> tuple[Array, Array, Arr
         for j in range(m):
             nis += nu[i] * S_inverse[i, j] * nu[j]
     return S, S_inverse, HP, nis
+
+
+@njit
+def update(x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float) -> tuple[Array, float]:
+    """`innovate` and, if nis is at most ``threshold``, `correct` ``x`` (n,) and ``P`` (n, n) in place; (S, nis)."""
+    S, S_inverse, HP, nis = innovate(P, H, R, nu)
+    if nis <= threshold:
+        correction = correct(P, H, R, HP, S_inverse, nu)
+        for i in range(len(x)):
+            x[i] += correction[i]
+    return S, nis
 
 
 @njit

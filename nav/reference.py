@@ -16,7 +16,7 @@ from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT, Alignment, InitialState
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors, transition
-from nav.kalman import correct, innovate, predict
+from nav.kalman import predict, update
 from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.strapdown import step
@@ -29,6 +29,7 @@ FUSED, UNAIDED = Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEA
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 NEVER = 1 << 62
+NO_INCREMENTS, NO_TIMES = np.empty((0, 3)), np.empty(0)
 PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
 
 # Order of the covariance in an estimate; and the blocks that have a place of their own there
@@ -157,7 +158,7 @@ class Reference:
             bad = _propagate(
                 s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
                 self.driven, self._decay_rate, self._variance_rate, *self._scratch,
-                period if self.scaling is None else NEVER, imu.dtheta[part], imu.dv[part], imu.dt[part],
+                period if self.scaling is None else NEVER, imu.dtheta[part], imu.dv[part], imu.dt[part], False,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[first + bad])
@@ -175,9 +176,10 @@ class Reference:
                 self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
         elif s.elapsed[0] > 0:
-            _covariance_step(
-                s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed,
+            _propagate(
+                s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
                 self.driven, self._decay_rate, self._variance_rate, *self._scratch,
+                NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES, True,
             )  # fmt: skip
 
     def correct(self, state: State, correction: Array) -> None:
@@ -267,25 +269,19 @@ def spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
     return covariance, sigma
 
 
-@njit
 def absorb(
     q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, driven: Indices,
     nu: Array, H: Array, R: Array, threshold: float, close: bool,
 ) -> tuple[Array, float]:  # fmt: skip
     """One measurement into one filter, ``x`` (n,) and ``P`` (n, n), if its nis is at most ``threshold``; (S, nis).
 
-    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.innovate`.
+    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
     """
-    S, S_inverse, HP, nis = innovate(P, H, R, nu)
-    if nis <= threshold:
-        correction = correct(P, H, R, HP, S_inverse, nu)
-        for i in range(len(x)):
-            x[i] += correction[i]
-        if close:
-            inject(q_nb, v_n, lla, imu, x)
-            for i in range(len(imu)):
-                x[i] = 0.0
-            sensor_errors(errors, imu, driven)
+    S, nis = update(x, P, H, R, nu, threshold)
+    if close and nis <= threshold:
+        inject(q_nb, v_n, lla, imu, x)
+        x[: len(imu)] = 0.0
+        sensor_errors(errors, imu, driven)
     return S, nis
 
 
@@ -381,34 +377,37 @@ def _sigma_step(
 def _propagate(
     q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     rates: Array, driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array,
-    half_noise: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array,
+    half_noise: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
 ) -> int:  # fmt: skip
-    """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none."""
+    """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
+
+    A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
+    since it is long to compile.
+    """
     bad = -1
     angle, push, before = np.empty(3), np.empty(3), np.empty(4)
-    for k in range(len(dt)):
-        T = dt[k]
-        if not T > 0.0:
-            continue
-        sound = True
-        for i in range(3):
-            if not (abs(dtheta[k, i]) <= RATE_LIMIT * T and abs(dv[k, i]) <= FORCE_LIMIT * T):
-                sound = False
-        if sound:
+    for k in range(len(dt) + 1):
+        T = dt[k] if k < len(dt) else 0.0
+        if T > 0.0:
+            sound = True
             for i in range(3):
-                rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
-        else:
-            bad = k
-        for i in range(3):
-            angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
-            push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
-        for i in range(4):
-            before[i] = q_nb[i]
-        step(q_nb, v_n, lla, angle, push, T)
-        _integrate(sums, before, q_nb, angle, push, T)
-        elapsed[0] += T
-        elapsed[1] += 1.0
-        if elapsed[1] >= period:
+                if not (abs(dtheta[k, i]) <= RATE_LIMIT * T and abs(dv[k, i]) <= FORCE_LIMIT * T):
+                    sound = False
+            if sound:
+                for i in range(3):
+                    rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
+            else:
+                bad = k
+            for i in range(3):
+                angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
+                push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
+            for i in range(4):
+                before[i] = q_nb[i]
+            step(q_nb, v_n, lla, angle, push, T)
+            _integrate(sums, before, q_nb, angle, push, T)
+            elapsed[0] += T
+            elapsed[1] += 1.0
+        if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
             _covariance_step(
                 v_n, lla, imu, x, P, errors, sums, elapsed,
                 driven, decay_rate, variance_rate, Phi, FT, decay, half_noise, work,
