@@ -239,7 +239,7 @@ def airspeed(
     C_nb = dcm_from_quat(q_nb)
     scale = x[airspeed_scale] if airspeed_scale >= 0 else 0.0
     root = (1 + scale) * math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
-    nu, H = _air_velocity(C_nb, v_n, x, wind, gust, 0)
+    nu, H = _air_velocity(C_nb[:, 0], v_n, x, wind, gust)
     predicted = -root * nu[0]
     for i in range(len(x)):
         H[0, i] *= root
@@ -254,16 +254,16 @@ def airspeed(
 @njit
 def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[Array, Array]:
     """The constraint that no air comes from the side: 0 = e_y . C_nb' (v - wind - gust) [m/s]."""
-    return _air_velocity(dcm_from_quat(q_nb), v_n, x, wind, gust, 1)
+    return _air_velocity(dcm_from_quat(q_nb)[:, 1], v_n, x, wind, gust)
 
 
 @njit
-def _air_velocity(C_nb: Array, v_n: Array, x: Array, wind: int, gust: int, axis: int) -> tuple[Array, Array]:
-    """Zero minus the velocity through the air along one body axis, and the Jacobian of that velocity."""
+def _air_velocity(axis_n: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[Array, Array]:
+    """Zero minus the velocity through the air along a body axis ``axis_n`` (3,), and the Jacobian of that velocity."""
     air_n, along_n = np.empty(3), np.empty(3)
     H = np.zeros((1, len(x)))
     for i in range(3):
-        air_n[i], along_n[i] = v_n[i], C_nb[i, axis]
+        air_n[i], along_n[i] = v_n[i], axis_n[i]
     for start in (wind, gust):
         if start >= 0:
             for i in range(2):
