@@ -254,6 +254,11 @@ class Ins:
         self.t = initial.t
         self._monitor.last_fused = initial.t
 
+    def set_gate(self, false_rejection: float) -> None:
+        """From now on, turn sound measurements away with this probability (`InsConfig.false_rejection`)."""
+        self._gate = self._filter.gate = ChiSquareGate(false_rejection)
+        self._monitor.consistency_gate = self._gate.threshold(3)
+
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
         if len(imu) == 0:

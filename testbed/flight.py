@@ -28,6 +28,7 @@ PSF = 47.88025898  # one pound-force per square foot [Pa]
 RANKINE = 5 / 9  # [K]
 
 GUIDANCE_HZ = 10.0
+WIND_CHANGE_S = 5.0  # time constant of a change of wind in flight, as in ArduPilot's simulation (SIM_WIND_TC)
 SETTLING_S = 90.0  # of straight and level flight before the run starts
 
 # JSBSim's numbers for: second order Adams-Bashforth rates, Adams-Bashforth 3 position, and Buss's augmented second
@@ -109,6 +110,7 @@ class Flight:
         self._row = self._aircraft.read()
         self._last = self._row  # the last row handed out, for its increments
         self._feedback: Feedback | None = None
+        self._wind_asked: tuple[float, float] | None = None  # north, east [m/s]
         alt, speed = truth.start.alt_m, truth.start.airspeed_mps
         self._guidance = Guidance(plan, self._true_feedback(), alt, speed, self._frame / truth.rate_hz)
         self._commands = (0.0, alt, speed, 0.0)  # bank, altitude, airspeed, leg
@@ -141,6 +143,11 @@ class Flight:
         self._feedback = state
         self._aircraft.feed_back(state)
 
+    def blow(self, from_deg: float, speed_mps: float) -> None:
+        """Let the steady wind, where there is no profile, become this one with a time constant of `WIND_CHANGE_S`."""
+        north, east, _ = _v_n(speed_mps, from_deg)
+        self._wind_asked = (-north, -east)
+
     def activity(self) -> str:
         """The leg being flown, or why the flight ended."""
         return self.failure or self._guidance.activity()
@@ -156,7 +163,14 @@ class Flight:
         self._ended = self._guidance.done
         self._commands = (command.bank, command.altitude, command.airspeed, float(self._guidance.leg))
         self._aircraft.command(command.bank, command.altitude, command.climb, command.airspeed)
-        if len(self._winds) > 1:
+        if self._wind_asked is not None:
+            share = -math.expm1(-self._frame / (self.rate_hz * WIND_CHANGE_S))
+            _, north, east = self._winds[0]
+            north += share * (self._wind_asked[0] - north)
+            east += share * (self._wind_asked[1] - east)
+            self._winds = [(0.0, north, east)]
+            self._aircraft.wind(north, east)
+        elif len(self._winds) > 1:
             self._aircraft.wind(*_wind_at(self._winds, true.h))
 
     def _true_feedback(self) -> Feedback:

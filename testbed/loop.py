@@ -1,4 +1,7 @@
-"""The one loop: motion, sensors, estimators, record, link. Data goes one way; nothing downstream is heard upstream."""
+"""The one loop: motion, sensors, estimators, record, link.
+
+Data goes one way; what is heard from downstream are requests (`testbed.control`), at the start of a turn.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,20 +20,22 @@ from typing import TYPE_CHECKING, Protocol
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
 from testbed import estimators, metrics, sensors
 from testbed.ahead import Ahead
+from testbed.control import Desk, Director, Plant, Recorded, Request, Restarted
 from testbed.data import remove_derived
 from testbed.errors import UserError
-from testbed.pacer import Pacer
 from testbed.record import Recorder
 from testbed.scenario import FlightTruth, Scenario
 from testbed.sensors.faults import Faults, FaultTruth
+from testbed.sensors.imu import ImuConfig
 from testbed.truth import MotionSource, TruthBlock
 
 if TYPE_CHECKING:
     import xarray
 
 BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
-PACED_S = 1.0  # and when it keeps to the clock
+PACED_S = 0.1  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
+SILENT_S = 0.5  # beyond its period, or half of it if that is longer, before a sensor that says nothing is silent
 REFUSALS = 10  # of an aid in a row, before it is worth an event
 LARGEST_SEED = 2**63 - 1
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
@@ -62,7 +67,7 @@ class RunResult:
 
 
 class Publisher(Protocol):
-    """Whoever watches a run: handed plain data every ``period_s`` of simulated time, never asked anything."""
+    """Whoever watches a run: handed plain data every ``period_s`` of simulated time, and may ask for something."""
 
     period_s: float
 
@@ -77,6 +82,13 @@ class Publisher(Protocol):
     ) -> None:
         """One row of truth; the shown estimator's estimate and its reports since the last call; the newest sample of
         each sensor; increments up to the row or beyond; the other estimators' estimates.
+        """
+        ...
+
+    def requests(self) -> Sequence[Request]:
+        """Answer what has come in since the last call, and hand over what is asked of the run; never waits.
+
+        Called before every turn, and while the run is paused every 20 ms of wall time.
         """
         ...
 
@@ -119,6 +131,9 @@ class _EventWatch:
 
     emit: Callable[[float, str, str], None]
     faults: Sequence[FaultTruth] = ()
+    patience: dict[str, float] = field(default_factory=dict)  # how long an aiding sensor may say nothing
+    heard: dict[str, float] = field(default_factory=dict)  # when it last did, or at first should
+    silent: set[str] = field(default_factory=set)
     fix: dict[str, bool] = field(default_factory=dict)
     aligned: dict[str, bool] = field(default_factory=dict)
     refusals: dict[tuple[str, str], int] = field(default_factory=dict)  # in a row
@@ -128,10 +143,14 @@ class _EventWatch:
 
     @property
     def denied(self) -> bool:
-        """Whether no GNSS receiver has a fix, as in `metrics.outages`; one that has said nothing yet doesn't count."""
-        return bool(self.fix) and not any(self.fix.values())
+        """Whether no GNSS receiver has a fix, or says so; one that has said nothing yet doesn't count."""
+        return bool(self.fix) and not any(has and name not in self.silent for name, has in self.fix.items())
 
     def sample(self, sample: Sample) -> None:
+        if sample.sensor in self.silent:
+            self.silent.remove(sample.sensor)
+            self.emit(sample.t_arrival, "info", f"{sample.sensor} heard again")
+        self.heard[sample.sensor] = sample.t_arrival
         if not isinstance(sample, GnssSample):
             return
         has_fix = sample.fix_type != FixType.NO_FIX
@@ -169,6 +188,10 @@ class _EventWatch:
         if leg != self.leg and 0 <= leg < len(plan):
             self.emit(t, "info", f"leg {int(leg) + 1}/{len(plan)} {plan[int(leg)]}")
         self.leg = leg
+        for name, patience in self.patience.items():
+            if name not in self.silent and t > self.heard[name] + patience:
+                self.silent.add(name)
+                self.emit(t, "warning", f"{name} silent")
         edges = [(one.start, "begins", one) for one in self.faults] + [(one.end, "ends", one) for one in self.faults]
         for when, what, one in sorted(edges, key=lambda edge: edge[0]):
             if self.t < when <= t:
@@ -232,14 +255,18 @@ def run(
     realtime: float | None = None,
     progress: Callable[[Progress], None] | None = None,
     source: MotionSource | None = None,
+    controls: Sequence[Callable[[], Sequence[Request]]] = (),
+    replay: Sequence[tuple[float, Recorded]] = (),
 ) -> RunResult:
     """Fly, sense, estimate and record one scenario.
 
     ``seed`` replaces the scenario's own. With ``out`` the record goes to ``out/run.nc`` as it is made, and
     metrics.json beside it; without, everything stays in memory. ``links`` watch the estimator ``shown``, the first
     unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
-    ``source`` replaces the motion, to share one flown truth between runs. Same scenario and seed, same bits.
-    Raises UserError when the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
+    ``source`` replaces the motion, to share one flown truth between runs. Links and ``controls`` may make requests
+    (`testbed.control`); ``replay`` are those of an earlier run with their times. Same scenario, seed and requests, same
+    bits. Raises UserError when the folder can't be written, the motion can't be started, or the seed or ``shown`` is
+    none.
     """
     with ExitStack() as ending:
         for link in links:
@@ -248,15 +275,45 @@ def run(
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
-        started = time.perf_counter()
+        rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
+        asking = (*(link.requests for link in links), *controls)
+        director = Director(scenario, asking, replay, realtime, rate_hz, source is None)
+        flown = None
+        while flown is None:
+            with suppress(Restarted):
+                flown = _fly(scenario, seed, out, links, shown, director, progress, source)
+    dataset, failure, remarks, seconds = flown
+    results = metrics.compute(dataset) | {f"run.{name}": value for name, value in seconds.items()}
+    if out is not None:
+        metrics.save(results, out / "metrics.json")
+    return RunResult(dataset, results, out, failure, tuple(remarks))
+
+
+def _fly(
+    scenario: Scenario,
+    seed: int,
+    out: Path | None,
+    links: Sequence[Publisher],
+    shown: str | None,
+    director: Director,
+    progress: Callable[[Progress], None] | None,
+    source: MotionSource | None,
+) -> tuple[xarray.DataTree, str, list[str], dict[str, float]]:
+    """From the first tick to the end: the record, failure and remarks, what the run has to say of itself.
+
+    Raises Restarted when that was asked for.
+    """
+    started = time.perf_counter()
+    with ExitStack() as ending:
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
         ticks = round(scenario.duration_s * rate_hz) + 1
         record_every = round(rate_hz / scenario.record.rate_hz)
         events_every = max(1, round(EVENTS_S * rate_hz))
         publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
-        chunk = publish_every if realtime and links else round((PACED_S if realtime else BATCH_S) * rate_hz)
-        if source is None and realtime is None and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
-            source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, chunk, ticks)
+        paced = min(publish_every or ticks, max(1, round(PACED_S * rate_hz)))
+        batch = round(BATCH_S * rate_hz)
+        if source is None and not director.listens and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
+            source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, batch, ticks)
             ending.callback(ahead.close)
         elif source is None:
             source = motion(scenario, seed)
@@ -278,7 +335,6 @@ def run(
         legs = scenario.plan if isinstance(scenario.truth, FlightTruth) else scenario.truth.segments
         plan = [leg.leg for leg in legs]
 
-        pacer = Pacer(realtime) if realtime else None
         recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
         ending.callback(recorder.close)
 
@@ -287,7 +343,18 @@ def run(
             for link in links:
                 link.event(t, severity, text)
 
+        def say(t: float, severity: str, text: str) -> None:
+            for link in links:
+                link.event(t, severity, text)
+            if progress is not None:
+                progress(Progress(t, scenario.duration_s, t / (time.perf_counter() - started), text))
+
         watch = _EventWatch(emit, faults.truth)
+        for name, config in scenario.sensors.items():
+            if not isinstance(config, ImuConfig):
+                watch.heard[name] = config.offset_s + config.latency_s
+                watch.patience[name] = 1 / config.rate_hz + max(SILENT_S, 0.5 / config.rate_hz)
+        director.begin(Desk(scenario, Plant(faults, aiding, filters, source)), recorder, emit, say)
         latest = _Latest()
         unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
         unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events
@@ -298,9 +365,10 @@ def run(
         gc.freeze()
         ending.callback(gc.unfreeze)
         tick = 0
-        while tick < ticks:
+        while tick < ticks and director.ready(tick):
             before = time.perf_counter()
-            block = source.advance(min(chunk, ticks - tick))
+            turn = paced if director.pacer is not None else batch
+            block = source.advance(min(turn, ticks - tick, director.room(tick)))
             truth_s += time.perf_counter() - before
             if not len(block):
                 break
@@ -334,7 +402,7 @@ def run(
                 if links and name == shown:
                     unshown.extend(reports)
             if tick == 0:
-                recorder.faults(faults.truth)
+                recorder.faults(faults.truth[: len(scenario.fault)])
             recorder.truth(block)
             for name, increments in imu.items():
                 recorder.imu(name, increments)
@@ -363,8 +431,8 @@ def run(
                         link.publish(row, first, latest.by_sensor, integrated[shown], others, due)
             tick += len(block)
             t = float(block.t[-1])
-            if pacer is not None:
-                pacer.wait(t)
+            if director.pacer is not None:
+                director.pacer.wait(t)
             if progress is not None:
                 activity = "GNSS denied" if watch.denied else source.activity()
                 factor = t / max(time.perf_counter() - started, 1e-9)
@@ -373,20 +441,16 @@ def run(
         remarks = []
         if source.failure:
             emit(end, "error", source.failure)
+        elif director.ended:
+            remarks.append(f"ended on request at {end:.0f} s of {scenario.duration_s:g} s")
         elif tick < ticks:
             severity, remark = _flown(scenario, end)
             emit(end, severity, remark)
             remarks.append(remark)
-        if pacer is not None and pacer.missed:
-            remarks.append(str(pacer))
+        director.conclude(end)
+        if director.pacer is not None and director.pacer.missed:
+            remarks.append(str(director.pacer))
     dataset = recorder.dataset()
     wall_s = time.perf_counter() - started
-    results = metrics.compute(dataset)
-    results |= {
-        "run.wall_s": wall_s,
-        "run.truth_s": truth_s,
-        "run.realtime_factor": end / wall_s,
-    }
-    if out is not None:
-        metrics.save(results, out / "metrics.json")
-    return RunResult(dataset, results, out, source.failure, tuple(remarks))
+    seconds = {"wall_s": wall_s, "truth_s": truth_s, "realtime_factor": end / wall_s}
+    return dataset, source.failure, remarks, seconds

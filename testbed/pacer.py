@@ -40,6 +40,11 @@ class Pacer:
         self.worst_s = 0.0
         self.given_up_s = 0.0
 
+    def restart(self, t: float, factor: float | None = None) -> None:
+        """Count from now, which is simulated time ``t`` [s], at another speed perhaps."""
+        self._factor = factor or self._factor
+        self._start = self._clock() - t / self._factor
+
     def wait(self, t: float) -> None:
         """Return when the wall clock has reached simulated time ``t`` [s]; the first call only sets the start."""
         now = self._clock()

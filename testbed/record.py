@@ -7,6 +7,7 @@ Layout, one group each, every group with its own time axis::
     estimators/<name>                        state, sigmas, 9x9 covariance, further states
     estimators/<name>/innovations/<aid>      what became of each aiding sample
     faults                                   what was made to go wrong; time is when it begins
+    requests                                 what was asked of the run while it went on
     events                                   severity and text
 
 Every variable carries ``units``, ``long_name`` and, where it has one, ``frame``. The root carries the scenario text,
@@ -236,6 +237,12 @@ FAULT = {
     "unit": Variable("", "unit of size", dtype="S16"),
 }
 
+REQUEST = {
+    "tick": Variable("1", "number of the first row that it had to do with", dtype="<i8"),
+    "kind": Variable("", "what was asked", dtype="S8"),
+    "content": Variable("", "the same in full, JSON", dtype="S512"),
+}
+
 EVENT = {
     "severity": Variable("", "info, warning or error", dtype="S8"),
     "text": Variable("", "what happened", dtype="S160"),
@@ -421,6 +428,17 @@ def _pack_faults(faults: Sequence[FaultTruth]) -> tuple[Block, dict[str, Variabl
     return block, FAULT
 
 
+def _pack_requests(requests: Sequence[tuple[float, int, str, str]]) -> tuple[Block, dict[str, Variable]]:
+    times, ticks, kinds, contents = zip(*requests, strict=True)
+    block: Block = {
+        "time": np.array(times),
+        "tick": np.array(ticks, REQUEST["tick"].dtype),
+        "kind": _text(kinds, REQUEST["kind"].dtype),
+        "content": _text(contents, REQUEST["content"].dtype),
+    }
+    return block, REQUEST
+
+
 def _pack_events(events: Sequence[tuple[float, str, str]]) -> tuple[Block, dict[str, Variable]]:
     block: Block = {
         "time": np.array([e[0] for e in events]),
@@ -506,6 +524,12 @@ class Recorder:
         """Note what is going to go wrong."""
         if faults:
             self._table("faults", _pack_faults).objects.extend(faults)
+
+    def request(self, t: float, tick: int, kind: str, content: str) -> None:
+        """Note what somebody asked of the run, at once if there is a file: a run that is killed can be repeated."""
+        self._table("requests", _pack_requests).objects.append((t, tick, kind, content))
+        if self._file is not None:
+            self.flush()
 
     def event(self, t: float, severity: str, text: str) -> None:
         """Note that something happened; severity is info, warning or error."""

@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 
 from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
+from testbed.control import Request
 from testbed.mavlink import messages
 from testbed.mavlink.encode import Encoder, Fields, microseconds
 from testbed.mavlink.link import connect_all
@@ -134,6 +135,10 @@ class MavlinkPublisher:
                     frames.append(self._encoder.frame(stream.message, fields))
         self._calls += 1
         self._send(snapshot.t, frames)
+
+    def requests(self) -> Sequence[Request]:
+        """What stations ask of the run: nothing yet."""
+        return ()
 
     def event(self, t: float, severity: str, text: str) -> None:
         """Say ``text`` as STATUSTEXT; severity is info, warning or error."""

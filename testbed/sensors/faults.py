@@ -13,12 +13,14 @@ With tau = t - start [s] the kinds are::
     noise        white noise on top, so that the sensor's stated 1-sigma becomes factor times as large
     scale        the value times factor                  stuck      the last value before the window, or ``value``
     delay        the value of delay_s ago                dropout    no sample at all; an IMU's increments are NaN
-    garbage      NaN, infinities and absurd numbers
+    garbage      NaN, infinities and absurd numbers      slow       one sample of ``factor``; an IMU holds its rates
+    intermittent a dropout during the first ``share`` of every period_s
     drag_off     spoofing: from the true position away along bearing_deg by velocity_mps tau +
                  acceleration_mps2 tau^2 / 2, and the velocity with it
 
 Sizes are in the channel's unit, in another that fits it, or with ``unit = "sigma"`` in the sensor's own stated 1-sigma
-of one sample: what a GNSS receiver reports, white noise elsewhere.
+of one sample: what a GNSS receiver reports, white noise elsewhere. What loses samples may name ``gyro`` or ``accel`` as
+the channel of an IMU, and then loses these alone.
 """
 
 from __future__ import annotations
@@ -59,6 +61,7 @@ class Channel:
     ``units`` by name, in SI, the default first; ``read`` and ``write`` its numbers as the sample holds them; ``shift``
     adds a size [SI] to it, along a bearing [rad] where the channel ``needs_bearing``; ``sigma`` is the stated 1-sigma
     of one sample [SI] by the sensor's section. Of a channel that ``has_zero`` a multiple and a given value make sense.
+    One that ``is_whole`` stands for several: a size is added to each, and one that ``has_size`` False takes none.
     """
 
     units: Mapping[str, float]
@@ -68,6 +71,8 @@ class Channel:
     sigma: Callable[[Any], float]
     has_zero: bool = True
     needs_bearing: bool = False
+    is_whole: bool = False
+    has_size: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,12 +189,23 @@ def _gnss_sigma(what: str) -> Callable[[Any, int], float]:
 
 
 def _imu_axes(what: str, field: str, units: Mapping[str, float]) -> dict[str, Channel]:
-    """The three axes of the gyros or accelerometers, in the axes of the unit; noise over one increment."""
+    """The three axes of the gyros or accelerometers, in the axes of the unit, and all at once; noise per increment."""
 
     def sigma(config: Any) -> float:
         return float(getattr(config.errors(), f"{what}_noise")) * math.sqrt(config.rate_hz)
 
-    return {f"{what}_{name}": _rate(field, axis, units, sigma) for axis, name in enumerate("xyz")}
+    triad = Channel(
+        units,
+        lambda s: tuple((getattr(s, field) / s.dt).tolist()),
+        lambda s, values: replace(s, **{field: np.array(values) * s.dt}),
+        lambda s, size, _: replace(s, **{field: getattr(s, field) + size * s.dt}),
+        sigma,
+        is_whole=True,
+    )
+    return {
+        **{f"{what}_{name}": _rate(field, axis, units, sigma) for axis, name in enumerate("xyz")},
+        what: triad,
+    }
 
 
 def _turn(axis: int) -> Channel:
@@ -204,6 +220,26 @@ def _turn(axis: int) -> Channel:
         has_zero=False,
     )
 
+
+_FIELD = Channel(
+    {"uT": MICROTESLA},
+    lambda s: tuple(s.field_b.tolist()),
+    lambda s, values: replace(s, field_b=np.array(values)),
+    lambda s, size, _: replace(s, field_b=s.field_b + size),
+    lambda c: float(c.errors().noise),
+    is_whole=True,
+)
+
+_FIX = Channel(
+    METRES,
+    lambda s: (s.lat, s.lon, s.h, *s.v_n.tolist()),
+    lambda s, values: replace(s, lat=values[0], lon=values[1], h=values[2], v_n=np.array(values[3:])),
+    lambda s, size, _: s,
+    lambda c: 0.0,
+    has_zero=False,
+    is_whole=True,
+    has_size=False,
+)
 
 _HEIGHT = Channel(
     METRES,
@@ -220,14 +256,17 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
         **_imu_axes("gyro", "dtheta", {"deg/s": DEG, "deg/h": DEG_PER_H, "rad/s": 1.0}),
         **_imu_axes("accel", "dv", {"m/s^2": 1.0, "mg": MG}),
     },
-    "gnss": {**_position(_gnss_sigma("position")), **_velocity(_gnss_sigma("velocity"))},
+    "gnss": {**_position(_gnss_sigma("position")), **_velocity(_gnss_sigma("velocity")), "fix": _FIX},
     "barometer": {
         "pressure": _scalar("pressure", {"Pa": 1.0, "hPa": 100.0}, lambda c: c.errors().noise),
         "height": _HEIGHT,
     },
     "magnetometer": {
-        name: _component("field_b", axis, {"uT": MICROTESLA}, lambda c: c.errors().noise)
-        for axis, name in enumerate("xyz")
+        **{
+            name: _component("field_b", axis, {"uT": MICROTESLA}, lambda c: c.errors().noise)
+            for axis, name in enumerate("xyz")
+        },
+        "field": _FIELD,
     },
     "body_velocity": {
         name: _component("v_b", axis, SPEEDS, lambda c: c.errors().noise) for axis, name in enumerate(BODY_AXES)
@@ -367,10 +406,29 @@ class Garbage(_OnChannel):
     kind: Literal["garbage"]
 
 
-class Dropout(_Fault):
+class _Losing(_Fault):
+    channel: str | None = Field(None, description="of an IMU, whose other channels go on: gyro or accel; none: all")
+
+
+class Dropout(_Losing):
     """No samples."""
 
     kind: Literal["dropout"]
+
+
+class Slow(_Losing):
+    """One sample of every ``factor``; an IMU, which is asked all the same, repeats its last rates."""
+
+    kind: Literal["slow"]
+    factor: int = Field(ge=2, le=10_000)
+
+
+class Intermittent(_Losing):
+    """Comes and goes: no samples during the first ``share`` of every ``period_s``."""
+
+    kind: Literal["intermittent"]
+    period_s: Seconds
+    share: float = Field(0.5, gt=0, lt=1)
 
 
 class DragOff(_Fault):
@@ -383,7 +441,21 @@ class DragOff(_Fault):
 
 
 FaultConfig: TypeAlias = (
-    Step | Ramp | Quadratic | Exponential | Sine | Spikes | Stuck | Noise | Scale | Delay | Garbage | Dropout | DragOff
+    Step
+    | Ramp
+    | Quadratic
+    | Exponential
+    | Sine
+    | Spikes
+    | Stuck
+    | Noise
+    | Scale
+    | Delay
+    | Garbage
+    | Dropout
+    | Slow
+    | Intermittent
+    | DragOff
 )
 Fault: TypeAlias = Annotated[FaultConfig, Field(discriminator="kind")]
 
@@ -396,16 +468,25 @@ def mistakes(fault: FaultConfig, sensor: Any) -> Iterator[tuple[str, str]]:
             yield "kind", f"drag_off needs a sensor of position, and {fault.sensor!r} is of kind {sensor.kind!r}"
         if not fault.velocity_mps and not fault.acceleration_mps2:
             yield "kind", "drag_off needs velocity_mps, acceleration_mps2 or both: nothing would move"
+    if isinstance(fault, _Losing) and fault.channel in channels and sensor.kind != "imu":
+        yield "channel", f"a sample of kind {sensor.kind!r} is lost as a whole: leave the channel out"
+    if isinstance(fault, Slow) and fault.channel is None and sensor.kind == "imu":
+        yield "channel", "is missing: gyros and accelerometers are slow each by themselves: add gyro or accel"
     if not isinstance(fault, _OnChannel) or fault.channel not in channels:
         return
     channel = channels[fault.channel]
+    if isinstance(fault, Noise) and channel.is_whole:
+        yield "channel", f"{fault.channel!r} stands for several, whose noise is not the same: name one of them"
+    elif isinstance(fault, _Sized) and not isinstance(fault, Stuck) and not channel.has_size:
+        yield "channel", f"{fault.channel!r} stands for several of different units: name one of them"
     if channel.needs_bearing and fault.bearing_deg is None and not isinstance(fault, (Stuck, Delay, Scale, Garbage)):
         yield "channel", f"{fault.channel!r} has no direction of its own: add bearing_deg"
     if not channel.needs_bearing and fault.bearing_deg is not None:
         yield "bearing_deg", f"{fault.channel!r} has its own direction: leave the bearing out"
     if not channel.has_zero and isinstance(fault, Scale):
         yield "kind", f"a multiple of {fault.channel!r} means nothing: choose another kind"
-    if isinstance(fault, Stuck) and fault.value is not None and (not channel.has_zero or channel.needs_bearing):
+    valued = channel.has_zero and not channel.needs_bearing and not channel.is_whole
+    if isinstance(fault, Stuck) and fault.value is not None and not valued:
         yield "value", f"{fault.channel!r} takes no value: leave it out, and it sticks where it was"
     in_sigmas = isinstance(fault, Noise)
     if isinstance(fault, _Sized) and fault.unit is not None:
@@ -415,7 +496,7 @@ def mistakes(fault: FaultConfig, sensor: Any) -> Iterator[tuple[str, str]]:
             yield "unit", f"{fault.unit!r} does not fit {fault.sensor} {fault.channel}: choose from {', '.join(known)}"
         if in_sigmas and isinstance(fault, Stuck):
             yield "unit", "a value is in no sigmas: give it in " + " or ".join(channel.units)
-    if in_sigmas and channel.sigma(sensor) <= 0:
+    if in_sigmas and channel.has_size and channel.sigma(sensor) <= 0:
         key = "factor" if isinstance(fault, Noise) else "unit"
         yield key, f"{fault.sensor!r} states no error of {fault.channel!r} to take multiples of: give a size"
 
@@ -452,6 +533,8 @@ class _Running:
         self.listens = self.start  # from when on it has to see every sample; of earlier ones the newest will do
         self._before: deque[tuple[float, tuple[float, ...]]] = deque()
         self._next_spike = fault.window[0]
+        self._seen = 0  # samples inside the window
+        self._held: tuple[float, ...] = ()
         self._unit = 1.0
         self._bearing = 0.0
         self._sigma = 0.0
@@ -468,7 +551,7 @@ class _Running:
     def act(self, sample: Any) -> Any:
         """What becomes of a sample, None when it is lost."""
         fault = self._fault
-        if isinstance(sample, GnssSample) and sample.fix_type is FixType.NO_FIX and not isinstance(fault, Dropout):
+        if isinstance(sample, GnssSample) and sample.fix_type is FixType.NO_FIX and not isinstance(fault, _Losing):
             return sample  # there is nothing in it that could be wrong
         if isinstance(fault, (Stuck, Delay)):
             self._remember(fault, sample)
@@ -499,7 +582,18 @@ class _Running:
                 picked = self._rng.integers(len(NONSENSE), size=len(self._channel.read(sample)))
                 return self._channel.write(sample, [NONSENSE[k] for k in picked])
             case Dropout():
-                return _lost(sample) if isinstance(sample, _Increment) else None
+                return self._lost(fault, sample)
+            case Slow():
+                self._seen += 1
+                delivers = self._seen % fault.factor == 1
+                if fault.channel is None:
+                    return sample if delivers else None
+                channel = self._channels[fault.channel]
+                self._held = channel.read(sample) if delivers else self._held
+                return channel.write(sample, self._held)
+            case Intermittent():
+                phase = (tau + ON_THE_EDGE_S) % fault.period_s
+                return self._lost(fault, sample) if phase < fault.share * fault.period_s else sample
             case DragOff():
                 bearing = fault.bearing_deg * DEG
                 away = fault.velocity_mps * tau + fault.acceleration_mps2 * tau**2 / 2
@@ -508,6 +602,15 @@ class _Running:
                     speed = fault.velocity_mps + fault.acceleration_mps2 * tau
                     sample = self._channels["velocity"].shift(sample, speed, bearing)
                 return sample
+
+    def _lost(self, fault: _Losing, sample: Any) -> Any:
+        """None, or NaN in the channels of an increment: the time still passes."""
+        if not isinstance(sample, _Increment):
+            return None
+        for name in ("gyro", "accel") if fault.channel is None else (fault.channel,):
+            channel = self._channels[name]
+            sample = channel.write(sample, [math.nan] * len(channel.read(sample)))
+        return sample
 
     def _shifted(self, sample: Any, size: float) -> Any:
         return self._channel.shift(sample, size, self._bearing)
@@ -524,28 +627,32 @@ class _Running:
             self._before.popleft()
 
 
-def _lost(increment: _Increment) -> _Increment:
-    nothing = np.full(3, np.nan)
-    return replace(increment, dtheta=nothing, dv=nothing)
-
-
 class Faults:
-    """All faults of a run. ``truth`` says what they are; one may be added while the run goes on."""
+    """All faults of a run. ``truth`` says what they are; they may be added and ended while the run goes on."""
 
     def __init__(self, faults: Sequence[FaultConfig], sensors: Mapping[str, Any], seed: int) -> None:
         self.truth: list[FaultTruth] = []
         self._sensors = sensors
         self._seed = seed
         self._running: dict[str, list[_Running]] = {}
+        self._all: list[_Running] = []  # as in ``truth``
         for fault in faults:
             self.add(fault)
 
-    def add(self, fault: FaultConfig) -> None:
-        """One more fault; it acts on the samples that have yet to come."""
+    def add(self, fault: FaultConfig) -> int:
+        """One more fault, which acts on the samples that have yet to come; its place in ``truth``."""
         sensor = self._sensors[fault.sensor]
         rng = stream(self._seed, fault.sensor, f"fault {len(self.truth)}")
-        self._running.setdefault(fault.sensor, []).append(_Running(fault, sensor, rng))
+        self._all.append(_Running(fault, sensor, rng))
+        self._running.setdefault(fault.sensor, []).append(self._all[-1])
         self.truth.append(_truth(fault, sensor, [one.name for one in self.truth]))
+        return len(self.truth) - 1
+
+    def end(self, index: int, t: float) -> FaultTruth:
+        """End one at ``t`` [s], before the samples of then have been seen; what it is now known to have been."""
+        self._all[index].end = t - ON_THE_EDGE_S
+        self.truth[index] = replace(self.truth[index], end=t)
+        return self.truth[index]
 
     @overload
     def apply(self, sensor: str, samples: ImuSamples) -> ImuSamples: ...
@@ -595,8 +702,8 @@ def label(fault: FaultConfig, taken: Collection[str]) -> str:
     return next(name for name in itertools.chain([made], numbered) if name not in taken)
 
 
-_SIZES = ("size", "slope", "coefficient", "value", "factor", "delay_s", "velocity_mps")
-_UNITS = {"noise": "times", "scale": "times", "delay": "s", "drag_off": "m/s"}
+_SIZES = ("size", "slope", "coefficient", "value", "factor", "delay_s", "period_s", "velocity_mps")
+_UNITS = {"noise": "times", "scale": "times", "delay": "s", "slow": "times", "intermittent": "s", "drag_off": "m/s"}
 _PER = {"ramp": "/s", "quadratic": "/s^2"}
 
 
@@ -605,5 +712,5 @@ def _truth(fault: FaultConfig, sensor: Any, taken: Collection[str]) -> FaultTrut
     unit = _UNITS.get(fault.kind, "")
     if isinstance(fault, _Sized) and not math.isnan(size):
         unit = (fault.unit or next(iter(CHANNELS[sensor.kind][fault.channel].units))) + _PER.get(fault.kind, "")
-    channel = fault.channel if isinstance(fault, _OnChannel) else ""
+    channel = getattr(fault, "channel", None) or ""
     return FaultTruth(label(fault, taken), fault.sensor, channel, fault.kind, *fault.window, float(size), unit)

@@ -197,6 +197,7 @@ class Gnss:
             (ecef_from_geodetic(j.lat_deg * DEG, j.lon_deg * DEG, 0.0), j.radius_m) for j in config.jammers
         ]
         self._denied_until = -math.inf
+        self.jammed = False  # now, wherever it is; by who directs the run
 
     def sense(self, truth: TruthBlock) -> list[GnssSample]:
         """The epochs that fall inside this block; those without a fix are delivered too."""
@@ -279,8 +280,8 @@ class Gnss:
 
     def _is_jammed(self, antenna: Array) -> bool:
         """Whether the point below the antenna is within a jammer's radius, as the crow flies."""
-        if not self._jammers:
-            return False
+        if self.jammed or not self._jammers:
+            return self.jammed
         ground = ecef_from_geodetic(antenna[0], antenna[1], 0.0)
         return any(math.dist(ground, centre) <= radius for centre, radius in self._jammers)
 

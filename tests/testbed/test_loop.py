@@ -13,6 +13,7 @@ import pytest
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, UpdateReport
 from testbed import Scenario, flight, loop, record, run, sensors
+from testbed.control import Request
 from testbed.errors import UserError
 from testbed.scenario import shipped
 from testbed.truth import MotionSource, TruthBlock
@@ -50,6 +51,9 @@ class Watcher:
         if "gnss" in samples:
             self.gnss_age.append(t - samples["gnss"].t)
         self.rows.append(t)
+
+    def requests(self) -> Sequence[Request]:
+        return ()
 
     def event(self, t: float, severity: str, text: str) -> None:
         self.events.append((t, severity, text))
