@@ -5,12 +5,13 @@ Nothing heavy is imported before a command needs it, so that help and completion
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 import tempfile
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     import xarray
     from rich.console import Console
 
+    from testbed.control import Recorded
     from testbed.loop import Publisher, RunResult
     from testbed.scenario import Bounds, Scenario
 
@@ -95,7 +97,12 @@ def scenarios() -> None:
 
 @app.command()
 def run(
-    scenario: ScenarioName,
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENARIO|RUN.nc", help="A scenario file, a shipped one by name, or a record to be run again."
+        ),
+    ],
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results; runs/<scenario>.")] = None,
     seed: Annotated[
         int | None, typer.Option(metavar="N", min=0, max=2**63 - 1, help="In place of the scenario's seed.")
@@ -113,14 +120,25 @@ def run(
     ] = None,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write figures and report.html.")] = True,
 ) -> None:
-    """Fly one scenario: record, metrics, report. Exit code 1 if control was lost on the way."""
+    """Fly one scenario: record, metrics, report. Exit code 1 if control was lost on the way.
+
+    A record is run again with everything that was asked of it, bit for bit; --seed and --set make another run of it,
+    of which the same is asked at the same times.
+    """
     if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
         raise UserError(f"--realtime {realtime:g}: the factor must be above 0, such as 1 for wall-clock time")
-    loaded = _load(scenario, overrides)
-    folder = out or RUNS / Path(scenario).stem
+    replay: Sequence[tuple[float, Recorded]] = ()
+    if scenario.endswith(".nc"):
+        loaded, folder, recorded_seed, replay = _again(Path(scenario), overrides or [])
+        seed = recorded_seed if seed is None else seed
+    else:
+        loaded, folder = _load(scenario, overrides), RUNS / Path(scenario).stem
+    folder = out or folder
+    if (folder / "run.nc").resolve() == Path(scenario).resolve():
+        raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with _output_folder(folder):
         links = _connect(mavlink or [], loaded, folder, estimator)
-        result = _fly(loaded, folder, seed=seed, links=links, shown=estimator, realtime=realtime)
+        result = _fly(loaded, folder, seed=seed, links=links, shown=estimator, realtime=realtime, replay=replay)
         _conclude(result.dataset, result.metrics, folder / "run.nc", report)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
@@ -313,6 +331,28 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
     return Scenario.load(name, overrides or ())
 
 
+def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
+    """Scenario, folder, seed and requests for running a record again."""
+    from testbed import control, record
+    from testbed.scenario import Scenario
+
+    dataset = record.load(run_file)
+    said = dataset.attrs
+    try:
+        before, versions = json.loads(said["overrides"]), json.loads(said["versions"])
+        text, seed, path = said["scenario"], int(said["seed"]), said["scenario_path"]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
+    scenario = Scenario.parse(text, [*before, *overrides], Path(path) if path else run_file)
+    other = [f"{name} {version}" for name, version in versions.items() if record.versions().get(name) != version]
+    if other:
+        print(f"testbed: {run_file}: was made with {', '.join(other)}: bits may differ", file=sys.stderr)
+    if not said["complete"]:
+        print(f"testbed: {run_file}: ends early; the rerun goes on to the scenario's end", file=sys.stderr)
+    name = run_file.resolve().parent.name if run_file.name == "run.nc" else run_file.stem
+    return scenario, RUNS / f"{name}_again", seed, control.recorded(dataset, scenario)
+
+
 @contextmanager
 def _output_folder(folder: Path) -> Iterator[None]:
     """Make a folder and see that it can be written; if the work is then refused, no empty folder stays behind."""
@@ -365,13 +405,17 @@ def _fly(
     links: Sequence[Publisher] = (),
     shown: str | None = None,
     realtime: float | None = None,
+    replay: Sequence[tuple[float, Recorded]] = (),
 ) -> RunResult:
-    from testbed import loop, progress
+    from testbed import keyboard, loop, progress
 
     with (
         _keeping(f"the record so far is {folder / 'run.nc'}"),
+        keyboard.keys(sys.stdin.fileno(), realtime) if realtime else nullcontext() as keys,
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
+        if keys is not None:
+            print(keyboard.HELP, file=sys.stderr)
         result = loop.run(
             scenario,
             seed=seed,
@@ -380,6 +424,8 @@ def _fly(
             shown=shown,
             realtime=realtime,
             progress=lambda now: tell(*progress.of_run(now)),
+            controls=[keys.requests] if keys is not None else (),
+            replay=replay,
         )
     for remark in result.remarks:
         print(f"testbed: {remark}", file=sys.stderr)

@@ -119,6 +119,11 @@ class Resume:
 
 
 @dataclass(frozen=True, slots=True)
+class Toggle:
+    """`Resume` if the run is paused, else `Pause`."""
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """Go on for ``seconds`` of simulated time, then hold again."""
 
@@ -137,7 +142,7 @@ class Restart:
     """Begin the run anew, at its first tick."""
 
 
-Request: TypeAlias = Inject | Clear | Change | End | Pause | Resume | Step | Speed | Restart
+Request: TypeAlias = Inject | Clear | Change | End | Pause | Resume | Toggle | Step | Speed | Restart
 Recorded: TypeAlias = Inject | Clear | Change | End  # those that change what is computed
 Event: TypeAlias = Callable[[float, str, str], None]  # time [s], severity, text
 _RECORDED: Mapping[str, type[Recorded]] = {one.__name__.lower(): one for one in get_args(Recorded)}
@@ -504,6 +509,8 @@ class Director:
     def _heed(self, request: Request, tick: int) -> None:
         t = tick / self._rate_hz
         match request:
+            case Toggle():
+                self._heed(Resume() if self._paused else Pause(), tick)
             case Pause():
                 self._stop_at = None
                 self._hold(tick)

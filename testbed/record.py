@@ -468,7 +468,7 @@ class Recorder:
             "seed": seed,
             "duration_s": float(scenario.duration_s),
             "record_rate_hz": float(scenario.record.rate_hz),
-            "versions": json.dumps(_versions()),
+            "versions": json.dumps(versions()),
             "estimated_point_b_m": json.dumps(
                 {own.name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m for own in scenario.estimator}
             ),
@@ -672,7 +672,8 @@ def _check_writable(path: Path) -> None:
         ) from error
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """What the installed packages are that decide on a run's bits."""
     found = {}
     for package in ("navigation-testbed", "numpy", "scipy", "numba", "jsbsim", "h5py"):
         try:

@@ -212,7 +212,7 @@ STEP = {"sensor": "gnss", "channel": "north", "kind": "step", "window": [50, 60]
         ({"kind": "stuck", "size": None, "value": 2.0}, "value: 'north' takes no value"),
         ({"kind": "noise", "size": None, "factor": 0.5}, "factor: must be greater than or equal to 1, not 0.5"),
         ({"kind": "sine", "period_s": 0.0}, "period_s: must be greater than or equal to 0.001"),
-        ({"kind": "dropout", "size": None}, "channel: unknown key"),
+        ({"kind": "dropout", "size": None}, "channel: a sample of kind 'gnss' is lost as a whole"),
         (
             {"sensor": "airspeed", "channel": "speed", "kind": "stuck", "size": None, "unit": "sigma", "value": 3.0},
             "unit: a value is in no sigmas: give it in m/s",
