@@ -411,7 +411,7 @@ def _fly(
 
     with (
         _keeping(f"the record so far is {folder / 'run.nc'}"),
-        keyboard.keys(sys.stdin.fileno(), realtime) if realtime else nullcontext() as keys,
+        keyboard.keys(realtime) if realtime else nullcontext() as keys,
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
         if keys is not None:

@@ -7,6 +7,7 @@ rounds, the median of each side.
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -41,6 +42,7 @@ from testbed.scenario import Scenario
 MAIN = "loiter_gnss_outage"
 ROUNDS = 5
 CAMPAIGN_RUNS = 40
+LIVE_S = 25
 DEG = np.pi / 180
 HAS_PEERS = all(find_spec(name) is not None for name in ("pyins", "smsfusion", "vqf"))
 
@@ -331,6 +333,67 @@ def _unscented_seconds(
         unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, root, A, curved, R, nu))
 
 
+def live() -> list[Row]:
+    """A run held to the wall clock with four stations listening: deadlines, jitter, and what streaming costs."""
+    from testbed.mavlink import MavlinkPublisher
+
+    station = (
+        "import select, socket, sys\n"
+        "udp = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]\n"
+        "tcp = socket.create_server(('127.0.0.1', 0))\n"
+        "for one in udp: one.bind(('127.0.0.1', 0))\n"
+        "print(*(one.getsockname()[1] for one in (*udp, tcp)), flush=True)\n"
+        "ears = [*udp, tcp.accept()[0], socket.create_connection(('127.0.0.1', int(sys.stdin.readline())))]\n"
+        "while all(one.recv(65536) for one in select.select(ears, [], [])[0]): pass\n"
+    )
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    scenario = Scenario.load(MAIN, [f"duration_s={LIVE_S}", "sensors.gnss.denied=[]", "expect={}", TWO_ESTIMATORS])
+    command = [sys.executable, "-c", station]
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as listening,
+    ):
+        assert listening.stdin is not None
+        assert listening.stdout is not None
+        ours = [int(word) for word in listening.stdout.readline().split()]
+        urls = [f"udpout:127.0.0.1:{ours[0]}", f"udpout:127.0.0.1:{ours[1]}", f"tcp:127.0.0.1:{ours[2]}"]
+        publisher = MavlinkPublisher([*urls, f"tcpin:127.0.0.1:{port}"], scenario.date)
+        listening.stdin.write(f"{port}\n")
+        listening.stdin.flush()
+        timed = _Timed(publisher)
+        found = loop.run(scenario, links=[timed], realtime=1.0, out=Path(folder)).metrics
+    share = 100 * timed.seconds / LIVE_S
+    detail = f"{LIVE_S} s at 200 Hz, four streams, {os.getloadavg()[0]:.1f} processes running on {os.cpu_count()} cores"
+    return [
+        Row("live: missed deadlines", found["run.missed_percent"], "%", at_most=0.1, detail=detail),
+        Row("live: jitter, 99 % within", 1e3 * found["run.jitter_p99_s"], "ms", at_most=5.0),
+        Row("live: streaming", share, "% of a core", at_most=5.0),
+    ]
+
+
+class _Timed:
+    """A publisher, and the processor time that it takes."""
+
+    def __init__(self, publisher: loop.Publisher) -> None:
+        self.period_s = publisher.period_s
+        self.seconds = 0.0
+        self.publish = self._timed(publisher.publish)
+        self.requests = self._timed(publisher.requests)
+        self.event = self._timed(publisher.event)
+        self.close = publisher.close
+
+    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any) -> Any:
+            began = time.thread_time()
+            result = call(*arguments)
+            self.seconds += time.thread_time() - began
+            return result
+
+        return timed
+
+
 def start_up() -> list[Row]:
     """Cold compile of every kernel, and the time from process start to the first tick when they are compiled."""
     script = (
@@ -477,8 +540,8 @@ def main() -> list[str]:
     console = Console()
     rows: list[Row] = []
     for measure in (
-        whole_run, strapdown_alone, ins_at_every_sample, accuracy, ahrs_batch, federated, unscented_period, start_up,
-        campaign_efficiency,
+        whole_run, strapdown_alone, ins_at_every_sample, accuracy, ahrs_batch, federated, unscented_period, live,
+        start_up, campaign_efficiency,
     ):  # fmt: skip
         with console.status((measure.__doc__ or "").partition("\n")[0]):
             rows += measure()

@@ -57,7 +57,7 @@ class Keyboard:
 
 
 @contextmanager
-def keys(fd: int, factor: float) -> Iterator[Keyboard | None]:
+def keys(factor: float, fd: int = 0) -> Iterator[Keyboard | None]:
     """The keyboard of terminal ``fd`` while the context lasts; None when it is no terminal, or another's.
 
     Keys then come one by one and unseen; however the context ends, by SIGTERM too, the terminal is as it was.

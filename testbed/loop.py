@@ -37,6 +37,7 @@ PACED_S = 0.1  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 SILENT_S = 0.5  # beyond its period, or half of it if that is longer, before a sensor that says nothing is silent
 REFUSALS = 10  # of an aid in a row, before it is worth an event
+REHEARSAL_S = 5.0  # that an estimator aligns in
 LARGEST_SEED = 2**63 - 1
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
@@ -278,6 +279,11 @@ def run(
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
         asking = (*(link.requests for link in links), *controls)
         director = Director(scenario, asking, replay, realtime, rate_hz, source is None)
+        if (
+            realtime is not None and source is None
+        ):  # the first calls load and compile, for which there is no time later
+            rehearsal = scenario.model_copy(update={"duration_s": min(REHEARSAL_S, scenario.duration_s)})
+            _fly(rehearsal, seed, None, (), None, Director(scenario, (), (), None, rate_hz), None, None)
         flown = None
         while flown is None:
             with suppress(Restarted):
@@ -432,7 +438,7 @@ def _fly(
             tick += len(block)
             t = float(block.t[-1])
             if director.pacer is not None:
-                director.pacer.wait(t)
+                director.pacer.wait(t, recorder.tend)
             if progress is not None:
                 activity = "GNSS denied" if watch.denied else source.activity()
                 factor = t / max(time.perf_counter() - started, 1e-9)
@@ -453,4 +459,7 @@ def _fly(
     dataset = recorder.dataset()
     wall_s = time.perf_counter() - started
     seconds = {"wall_s": wall_s, "truth_s": truth_s, "realtime_factor": end / wall_s}
+    if director.pacer is not None and director.pacer.waits:
+        seconds["missed_percent"] = 100 * director.pacer.missed / director.pacer.waits
+        seconds["jitter_p99_s"] = director.pacer.jitter_s(0.99)
     return dataset, source.failure, remarks, seconds

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from testbed.errors import UserError
 
+JITTER_STEP_S = 1e-4
 MAX_LAG_S = 0.5  # a run further behind than this gives up the rest instead of racing to make it good
 
 
@@ -18,7 +19,8 @@ class Pacer:
     late catches up at most `MAX_LAG_S` of wall time; what exceeds it is given up, and the deadlines after it move.
 
     ``waits`` counts the calls after the first, ``missed`` those that came after their deadline; ``worst_s`` is the
-    latest of them and ``given_up_s`` the wall time that was not made good. As text, it says these.
+    latest of them and ``given_up_s`` the wall time that was not made good. As text, it says these. `jitter_s` tells
+    how late the waits were over.
     """
 
     def __init__(
@@ -34,6 +36,7 @@ class Pacer:
         self._factor = factor
         self._clock = clock
         self._sleep = sleep
+        self._jitter = [0] * 5000  # waits by how late they were over; the last: or more
         self._start: float | None = None  # clock reading at simulated time 0
         self.waits = 0
         self.missed = 0
@@ -45,22 +48,41 @@ class Pacer:
         self._factor = factor or self._factor
         self._start = self._clock() - t / self._factor
 
-    def wait(self, t: float) -> None:
-        """Return when the wall clock has reached simulated time ``t`` [s]; the first call only sets the start."""
+    def wait(self, t: float, meanwhile: Callable[[float], object] | None = None) -> None:
+        """Return when the wall clock has reached simulated time ``t`` [s]; the first call only sets the start.
+
+        ``meanwhile`` is called if there is time to spare, with how much [s], and should use less.
+        """
         now = self._clock()
         if self._start is None:
             self._start = now - t / self._factor
             return
         self.waits += 1
-        late = now - (self._start + t / self._factor)
+        deadline = self._start + t / self._factor
+        late = now - deadline
         if late < 0:
-            self._sleep(-late)
+            if meanwhile is not None:
+                meanwhile(-late)
+                now = self._clock()
+            if now < deadline:
+                self._sleep(deadline - now)
+                now = self._clock()
         elif late > 0:
             self.missed += 1
             self.worst_s = max(self.worst_s, late)
             excess = max(0.0, late - MAX_LAG_S)
             self.given_up_s += excess
             self._start += excess
+        self._jitter[min(int((now - deadline) / JITTER_STEP_S), len(self._jitter) - 1)] += 1
+
+    def jitter_s(self, share: float) -> float:
+        """How long after its deadline the wait of all but ``1 - share`` was over at the latest [s], to 0.1 ms."""
+        below = 0
+        for k, count in enumerate(self._jitter):
+            below += count
+            if below >= share * self.waits:
+                return (k + 1) * JITTER_STEP_S
+        return 0.0
 
     def __str__(self) -> str:
         return (

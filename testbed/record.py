@@ -53,6 +53,8 @@ Data: TypeAlias = npt.NDArray[Any]
 
 FORMAT = "navigation-testbed run 1"
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
+UNTENDED_S = 5.0  # or this much of a live one, which writes when there is time, if there was none
+PIECE_S = 0.004  # what one piece of that work may take, on a busy machine
 PACK_ROWS = 400  # objects that a table keeps before it makes columns of them: while they are in the cache
 SPARE_ROWS = 64  # room made for a table beyond what its rate so far asks for
 
@@ -272,6 +274,16 @@ class _Column:
         return self.dtype.itemsize * int(np.prod(self.shape, dtype=int))
 
 
+@dataclass(slots=True)
+class _Plan:
+    """What a new file is to hold of a table: rows, columns with time first, and where each begins in it [bytes]."""
+
+    time_name: str
+    capacity: int
+    columns: dict[str, _Column]
+    offsets: dict[str, int] = field(default_factory=dict)
+
+
 Block: TypeAlias = dict[str, Data]
 Pack: TypeAlias = Callable[[Sequence[Any]], tuple[Block, dict[str, Variable]]]
 
@@ -483,7 +495,9 @@ class Recorder:
         self._increments = np.zeros((0, 6))  # dtheta and dv of the ticks since the last recorded row
         self._t = 0.0
         self._last_flush = time.monotonic()
+        self._tended = False
         self._file: BinaryIO | None = None
+        self._laying: Iterator[None] | None = None  # the next file in the making
         if path is not None:
             _check_writable(path)
 
@@ -495,7 +509,7 @@ class Recorder:
         for table in self._tables.values():
             if len(table.objects) >= PACK_ROWS:
                 table.pack()
-        if time.monotonic() - self._last_flush >= FLUSH_WALL_S:
+        if time.monotonic() - self._last_flush >= (UNTENDED_S if self._tended else FLUSH_WALL_S):
             self.flush()
 
     def imu(self, name: str, samples: ImuSamples) -> None:
@@ -528,7 +542,9 @@ class Recorder:
     def request(self, t: float, tick: int, kind: str, content: str) -> None:
         """Note what somebody asked of the run, at once if there is a file: a run that is killed can be repeated."""
         self._table("requests", _pack_requests).objects.append((t, tick, kind, content))
-        if self._file is not None:
+        if self._tended:
+            self._last_flush = -math.inf
+        elif self._file is not None:
             self.flush()
 
     def event(self, t: float, severity: str, text: str) -> None:
@@ -537,15 +553,24 @@ class Recorder:
 
     def flush(self) -> None:
         """Make every row taken so far part of the file; in memory, only pack it."""
-        self._last_flush = time.monotonic()
-        for table in self._tables.values():
-            table.pack()
-        if self.path is None or not any(table.pending for table in self._tables.values()):
+        self._pack()
+        if self.path is not None and (self._laying or any(table.pending for table in self._tables.values())):
+            self._guard(self._write)
+
+    def tend(self, seconds: float) -> None:
+        """Use no more than ``seconds`` of wall time, which nobody else needs, for what `flush` does in one go."""
+        until = time.monotonic() + seconds - PIECE_S
+        self._tended = True
+        if self.path is None or time.monotonic() >= until:
             return
-        if any(t.grown or t.rows_now > t.capacity for t in self._tables.values()):
-            self._guard(self._lay_out)
-        else:
-            self._guard(self._write_rows)
+        if self._laying is None and time.monotonic() - self._last_flush >= FLUSH_WALL_S:
+            self._pack()
+            if self._misfit():
+                self._laying = self._lay_out()
+            else:
+                self._guard(self._write_rows)
+        while self._laying is not None and time.monotonic() < until:
+            self._guard(self._lay_piece)
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
@@ -553,7 +578,8 @@ class Recorder:
             self.flush()
             if self._file is not None:
                 self.attributes["complete"] = 1
-                self._guard(lambda: self._lay_out(final=True))
+                self._laying = self._lay_out(final=True)
+                self._guard(self._write)
         finally:
             if self._file is not None:
                 self._file.close()
@@ -599,10 +625,29 @@ class Recorder:
             {"time": block.t[kept].copy(), **columns, "dtheta": sums[:, :3], "dv": sums[:, 3:]}, TRUTH
         )
 
+    def _pack(self) -> None:
+        self._last_flush = time.monotonic()
+        for table in self._tables.values():
+            table.pack()
+
+    def _misfit(self) -> bool:
+        """Whether the file lacks a column, or room."""
+        return any(table.grown or table.rows_now > table.capacity for table in self._tables.values())
+
+    def _write(self) -> None:
+        """Write all rows, whatever it takes."""
+        while self._laying is not None:
+            self._lay_piece()
+        if self._misfit():
+            self._laying = self._lay_out()
+            self._write()
+        self._write_rows()
+
     def _write_rows(self) -> None:
+        """Write the rows of the tables that the file has room for."""
         assert self._file is not None
         for table in self._tables.values():
-            if not table.pending:
+            if not table.pending or table.grown or table.rows_now > table.capacity:
                 continue
             for name in table.order():
                 column = table.columns[name]
@@ -612,26 +657,44 @@ class Recorder:
             table.pending = 0
             table.blocks.clear()
 
-    def _lay_out(self, final: bool = False) -> None:
-        """Write a new file with the room that is needed, and put it in place of the old one."""
+    def _lay_piece(self) -> None:
+        assert self._laying is not None
+        if next(self._laying, self) is self:
+            self._laying = None
+
+    def _lay_out(self, final: bool = False) -> Iterator[None]:
+        """Write a new file with the room that is needed, piece by piece, and put it in place of the old one.
+
+        Rows may come meanwhile, and columns; these wait for the next file.
+        """
         assert self.path is not None
-        old = {path: (t.written, {n: c.offset for n, c in t.columns.items()}) for path, t in self._tables.items()}
-        for table in self._tables.values():
-            table.capacity = table.rows_now if final else table.rows_expected(self._t, self._duration)
-        _create(_part(self.path), self._tables, self.attributes, blank=not final)
+        plans = {
+            path: _Plan(
+                table.time_name,
+                table.rows_now if final else table.rows_expected(self._t, self._duration),
+                dict(table.columns),
+            )
+            for path, table in self._tables.items()
+        }
+        yield from _create(_part(self.path), plans, dict(self.attributes), blank=not final)
         new = _part(self.path).open("r+b", buffering=0)
         if self._file is not None:
-            for path, table in self._tables.items():
-                written, offsets = old[path]
-                for name in table.order() if written else ():
-                    column = table.columns[name]
-                    if offsets[name]:
-                        _copy(self._file, offsets[name], new, column.offset, written * column.row_bytes)
+            for path, plan in plans.items():
+                written = self._tables[path].written
+                for name in reversed(plan.columns) if written else ():
+                    column = plan.columns[name]
+                    if column.offset:
+                        yield from _copy(self._file, column.offset, new, plan.offsets[name], written * column.row_bytes)
                     else:
-                        new.seek(column.offset)
+                        new.seek(plan.offsets[name])
                         new.write(_blank((written, *column.shape), column.dtype).data.cast("B"))
             self._file.close()
         self._file = new
+        for path, plan in plans.items():
+            table = self._tables[path]
+            table.capacity, table.grown = plan.capacity, len(table.columns) > len(plan.columns)
+            for name, column in plan.columns.items():
+                column.offset = plan.offsets[name]
         self._write_rows()
         os.replace(_part(self.path), self.path)
 
@@ -650,13 +713,14 @@ def _part(path: Path) -> Path:
     return path.with_name(f".{path.name}.part")
 
 
-def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -> None:
+def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -> Iterator[None]:
     source.seek(start)
     target.seek(at)
     while count:
-        chunk = source.read(min(count, 1 << 22))
+        chunk = source.read(min(count, 1 << 20))
         target.write(chunk)
         count -= len(chunk)
+        yield
 
 
 def _check_writable(path: Path) -> None:
@@ -704,10 +768,12 @@ class _Attributes:
         h5a.create(where, name.encode(), kind, self._scalar).write(np.array(raw, f"S{max(len(raw), 1)}"), mtype=kind)
 
 
-def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, str | int | float], blank: bool) -> None:
+def _create(
+    path: Path, plans: Mapping[str, _Plan], attributes: Mapping[str, str | int | float], blank: bool
+) -> Iterator[None]:
     """Write the structure of a record with all its space allocated, and note where each column's rows go.
 
-    ``blank`` marks all rows as not written; without, every row is about to be.
+    ``blank`` marks all rows as not written; without, every row is about to be. Yields between small pieces of work.
     """
     import h5py
     from h5py import h5d, h5ds, h5p, h5s, h5t
@@ -716,30 +782,30 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
     with h5py.File(path, "w", libver=("earliest", "v110"), track_order=True) as file:
         for name, value in attributes.items():
             file.attrs[name] = value
-        for group_path, table in tables.items():
+        for group_path, plan in plans.items():
             group = _group(file, group_path)
             local: dict[str, Any] = {}
-            for name, column in table.columns.items():
+            for name, column in plan.columns.items():
                 dtype = column.dtype
                 text = dtype.kind == "S"
                 layout = h5p.create(h5p.DATASET_CREATE)
                 layout.set_alloc_time(h5d.ALLOC_TIME_EARLY)
                 layout.set_obj_track_times(False)  # the same run gives the same bytes
-                if blank and name == table.time_name:
+                if blank and name == plan.time_name:
                     layout.set_fill_value(np.array(np.nan))
                 else:
                     layout.set_fill_time(h5d.FILL_TIME_NEVER)  # room costs nothing until it is written
-                shape = (table.capacity, *column.shape, *((dtype.itemsize,) if text else ()))
+                shape = (plan.capacity, *column.shape, *((dtype.itemsize,) if text else ()))
                 stored = h5t.py_create(np.dtype("S1") if text else dtype)
                 dataset = h5d.create(group.id, name.encode(), stored, h5s.create_simple(shape), layout)
                 dims = (*column.variable.dims, *((f"characters_{dtype.itemsize}",) if text else ()))
-                if name == table.time_name:
+                if name == plan.time_name:
                     h5ds.set_scale(dataset, name.encode())
                     local[name] = dataset
                     note.text(dataset, "standard_name", "time")
                     note.text(dataset, "axis", "T")
                 else:
-                    h5ds.attach_scale(dataset, local[table.time_name], 0)
+                    h5ds.attach_scale(dataset, local[plan.time_name], 0)
                 for k, dim in enumerate(dims, start=1):
                     if dim not in local:
                         local[dim] = _labels(group, dim) if dim in AXES else _bare_dimension(group, dim, shape[k])
@@ -748,8 +814,8 @@ def _create(path: Path, tables: Mapping[str, _Table], attributes: Mapping[str, s
                     note.text(dataset, key, value)
                 if text:
                     note.text(dataset, "_Encoding", "utf-8")
-                column.offset = dataset.get_offset()
-            table.grown = False
+                plan.offsets[name] = dataset.get_offset()
+                yield
 
 
 def _group(file: h5py.File, path: str) -> h5py.Group:
