@@ -159,7 +159,8 @@ def _handover(config: EstimatorConfig, estimator: Ins | Federated, imu: ImuError
 
 def _turned_back(C_sb: Array, x_s: Array) -> Array:
     """C_sb' x of each row; written out, since the sums of a matrix product depend on the number of rows."""
-    x_b: Array = x_s[:, 0:1] * C_sb[0] + x_s[:, 1:2] * C_sb[1] + x_s[:, 2:3] * C_sb[2]
+    with np.errstate(all="ignore"):  # a broken unit may say anything
+        x_b: Array = x_s[:, 0:1] * C_sb[0] + x_s[:, 1:2] * C_sb[1] + x_s[:, 2:3] * C_sb[2]
     return x_b
 
 
