@@ -58,7 +58,7 @@ def problem(sample: Sample) -> str:
         case BarometerSample():
             return _range_problem("pressure", sample.pressure, PRESSURE_LIMITS)
         case MagnetometerSample():
-            return _range_problem("field", float(np.sqrt(sample.field_b @ sample.field_b)), FIELD_LIMITS)
+            return _range_problem("field", math.hypot(*sample.field_b), FIELD_LIMITS)
         case AirspeedSample():
             return _range_problem("airspeed", sample.eas, AIRSPEED_LIMITS)
         case BodyVelocitySample():
@@ -101,11 +101,11 @@ def _gnss_problem(sample: GnssSample) -> str:
         return trouble
     if not _positive(sample.sigma_position_n):
         return "reported accuracy of position is not a positive number"
-    speed2 = float(sample.v_n @ sample.v_n)
-    if math.isnan(speed2):
+    speed = math.hypot(*sample.v_n.tolist())
+    if math.isnan(speed):
         return "" if np.isnan(sample.v_n).all() else "velocity is not finite"
-    if speed2 > SPEED_LIMIT**2:
-        return f"speed {math.sqrt(speed2):.6g} is out of range"
+    if speed > SPEED_LIMIT:
+        return f"speed {speed:.6g} is out of range"
     return "" if _positive(sample.sigma_velocity_n) else "reported accuracy of velocity is not a positive number"
 
 
