@@ -339,12 +339,12 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
     dataset = record.load(run_file)
     said = dataset.attrs
     try:
-        before, versions = json.loads(said["overrides"]), json.loads(said["versions"])
+        before, versions = [*json.loads(said["overrides"])], [*json.loads(said["versions"]).items()]
         text, seed, path = said["scenario"], int(said["seed"]), said["scenario_path"]
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
     scenario = Scenario.parse(text, [*before, *overrides], Path(path) if path else run_file)
-    other = [f"{name} {version}" for name, version in versions.items() if record.versions().get(name) != version]
+    other = [f"{name} {version}" for name, version in versions if record.versions().get(name) != version]
     if other:
         print(f"testbed: {run_file}: was made with {', '.join(other)}: bits may differ", file=sys.stderr)
     if not said["complete"]:

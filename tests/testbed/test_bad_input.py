@@ -213,6 +213,11 @@ STEP = {"sensor": "gnss", "channel": "north", "kind": "step", "window": [50, 60]
         ({"kind": "noise", "size": None, "factor": 0.5}, "factor: must be greater than or equal to 1, not 0.5"),
         ({"kind": "sine", "period_s": 0.0}, "period_s: must be greater than or equal to 0.001"),
         ({"kind": "dropout", "size": None}, "channel: a sample of kind 'gnss' is lost as a whole"),
+        ({"kind": "slow", "size": None, "channel": None, "factor": 1}, "factor: must be greater than or equal to 2"),
+        ({"kind": "slow", "size": None, "channel": None, "factor": 5, "sensor": "imu"}, "channel: is missing: gyros"),
+        ({"channel": "fix"}, "channel: 'fix' stands for several of different units: name one of them"),
+        ({"channel": "gyro", "sensor": "imu", "kind": "noise", "factor": 2.0, "size": None},
+         "channel: 'gyro' stands for several, whose noise is not the same: name one of them"),
         (
             {"sensor": "airspeed", "channel": "speed", "kind": "stuck", "size": None, "unit": "sigma", "value": 3.0},
             "unit: a value is in no sigmas: give it in m/s",

@@ -245,6 +245,59 @@ def test_run_passes_everything_on(testbed: Testbed, monkeypatch: pytest.MonkeyPa
         assert asked["realtime"] == 1.0
 
 
+def test_a_record_is_run_again(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("run", "static_bench", *QUICK, "--out", "first", "--seed", "7")
+    ended = testbed("run", "first/run.nc", "--no-report")
+    assert ended.code == 0, ended.err
+    again = tmp_path / "runs/first_again/run.nc"
+    assert str(again.relative_to(tmp_path)) in ended.out
+    first, second = record.load(tmp_path / "first/run.nc"), record.load(again)
+    assert first.identical(second)
+    ended = testbed("run", "first/run.nc", "--no-report", "--seed", "8", "--set", "duration_s=2", "--out", "other")
+    other = record.load(tmp_path / "other/run.nc")
+    assert (other.attrs["seed"], other["truth/time"].values[-1]) == (8, 2.0)
+    third = testbed("run", "other/run.nc", "--no-report", "--out", "third")
+    assert third.code == 0, "overrides are part of a record"
+    assert record.load(tmp_path / "third/run.nc").identical(other)
+
+
+def _spoilt(folder: Path, **attributes: str) -> Path:
+    """A record some of whose attributes are not what a run writes."""
+    import h5py
+
+    folder.mkdir()
+    path = folder / "mine.nc"
+    path.write_bytes((folder.parent / "first/run.nc").read_bytes())
+    with h5py.File(path, "r+") as file:
+        for name, value in attributes.items():
+            file.attrs[name] = value
+    return path
+
+
+def test_what_is_wrong_with_running_a_record_again(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("run", "static_bench", *QUICK, "--out", "first")
+    for arguments, says in (
+        (["first/run.nc", "--out", "first"], "first/run.nc: would be overwritten by its own rerun: choose another"),
+        (["nothing.nc"], "nothing.nc: no such file"),
+        (["first/run.nc", "--set", "sensors.gnss=3"], "sensors.gnss: must be a table, not 3"),
+        ([_spoilt(tmp_path / "a", overrides="[")], "a/mine.nc: damaged record"),
+        ([_spoilt(tmp_path / "b", scenario="title = 3")], "title: must be text"),
+        ([_spoilt(tmp_path / "c", versions="5")], "c/mine.nc: damaged record"),
+    ):
+        ended = testbed("run", *arguments)
+        assert ended.code == 2, arguments
+        assert says in ended.err
+        assert "Traceback" not in ended.err
+    assert (tmp_path / "first/run.nc").exists()
+    assert not (tmp_path / "runs").exists()
+    old = _spoilt(tmp_path / "d", versions='{"numpy": "0.1"}', complete="")
+    ended = testbed("run", old, "--no-report")
+    assert ended.code == 0, ended.err
+    assert "mine.nc: was made with numpy 0.1: bits may differ" in ended.err
+    assert "mine.nc: ends early; the rerun goes on to the scenario's end" in ended.err
+    assert (tmp_path / "runs/mine_again/run.nc").exists()
+
+
 def test_a_lost_flight_fails_and_keeps_its_record(
     testbed: Testbed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

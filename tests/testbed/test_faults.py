@@ -381,3 +381,71 @@ def test_truth_says_what_was_done() -> None:
     assert [(one.size, one.unit) for one in truth[:3]] == [(0.5, "m/s"), (2.0, "sigma/s"), (1.0, "m/s")]
     assert [str(one) for one in truth[1:]] == ["it north ramp 2 sigma/s", "it drag_off 1 m/s", "it dropout"]
     assert math.isnan(truth[3].size)
+
+
+def test_slow_delivers_one_of_so_many_and_an_imu_repeats_itself() -> None:
+    healthy, ours = sensed(section("barometer", rate_hz=10), fault(sensor="it", kind="slow", factor=4))
+    t = np.array([s.t for s in healthy])
+    inside = (t > 10 - 1e-6) & (t < 20 - 1e-6)
+    kept = [*t[~inside & (t < 15)], *t[inside][::4], *t[~inside & (t > 15)]]
+    assert [s.t for s in ours] == kept
+    config = section("imu", grade="mems-industrial", rate_hz=100)
+    healthy, ours = sensed(config, fault(sensor="it", channel="gyro", kind="slow", factor=3), moving=True, cuts=[1234])
+    inside = (healthy.t > 10 - 1e-6) & (healthy.t < 20 - 1e-6)
+    held = np.repeat(healthy.dtheta[inside][::3], 3, axis=0)[: inside.sum()]
+    np.testing.assert_allclose(ours.dtheta[inside], held, rtol=1e-12)
+    np.testing.assert_array_equal(ours.dtheta[~inside], healthy.dtheta[~inside])
+    np.testing.assert_array_equal(ours.dv, healthy.dv)
+
+
+def test_intermittent_comes_and_goes() -> None:
+    for share, lost in ((0.5, lambda p: p < 1.5), (0.25, lambda p: p < 0.75)):
+        keys = {"kind": "intermittent", "period_s": 3.0, "share": share}
+        healthy, ours = sensed(section("airspeed", rate_hz=5), fault(sensor="it", **keys), cuts=[2500])
+        t = np.array([s.t for s in healthy])
+        gone = np.array([9.999 < x < 19.999 and lost((x - 10 + 1e-6) % 3.0) for x in t])
+        assert [s.t for s in ours] == t[~gone].tolist()
+        assert gone.sum() > 10
+    keys = {"kind": "intermittent", "period_s": 4.0}
+    healthy, ours = sensed(section("imu", rate_hz=100), fault(sensor="it", channel="accel", **keys))
+    gone = np.array([9.999 < x < 19.999 and (x - 10 + 1e-6) % 4.0 < 2.0 for x in healthy.t])
+    np.testing.assert_array_equal(np.isnan(ours.dv).all(axis=1), gone)
+    assert np.isfinite(ours.dtheta).all()
+
+
+@pytest.mark.parametrize(("kind", "channel", "unit"), [("imu", "gyro", "deg/s"), ("magnetometer", "field", "uT")])
+def test_a_size_is_added_to_every_axis_of_what_stands_for_several(kind: str, channel: str, unit: str) -> None:
+    step = fault(sensor="it", channel=channel, kind="step", size=3.0, unit=unit)
+    healthy, ours = sensed(section(kind, rate_hz=100), step, moving=True)
+    if kind == "imu":
+        added, t = (ours.dtheta - healthy.dtheta) * 100 / math.radians(1), healthy.t
+    else:
+        added = np.array([b.field_b - a.field_b for a, b in zip(healthy, ours, strict=True)]) / 1e-6
+        t = np.array([s.t for s in healthy])
+    inside = (t > 10 - 1e-6) & (t < 20 - 1e-6)
+    np.testing.assert_allclose(added, np.where(inside, 3.0, 0.0)[:, None] * np.ones(3), atol=1e-9)
+
+
+def test_a_fault_may_begin_and_end_while_the_run_goes_on_wherever_it_is_cut() -> None:
+    """Added and ended between blocks, it acts as one that was known beforehand; stuck, from its first sample on."""
+    config = section("gnss", rate_hz=10)
+    truth = still(4001)
+    window = {"window": (8.0, 12.0)}
+    known = Faults(
+        [fault(sensor="it", channel="north", kind="sine", size=4.0, period_s=3.0, **window)], {"it": config}, 5
+    )
+    live = Faults([], {"it": config}, 5)
+    one, other = (sensors.build("it", config, RATE_HZ, 5, SITE) for _ in range(2))
+    expected = known.apply("it", one.sense(truth))
+    found: list[Any] = []
+    index = -1
+    for block in cut(truth, [700, round(8 * RATE_HZ), 1777, round(12 * RATE_HZ), 3000]):
+        if block.t[0] == 8.0:
+            keys = {"window": (8.0, 1e5)}
+            index = live.add(fault(sensor="it", channel="north", kind="sine", size=4.0, period_s=3.0, **keys))
+        if block.t[0] == 12.0:
+            ended = live.end(index, 12.0)
+            assert (ended.start, ended.end) == (8.0, 12.0)
+        found += live.apply("it", other.sense(block))
+    assert alike(found, expected)
+    assert live.truth == known.truth

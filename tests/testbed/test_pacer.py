@@ -99,3 +99,56 @@ def test_on_the_real_clock():
 def test_impossible_factor(factor):
     with pytest.raises(UserError, match="above 0"):
         Pacer(factor)
+
+
+def test_a_pause_and_a_new_speed_move_the_deadlines():
+    clock = Clock()
+    paced = pacer(clock)
+    paced.wait(0.0)
+    paced.wait(1.0)
+    clock.now += 100.0  # paused
+    paced.restart(1.0)
+    before = clock.now
+    paced.wait(2.0)
+    assert clock.now - before == pytest.approx(1.0)
+    paced.restart(2.0, 4.0)
+    paced.wait(4.0)
+    assert clock.now - before == pytest.approx(1.5)
+    assert paced.missed == 0
+    assert paced.given_up_s == 0.0
+
+
+def test_jitter_is_how_late_a_wait_is_over():
+    clock = Clock()
+    paced = pacer(clock)
+    paced.wait(0.0)
+    for k in range(1, 1001):
+        clock.over = 0.00305 if k % 50 == 0 else 0.00015  # 2 % of the sleeps are too long
+        paced.wait(k * 0.04)
+    assert paced.jitter_s(0.5) == pytest.approx(0.0002)
+    assert paced.jitter_s(0.98) == pytest.approx(0.0002)
+    assert paced.jitter_s(0.99) == pytest.approx(0.0031)
+    clock.now += 3600.0
+    paced.wait(41.0)
+    assert paced.jitter_s(1.0) == pytest.approx(0.5), "as far as is counted"
+
+
+def test_spare_time_is_offered_and_what_is_left_is_slept():
+    clock = Clock()
+    paced = pacer(clock)
+    offered = []
+
+    def meanwhile(seconds):
+        offered.append(seconds)
+        clock.now += 0.03
+
+    paced.wait(0.0, meanwhile)
+    paced.wait(0.1, meanwhile)
+    assert clock.now == pytest.approx(1000.1)
+    clock.now += 0.09
+    paced.wait(0.2, meanwhile)  # which takes longer than was offered
+    assert clock.now == pytest.approx(1000.22)
+    clock.now += 1.0
+    paced.wait(0.3, meanwhile)
+    assert offered == [pytest.approx(0.1), pytest.approx(0.01)]
+    assert paced.missed == 1

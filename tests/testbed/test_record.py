@@ -25,7 +25,7 @@ from nav.samples import ImuSamples, UpdateReport
 from testbed import record
 from testbed.errors import UserError
 from testbed.record import Recorder, load
-from testbed.truth import COLUMNS
+from testbed.truth import COLUMNS, TruthBlock
 
 TWO = {"ins": Errors(), "dead_reckoning": Errors(drift_mps=5.0)}
 DENIED = ((20.0, 40.0),)
@@ -230,6 +230,47 @@ def test_a_report_without_innovation_keeps_its_place(tmp_path: Path) -> None:
     assert position["reason"].values.tolist() == ["broken", "", "broken", "", ""]
     np.testing.assert_array_equal(np.isnan(position["innovation"].values[:, 0]), [True, False, True, False, False])
     np.testing.assert_array_equal(position["S"][1], fused.S)
+
+
+def test_a_record_tended_in_spare_moments_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pieces of a new file are made between blocks, while rows, columns and groups go on coming."""
+    monkeypatch.setattr(record, "FLUSH_WALL_S", 0.0)
+    monkeypatch.setattr(record, "PIECE_S", 0.0)
+    truth, errors = circle(60.0), {"ins": Errors(), "other": Errors(aligned_after=20)}
+    plain = Recorder(None, scenario(60.0), 3)
+    synthetic_run.record(plain, truth, errors, ((30.0, 50.0),))
+    read = []
+
+    class Tended(Recorder):
+        def truth(self, block: TruthBlock) -> None:
+            super().truth(block)
+            self.tend(0.002)
+            if path.exists() and len(read) < 5:
+                read.append(load(path))  # while the next one is in the making
+
+    path = tmp_path / "run.nc"
+    tended = Tended(path, scenario(60.0), 3)
+    synthetic_run.record(tended, truth, errors, ((30.0, 50.0),))
+    tended.close()
+    expected, whole = plain.dataset(), load(path)
+    for node in expected.subtree:
+        assert whole[node.path].to_dataset().drop_attrs().identical(node.to_dataset().drop_attrs()), node.path
+    for early in read:
+        rows = early["truth"].sizes["time"]
+        np.testing.assert_array_equal(early["truth/lat"], expected["truth/lat"][:rows])
+    assert 0 < read[0]["truth"].sizes["time"] < expected["truth"].sizes["time"]
+
+
+def test_a_record_without_spare_moments_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record, "FLUSH_WALL_S", 0.0)
+    monkeypatch.setattr(record, "UNTENDED_S", 0.0)
+    recorder = Recorder(tmp_path / "run.nc", scenario(60.0), 3)
+    recorder.tend(0.0)
+    recorder.truth(circle(10.0))
+    assert load(tmp_path / "run.nc")["truth"].sizes["time"] == 101
+    recorder.close()
 
 
 def test_long_text_is_cut_at_a_whole_character() -> None:
