@@ -201,6 +201,8 @@ _FAULT: TypeAdapter[FaultConfig] = TypeAdapter(Fault)
 
 def _fault(scenario: Scenario, table: Mapping[str, object], start: float) -> FaultConfig:
     """The fault that a table asks for, from ``start`` [s] on. Raises Refused when there can be none such."""
+    if "name" in table:
+        raise Refused("no such fault: name: what is injected is named by what it is")
     try:
         fault = _FAULT.validate_python({**table, "window": (start, start + LONGEST_RUN_S)}, strict=True)
     except ValidationError as error:
@@ -532,6 +534,7 @@ class Director:
                 if not self._repeatable:
                     raise Refused("this motion can't be flown again")
                 self._say(t, "info", "begins anew")
+                self.pacer = self.pacer and Pacer(self.pacer.factor)
                 raise Restarted
             case _:
                 self._carry_out(request, tick)

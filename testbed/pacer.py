@@ -33,7 +33,7 @@ class Pacer:
         """Start at the first `wait`. Raises UserError unless ``factor`` is positive and finite."""
         if not (math.isfinite(factor) and factor > 0):
             raise UserError(f"--realtime {factor}: the speed must be above 0; 1 is the speed of the wall clock")
-        self._factor = factor
+        self.factor = factor
         self._clock = clock
         self._sleep = sleep
         self._jitter = [0] * 5000  # waits by how late they were over; the last: or more
@@ -45,8 +45,8 @@ class Pacer:
 
     def restart(self, t: float, factor: float | None = None) -> None:
         """Count from now, which is simulated time ``t`` [s], at another speed perhaps."""
-        self._factor = factor or self._factor
-        self._start = self._clock() - t / self._factor
+        self.factor = factor or self.factor
+        self._start = self._clock() - t / self.factor
 
     def wait(self, t: float, meanwhile: Callable[[float], object] | None = None) -> None:
         """Return when the wall clock has reached simulated time ``t`` [s]; the first call only sets the start.
@@ -55,10 +55,10 @@ class Pacer:
         """
         now = self._clock()
         if self._start is None:
-            self._start = now - t / self._factor
+            self._start = now - t / self.factor
             return
         self.waits += 1
-        deadline = self._start + t / self._factor
+        deadline = self._start + t / self.factor
         late = now - deadline
         if late < 0:
             if meanwhile is not None:

@@ -20,12 +20,14 @@ from testbed.control import (
     UNITS,
     Change,
     Clear,
+    Director,
     End,
     Inject,
     Pause,
     Refused,
     Request,
     Restart,
+    Restarted,
     Resume,
     Speed,
     Step,
@@ -341,6 +343,7 @@ def requests_in(dataset: Any, rows: Sequence[Mapping[str, str]]) -> Any:
         ("inject", '{"fault": {"sensor": "gnss", "kind": "scale", "channel": "north", "factor": 2}}', "a multiple of"),
         ("inject", '{"fault": {"sensor": "gnss", "kind": "stuck", "channel": "gyro"}}', "gnss has no channel 'gyro'"),
         ("inject", '{"fault": 5}', "can't be read: inject"),
+        ("inject", '{"fault": {"sensor": "gnss", "kind": "dropout", "name": "a b"}}', "no such fault: name"),
     ],
 )
 def test_a_record_whose_requests_make_no_sense(kind: str, content: str, says: str) -> None:
@@ -446,6 +449,24 @@ def test_a_restart_begins_anew_in_the_same_folder(tmp_path: Path) -> None:
     assert 3.9 < station.rows[turn] < 4.3
     assert station.rows[turn + 1] == 0.0
     assert "begins anew" in station.told()
+
+
+def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
+    short = scenario(6)
+    asked: list[Request] = [Speed(500.0), Restart()]
+    director = Director(short, [lambda: [asked.pop(0)] if asked else []], (), 1000.0, 200.0)
+    told: list[str] = []
+    director.begin(None, None, lambda *_: None, lambda *event: told.append(event[-1]))  # type: ignore[arg-type]
+    assert director.ready(0)
+    assert director.pacer is not None
+    for k in range(3):
+        director.pacer.wait(100.0 * k)
+    with pytest.raises(Restarted):
+        director.ready(40_000)
+    for k in range(3):
+        director.pacer.wait(100.0 * k)
+    assert (director.pacer.factor, director.pacer.waits, director.pacer.missed) == (500.0, 2, 0)
+    assert told == ["500 times the wall clock", "begins anew"]
 
 
 def test_a_motion_that_was_handed_over_is_not_begun_anew() -> None:
