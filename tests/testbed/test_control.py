@@ -108,11 +108,20 @@ def test_every_failure_of_every_unit_begins_and_ends() -> None:
         assert set(faults["time"].values.tolist()) == {4.0}
         assert set(faults["end"].values.tolist()) == {8.0}
         for sensor in healthy["sensors"].children:
-            ours, theirs = data[f"sensors/{sensor}"].to_dataset(), healthy[f"sensors/{sensor}"].to_dataset()
-            before, after = dict(time=slice(0, 3.999)), dict(time=slice(8.001, None))
-            assert ours.sel(before).identical(theirs.sel(before)), (kind, sensor)
-            assert ours.sel(after).identical(theirs.sel(after)), (kind, sensor)
-            assert not ours.sel(time=slice(4, 7.999)).identical(theirs.sel(time=slice(4, 7.999))), (kind, sensor)
+            ours, theirs = data[f"sensors/{sensor}"], healthy[f"sensors/{sensor}"]
+            assert alike(ours, theirs, 0.0, 3.999), (kind, sensor)
+            assert not alike(ours, theirs, 3.999, 7.999), (kind, sensor)
+            assert alike(ours, theirs, 7.999, 12.1), (kind, sensor)
+
+
+def alike(a: Any, b: Any, start: float, end: float) -> bool:
+    """Whether two tables hold the same bits between two times."""
+
+    def within(table: Any) -> list[np.ndarray]:
+        t = table["time"].values
+        return [column.values[(t >= start) & (t < end)] for column in table.variables.values() if "time" in column.dims]
+
+    return all(np.array_equal(x, y, equal_nan=x.dtype.kind == "f") for x, y in zip(within(a), within(b), strict=True))
 
 
 def during(kind: str, unit: str) -> tuple[Any, Any]:
@@ -304,16 +313,17 @@ def test_a_session_is_repeated_bit_for_bit(period_s: float, realtime: float | No
     assert not same(run(again, seed=6, replay=replay).dataset, kept)
 
 
-def test_what_was_asked_is_in_the_file_at_once(tmp_path: Path) -> None:
+@pytest.mark.parametrize("realtime", [None, 4.0])
+def test_what_was_asked_is_in_the_file_at_once(realtime: float | None, tmp_path: Path) -> None:
     found: list[int] = []
 
     class Looking(Station):
         def requests(self) -> Sequence[Request]:
-            if self.t > 6 and not found:
+            if self.t > 9 and not found:
                 found.append(len(record.load(tmp_path / "run.nc")["requests/time"]))
             return super().requests()
 
-    run(scenario(12), links=[Looking([(3.0, Change("SIM_GPS1_JAM", 1.0))])], out=tmp_path)
+    run(scenario(12), links=[Looking([(3.0, Change("SIM_GPS1_JAM", 1.0))])], out=tmp_path, realtime=realtime)
     assert found == [1]
 
 
