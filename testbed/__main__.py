@@ -394,7 +394,7 @@ def _connect(urls: Sequence[str], scenario: Scenario, folder: Path, estimator: s
         path = log_path(url)
         if path is not None and path.resolve().parent == folder.resolve() and is_result(path.name):
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
-    return [MavlinkPublisher(urls, scenario.date)]
+    return [MavlinkPublisher(urls, scenario)]
 
 
 def _fly(

@@ -359,7 +359,7 @@ def live() -> list[Row]:
         assert listening.stdout is not None
         ours = [int(word) for word in listening.stdout.readline().split()]
         urls = [f"udpout:127.0.0.1:{ours[0]}", f"udpout:127.0.0.1:{ours[1]}", f"tcp:127.0.0.1:{ours[2]}"]
-        publisher = MavlinkPublisher([*urls, f"tcpin:127.0.0.1:{port}"], scenario.date)
+        publisher = MavlinkPublisher([*urls, f"tcpin:127.0.0.1:{port}"], scenario)
         listening.stdin.write(f"{port}\n")
         listening.stdin.flush()
         timed = _Timed(publisher)

@@ -1,5 +1,7 @@
 """Numbers to MAVLink 2 frames: the one layer that rounds, saturates and wraps, and cannot fail whatever the numbers.
 
+`Encoder` makes frames, `Voice` numbers and signs them for one listener.
+
 Field names, types, order on the wire and checksum seeds come from pymavlink's ``all`` dialect; only the framing is
 done here, because pymavlink's own objects cost several times the rest of the stream.
 Source: MAVLink 2 packet format, https://mavlink.io/en/guide/serialization.html
@@ -16,6 +18,8 @@ from typing import Any, TypeAlias
 
 from pymavlink.dialects.v20 import all as dialect  # type: ignore[import-untyped]
 
+from testbed.mavlink.signing import SIGNED, Signing
+
 Value: TypeAlias = float | bytes | Sequence[float]
 Fields: TypeAlias = Mapping[str, Value]
 
@@ -29,6 +33,7 @@ _RANGE: dict[str, tuple[float, float]] = {
     "uint32_t": (0, 2**32 - 1),
     "int32_t": (-(2**31), 2**31 - 1),
     "uint64_t": (0, 2**64 - 1),
+    "int64_t": (-(2**63), 2**63 - 1),
     "float": (-_FLOAT_MAX, _FLOAT_MAX),
 }
 # What an integer field says when its number is NaN; 0 where the message defines nothing. Floats carry NaN themselves.
@@ -165,3 +170,30 @@ class Encoder:
         self._sequence = (self._sequence + 1) % 256
         checksum: int = dialect.x25crc(body[1:] + layout.crc_extra).crc
         return body + checksum.to_bytes(2, "little")
+
+
+_CRC_EXTRA = {
+    number.to_bytes(3, "little"): bytes([message.crc_extra]) for number, message in dialect.mavlink_map.items()
+}
+
+
+class Voice:
+    """What one listener hears: frames numbered without gaps, by vehicle, and signed when there is a key.
+
+    Frames are made once for all listeners; but a listener counts the numbers to know what was lost on its own way.
+    """
+
+    def __init__(self, signing: Signing | None = None) -> None:
+        self._signing = signing
+        self._numbers: dict[bytes, int] = {}
+
+    def say(self, frame: bytes) -> bytes:
+        """``frame`` (of an `Encoder`) with the number that is next for this listener, signed if need be."""
+        source = frame[5:7]
+        number = self._numbers.get(source, 0)
+        self._numbers[source] = (number + 1) % 256
+        flags = SIGNED if self._signing else 0
+        body = frame[:2] + bytes((flags, 0, number)) + frame[5:-2]
+        checksum: int = dialect.x25crc(body[1:] + _CRC_EXTRA[frame[7:10]]).crc
+        said = body + checksum.to_bytes(2, "little")
+        return self._signing.sign(said) if self._signing else said

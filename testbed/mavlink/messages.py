@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
@@ -31,14 +31,13 @@ from nav.samples import (
     Status,
 )
 from testbed.mavlink.encode import Fields, boot_ms, centidegrees, latitude_e7, longitude_e7, microseconds
+from testbed.mavlink.identity import Identity
 from testbed.truth import TruthBlock
 
 S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
 Point: TypeAlias = tuple[float, float, float]
 
-STALE_S = 5.0  # a sensor silent for longer counts as failed
 FLYING_MPS = 8.0  # faster than this, through the air or over ground, is flight: well below any stall speed
-PX4_HOLD = 4 << 16 | 3 << 24  # main mode auto, sub mode loiter, as PX4 packs them
 TERRAIN_UNKNOWN = -10000.0  # ALTITUDE: below -1000 means unknown
 NO_OFFSET = [0.0, 0.0, 0.0, 0.0]  # ATTITUDE_QUATERNION: no other attitude for display
 
@@ -54,7 +53,9 @@ class Snapshot:
 
     ``gyro`` [rad/s] and ``accel`` [m/s^2] are the newest inertial reading; ``home`` (lat, lon, h) the origin of local
     coordinates, None until the estimator is aligned; ``start_us`` the run's start in microseconds since 1970;
-    ``ratios`` the newest innovation over its gate, by aid.
+    ``ratios`` the newest innovation over its gate, by aid; ``legs`` how many the plan has; ``silent_s`` after how long
+    a sensor that says nothing counts as failed; ``isolated`` and ``refused`` are sensors that the estimator has shut
+    out, or whose samples it has long refused.
     """
 
     truth: TruthBlock
@@ -66,6 +67,11 @@ class Snapshot:
     home: Point | None
     start_us: int
     ratios: Mapping[str, float]
+    identity: Identity
+    legs: int
+    silent_s: Mapping[str, float]
+    isolated: frozenset[str]
+    refused: frozenset[str]
 
     def __post_init__(self) -> None:
         """What every call needs: time [s, ms, us], attitude and rates, which go out most often."""
@@ -117,6 +123,16 @@ class Snapshot:
         sample = self.newest(GnssSample)
         return sample if sample and sample.fix_type != FixType.NO_FIX else None
 
+    def works(self, kind: type[S]) -> bool:
+        """Whether the first sensor of this kind says something, and is not isolated."""
+        sample = self.newest(kind)
+        return sample is not None and sample.sensor not in self.isolated
+
+    @cached_property
+    def doubted(self) -> bool:
+        """Whether the estimator has isolated, or long refused, a receiver that has a fix."""
+        return self.gnss_fix is not None and self.gnss_fix.sensor in self.isolated | self.refused
+
     @cached_property
     def flying(self) -> bool | None:
         """Whether the vehicle is in the air, as far as it can tell itself."""
@@ -162,7 +178,7 @@ class Snapshot:
         """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
         for sample in self.samples.values():
             if isinstance(sample, kind):
-                return sample if self.t - sample.t < STALE_S else None
+                return sample if self.t - sample.t_arrival < self.silent_s[sample.sensor] else None
         return None
 
     def sigma(self, block: slice, dimensions: int = 3) -> float:
@@ -202,18 +218,24 @@ def _root(variances: Array) -> float:
 # The vehicle
 
 
-def heartbeat(s: Snapshot) -> Fields:
-    """Fixed wing, PX4, Hold; armed when flying; calibrating until the estimator is aligned."""
+def heartbeat_of(s: Snapshot) -> Fields:
+    """HEARTBEAT of a snapshot."""
+    return heartbeat(s, s.identity)
+
+
+def heartbeat(s: Snapshot | None, identity: Identity) -> Fields:
+    """Fixed wing, on its own; armed when flying; calibrating until the estimator is aligned, and before the run."""
     mode = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_AUTO_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
-    if Status.ALIGNED not in s.estimate.status:
+    flying = s is not None and s.flying
+    if s is None or Status.ALIGNED not in s.estimate.status:
         state = mav.MAV_STATE_CALIBRATING
     else:
-        state = mav.MAV_STATE_ACTIVE if s.flying else mav.MAV_STATE_STANDBY
+        state = mav.MAV_STATE_ACTIVE if flying else mav.MAV_STATE_STANDBY
     return {
         "type": mav.MAV_TYPE_FIXED_WING,
-        "autopilot": mav.MAV_AUTOPILOT_PX4,
-        "base_mode": mode | (mav.MAV_MODE_FLAG_SAFETY_ARMED if s.flying else 0),
-        "custom_mode": PX4_HOLD,
+        "autopilot": identity.autopilot,
+        "base_mode": mode | (mav.MAV_MODE_FLAG_SAFETY_ARMED if flying else 0),
+        "custom_mode": identity.mode,
         "system_status": state,
         "mavlink_version": 3,
     }
@@ -225,7 +247,10 @@ def system_time(s: Snapshot) -> Fields:
 
 
 def sys_status(s: Snapshot) -> Fields:
-    """Which sensors there are and which of them work; a receiver without a fix counts as failed."""
+    """Which sensors there are and which of them work.
+
+    Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
+    """
     inertial = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
     always = mav.MAV_SYS_STATUS_GEOFENCE  # without it MAVProxy reports a breach
     present = always | inertial | mav.MAV_SYS_STATUS_AHRS | mav.MAV_SYS_STATUS_PREARM_CHECK
@@ -234,16 +259,16 @@ def sys_status(s: Snapshot) -> Fields:
         health |= inertial
     if Status.ALIGNED in s.estimate.status:
         health |= mav.MAV_SYS_STATUS_AHRS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    aids: list[tuple[type[Sample], int, bool]] = [
-        (MagnetometerSample, mav.MAV_SYS_STATUS_SENSOR_3D_MAG, s.newest(MagnetometerSample) is not None),
+    aids: list[tuple[type[Any], int, bool]] = [
+        (MagnetometerSample, mav.MAV_SYS_STATUS_SENSOR_3D_MAG, True),
         (BarometerSample, mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE, math.isfinite(s.pressure)),
         (AirspeedSample, mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE, math.isfinite(s.eas)),
         (GnssSample, mav.MAV_SYS_STATUS_SENSOR_GPS, s.gnss_fix is not None),
     ]
-    for kind, bit, works in aids:
+    for kind, bit, is_sound in aids:
         if any(isinstance(sample, kind) for sample in s.samples.values()):
             present |= bit
-            health |= bit if works else 0
+            health |= bit if is_sound and s.works(kind) else 0
     return {
         "onboard_control_sensors_present": present,
         "onboard_control_sensors_enabled": present,
@@ -272,6 +297,30 @@ def extended_sys_state(s: Snapshot) -> Fields:
         True: mav.MAV_LANDED_STATE_IN_AIR,
     }
     return {"vtol_state": mav.MAV_VTOL_STATE_UNDEFINED, "landed_state": landed[s.flying]}
+
+
+def current_item(s: Snapshot) -> int:
+    """The mission item being flown: that of the leg; the last one when the plan is flown."""
+    leg = float(s.truth.leg[0])
+    first = int(s.identity.home_first)
+    return first + (int(leg) if 0 <= leg < s.legs else max(0, s.legs - 1))
+
+
+def mission_current(s: Snapshot) -> Fields:
+    """The leg being flown, as an item of the mission."""
+    if not s.legs:
+        state = mav.MISSION_STATE_NO_MISSION
+    else:
+        state = mav.MISSION_STATE_ACTIVE if s.truth.leg[0] >= 0 else mav.MISSION_STATE_COMPLETE
+    return {
+        "seq": current_item(s) if s.legs else 0,
+        "total": s.legs,
+        "mission_state": state,
+        "mission_mode": 0,  # unknown: there is but one mode
+        "mission_id": 0,
+        "fence_id": 0,
+        "rally_points_id": 0,
+    }
 
 
 def home_position(s: Snapshot) -> Fields | None:
@@ -477,7 +526,8 @@ def estimator_status(s: Snapshot) -> Fields:
     """What the estimator holds for known, innovations over their gates, its own sigma."""
     return {
         "time_usec": s.usec,
-        "flags": _solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else 0,
+        "flags": (_solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else 0)
+        | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
         "vel_ratio": s.ratio("gnss_velocity"),
         "pos_horiz_ratio": s.ratio("gnss_position"),
         "pos_vert_ratio": s.ratio("barometer"),
@@ -492,7 +542,8 @@ def estimator_status(s: Snapshot) -> Fields:
 def ekf_status_report(s: Snapshot) -> Fields:
     """The same in ArduPilot's form."""
     return {
-        "flags": _solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED,
+        "flags": (_solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED)
+        | (mav.EKF_GPS_GLITCHING if s.doubted else 0),
         "velocity_variance": s.ratio("gnss_velocity"),  # "variance" means the same ratio, in ArduPilot's usage
         "pos_horiz_variance": s.ratio("gnss_position"),
         "pos_vert_variance": s.ratio("barometer"),
@@ -544,15 +595,21 @@ def gps_raw_int(s: Snapshot) -> Fields | None:
 
 
 def gnss_integrity(s: Snapshot) -> Fields | None:
-    """Jamming is reported while there is no fix: in this testbed nothing but interference takes it away."""
+    """Jamming is reported while there is no fix, as nothing but interference takes it away in this testbed.
+
+    Spoofing is reported while the estimator isolates, or long refuses, a receiver that has one.
+    """
     if not any(isinstance(sample, GnssSample) for sample in s.samples.values()):
         return None
+    spoofing = mav.GPS_SPOOFING_STATE_UNKNOWN
+    if s.gnss_fix:
+        spoofing = mav.GPS_SPOOFING_STATE_DETECTED if s.doubted else mav.GPS_SPOOFING_STATE_NOT_SPOOFED
     return {
         "id": 0,
         "system_errors": 0,
         "authentication_state": mav.GPS_AUTHENTICATION_STATE_UNKNOWN,
         "jamming_state": mav.GPS_JAMMING_STATE_NOT_JAMMED if s.gnss_fix else mav.GPS_JAMMING_STATE_DETECTED,
-        "spoofing_state": mav.GPS_SPOOFING_STATE_UNKNOWN,
+        "spoofing_state": spoofing,
         "raim_state": mav.GPS_RAIM_STATE_UNKNOWN,
         "raim_hfom": 2**16 - 1,
         "raim_vfom": 2**16 - 1,

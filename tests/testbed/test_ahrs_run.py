@@ -108,7 +108,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunResult, dict[str
     """A U-turn, with GNSS denied for some of it, as a station would see the AHRS: result, messages, folder."""
     folder = tmp_path_factory.mktemp("ahrs")
     flight = scenario(AHRS, INS, BLIND, GYROS, overrides=("duration_s=100", "sensors.gnss.denied=[[75, 88]]"))
-    publisher = MavlinkPublisher([f"tlog:{folder / 'run.tlog'}"], flight.date)
+    publisher = MavlinkPublisher([f"tlog:{folder / 'run.tlog'}"], flight)
     result = run(flight, out=folder, links=[publisher])
     reader = mavutil.mavlink_connection(str(folder / "run.tlog"), dialect="all")
     heard = collections.defaultdict(list)

@@ -1,4 +1,3 @@
-import datetime
 import itertools
 import math
 import struct
@@ -21,10 +20,12 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from testbed import Scenario
 from testbed.mavlink import MavlinkPublisher, encode, messages
 from testbed.mavlink.stream import STREAMS
 from testbed.truth import COLUMNS, TruthBlock
 
+SCENARIO = Scenario.load("u_turn")
 CLASSES = {message.msgname: message for message in mav.mavlink_map.values()}
 NAMES = sorted({stream.message for stream in STREAMS} | {"STATUSTEXT"})
 RANGES = {
@@ -246,8 +247,8 @@ def broken_run(deal, status, fix):
 )
 def test_no_state_can_stop_the_stream(state, before, status, fix):
     link = Collector()
-    publisher = MavlinkPublisher([], datetime.date(2026, 1, 1))
-    publisher._links.append(link)
+    publisher = MavlinkPublisher([], SCENARIO)
+    publisher._logs.append(link)
     publisher.publish(*broken_run(Deal(before), status, fix))  # whatever came first, home and IMU included
     publisher._calls = 0  # every stream is due
     link.frames.clear()

@@ -47,7 +47,7 @@ def watched(tmp_path_factory):
             ],
         )
         log = folder / "run.tlog"
-        publisher = MavlinkPublisher([f"udpout:127.0.0.1:{port}", f"tlog:{log}"], scenario.date)
+        publisher = MavlinkPublisher([f"udpout:127.0.0.1:{port}", f"tlog:{log}"], scenario)
         try:
             result = run(scenario, links=[publisher], realtime=5.0)
         finally:

@@ -1,7 +1,6 @@
 """What a ground station hears: pymavlink listens, and its decoded numbers are compared with what went in."""
 
 import collections
-import datetime
 import math
 import socket
 import subprocess
@@ -28,10 +27,11 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from testbed import Scenario
 from testbed.mavlink import MavlinkPublisher
 from testbed.truth import TruthBlock
 
-DATE = datetime.date(2026, 6, 1)
+SCENARIO = Scenario.load("u_turn", ["date=2026-06-01"])
 MIDNIGHT_US = 1_780_272_000_000_000  # 2026-06-01T00:00Z
 LAT, LON, H = math.radians(-33.9), math.radians(179.999), 800.0
 G = 9.80665
@@ -129,6 +129,7 @@ def increments(t):
 def publish(publisher, calls, **changes):
     for k in calls:
         t = k * 0.04
+        publisher.requests()
         arguments = {
             "truth": truth_row(t),
             "estimate": estimate(t),
@@ -156,7 +157,7 @@ def read_log(path):
 def log_of(tmp_path, calls, **changes):
     """Messages by type of a log of these calls."""
     path = tmp_path / "run.tlog"
-    publisher = MavlinkPublisher([str(path)], DATE)
+    publisher = MavlinkPublisher([str(path)], SCENARIO)
     publish(publisher, calls, **changes)
     publisher.close()
     by_type = collections.defaultdict(list)
@@ -234,7 +235,7 @@ def paced(publisher, station, calls):
 @pytest.mark.usefixtures("mavlink2")
 def test_station_listens_on_udp(unused_port):
     station = Station(f"udpin:127.0.0.1:{unused_port}", 250)
-    publisher = MavlinkPublisher([f"udpout:127.0.0.1:{unused_port}"], DATE)
+    publisher = MavlinkPublisher([f"udpout:127.0.0.1:{unused_port}"], SCENARIO)
     paced(publisher, station, range(250))
     publisher.close()
     heard = station.finish()
@@ -250,9 +251,9 @@ def test_station_listens_on_udp(unused_port):
 def test_station_on_tcp(unused_port, ours, theirs):
     if ours == "tcp":
         station = Station(f"{theirs}:127.0.0.1:{unused_port}", 50)
-        publisher = MavlinkPublisher([f"{ours}:127.0.0.1:{unused_port}"], DATE)
+        publisher = MavlinkPublisher([f"{ours}:127.0.0.1:{unused_port}"], SCENARIO)
     else:
-        publisher = MavlinkPublisher([f"{ours}:127.0.0.1:{unused_port}"], DATE)
+        publisher = MavlinkPublisher([f"{ours}:127.0.0.1:{unused_port}"], SCENARIO)
         station = Station(f"{theirs}:127.0.0.1:{unused_port}", 50)
     paced(publisher, station, range(50))
     heard = station.finish()
@@ -263,7 +264,7 @@ def test_station_on_tcp(unused_port, ours, theirs):
 @pytest.mark.usefixtures("mavlink2")
 def test_mavlogdump_reads_the_log(tmp_path):
     path = tmp_path / "run.tlog"
-    publisher = MavlinkPublisher([f"tlog:{path}"], DATE)
+    publisher = MavlinkPublisher([f"tlog:{path}"], SCENARIO)
     publish(publisher, range(51))
     publisher.event(2.0, "warning", "gnss denied")
     publisher.close()
@@ -299,7 +300,8 @@ def test_rates(tmp_path):
         "GPS_RAW_INT": 5,
         "HIGHRES_IMU": 10,
         "SCALED_PRESSURE": 1,
-        "SYS_STATUS": 1,
+        "SYS_STATUS": 2,
+        "MISSION_CURRENT": 1,
         "ESTIMATOR_STATUS": 2,
         "EKF_STATUS_REPORT": 1,
         "EXTENDED_SYS_STATE": 1,
@@ -323,7 +325,7 @@ def test_rates(tmp_path):
 def test_log_is_stamped_in_simulated_time_and_the_same_every_time(tmp_path):
     paths = [tmp_path / "a.tlog", tmp_path / "b.tlog"]
     for path in paths:
-        publisher = MavlinkPublisher([str(path)], DATE)
+        publisher = MavlinkPublisher([str(path)], SCENARIO)
         publish(publisher, range(60))
         publisher.event(2.4, "info", "gnss reacquired")
         publisher.close()
@@ -339,7 +341,7 @@ def test_log_is_stamped_in_simulated_time_and_the_same_every_time(tmp_path):
 
 def test_sequence_numbers_have_no_gap(tmp_path):
     path = tmp_path / "run.tlog"
-    publisher = MavlinkPublisher([str(path)], DATE)
+    publisher = MavlinkPublisher([str(path)], SCENARIO)
     publish(publisher, range(100))
     publisher.event(4.0, "info", "x" * 120)
     publisher.close()
@@ -426,7 +428,7 @@ def silent(t):
 @pytest.mark.parametrize("samples", [denied, silent])
 def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples):
     start = 150  # six seconds in
-    publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], DATE)
+    publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], SCENARIO)
     publish(publisher, range(start, start + 25), samples=samples)
     publisher.close()
     heard = {message.get_type(): message for _, message in read_log(tmp_path / "run.tlog")}
@@ -596,7 +598,7 @@ def test_odometry_covariance(tmp_path):
 
 def test_events(tmp_path):
     path = tmp_path / "run.tlog"
-    publisher = MavlinkPublisher([str(path)], DATE)
+    publisher = MavlinkPublisher([str(path)], SCENARIO)
     publisher.event(300.0, "warning", "gnss denied")
     publisher.event(900.0, "info", "gnss reacquired")
     publisher.event(901.0, "error", "x" * 60)
@@ -611,7 +613,7 @@ def test_events(tmp_path):
 
 def test_time_never_runs_backwards_in_the_log(tmp_path):
     path = tmp_path / "run.tlog"
-    publisher = MavlinkPublisher([str(path)], DATE)
+    publisher = MavlinkPublisher([str(path)], SCENARIO)
     publish(publisher, range(50))
     publisher.event(1.0, "info", "of a sample that was used late")
     publish(publisher, range(50, 60))
@@ -623,7 +625,7 @@ def test_time_never_runs_backwards_in_the_log(tmp_path):
 
 def test_several_links_say_the_same(tmp_path):
     paths = [tmp_path / "a.tlog", tmp_path / "b.tlog"]
-    publisher = MavlinkPublisher([f"tlog:{path}" for path in paths], DATE)
+    publisher = MavlinkPublisher([f"tlog:{path}" for path in paths], SCENARIO)
     publish(publisher, range(10))
     publisher.close()
     publisher.close()

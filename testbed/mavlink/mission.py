@@ -1,0 +1,202 @@
+"""The plan as a mission that ground stations can show: one item for each leg, where still air would take the aircraft.
+
+An item is where its leg leads: the end of a straight line or a turn, the centre of circles. Legs that only change
+altitude or airspeed are such commands. In wind the aircraft goes elsewhere; the plan's own places stay.
+Source of the items' parameters: https://mavlink.io/en/messages/common.html#mav_commands
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
+
+from nav.earth import position_difference_n
+from testbed import guidance
+from testbed.kinematic import Kinematic
+from testbed.mavlink.encode import latitude_e7, longitude_e7
+from testbed.scenario import FlightTruth, KinematicTruth, Scenario
+from testbed.sensors.gnss import displaced
+
+_MOST_SEGMENTS = 1000  # of one leg; where a longer one ends makes no difference on a map
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One mission item: command, its first four parameters, place [rad, m above the ellipsoid]."""
+
+    command: int
+    params: tuple[float, float, float, float]
+    lat: float
+    lon: float
+    h: float
+
+
+def items(scenario: Scenario, home_first: bool) -> list[Item]:
+    """The plan's legs in order; with ``home_first`` after the start, as ArduPilot has it."""
+    truth = scenario.truth
+    start = truth.start
+    home = Item(
+        mav.MAV_CMD_NAV_WAYPOINT,
+        (0.0, 0.0, 0.0, 0.0),
+        math.radians(start.lat_deg),
+        math.radians(start.lon_deg),
+        float(start.alt_m),
+    )
+    legs = _flown(scenario.plan, truth) if isinstance(truth, FlightTruth) else _driven(truth, scenario.duration_s)
+    return [home, *legs] if home_first and legs else legs
+
+
+def fields(mission: Sequence[Item], number: int, current: int, home_h: float) -> dict[str, float]:
+    """MISSION_ITEM_INT of an item, without its target. Heights are relative to ``home_h``."""
+    item = mission[number]
+    first, second, third, fourth = item.params
+    return {
+        "seq": number,
+        "frame": mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+        "command": item.command,
+        "current": int(number == current),
+        "autocontinue": 1,
+        "param1": first,
+        "param2": second,
+        "param3": third,
+        "param4": fourth,
+        "x": latitude_e7(item.lat),
+        "y": longitude_e7(item.lon),
+        "z": item.h - home_h,
+        "mission_type": mav.MAV_MISSION_TYPE_MISSION,
+    }
+
+
+def with_floats(values: Mapping[str, float]) -> dict[str, float]:
+    """MISSION_ITEM of the same: the old form, degrees in float32."""
+    place = {"x": values["x"] / 1e7, "y": values["y"] / 1e7}
+    return {**values, **place, "frame": mav.MAV_FRAME_GLOBAL_RELATIVE_ALT}
+
+
+@dataclass(slots=True)
+class _Here:
+    """Where the walk along the plan has come to [rad, m, m/s true airspeed]."""
+
+    lat: float
+    lon: float
+    h: float
+    course: float
+    speed: float
+
+
+def _flown(plan: Sequence[guidance.Leg], truth: FlightTruth) -> list[Item]:
+    start = truth.start
+    here = _Here(
+        math.radians(start.lat_deg),
+        math.radians(start.lon_deg),
+        start.alt_m,
+        math.radians(start.heading_deg),
+        start.airspeed_mps,
+    )
+    return [_leg(leg, here) for leg in plan]
+
+
+def _leg(leg: guidance.Leg, here: _Here) -> Item:
+    """The item of a leg that begins ``here``; moves on to where it ends."""
+    place = getattr(leg, "to", None) or getattr(leg, "centre", None)
+    lat0, lon0 = (math.radians(place.lat_deg), math.radians(place.lon_deg)) if place else (here.lat, here.lon)
+    north, east, _ = position_difference_n(here.lat, here.lon, here.h, lat0, lon0, here.h).tolist()
+    to_h = getattr(leg, "to_m", None) or getattr(leg, "alt_m", None) or here.h
+    to_speed = getattr(leg, "to_mps", None) or getattr(leg, "airspeed_mps", None) or here.speed
+    length = math.inf
+    if isinstance(leg, guidance.Climb | guidance.Descend):
+        length = abs(to_h - here.h) / leg.rate_mps * here.speed
+    elif isinstance(leg, guidance.Airspeed):
+        length = abs(to_speed - here.speed) / guidance.ACCELERATION * 0.5 * (to_speed + here.speed)
+    elif duration := getattr(leg, "duration_s", None):
+        length = duration * to_speed
+    motion = guidance.Motion(
+        north, east, here.speed * math.cos(here.course), here.speed * math.sin(here.course), here.course, here.speed
+    )
+    centre: tuple[float, float] | None = None
+    for count, segment in enumerate(leg.segments(motion, here.course)):
+        if isinstance(segment, guidance.Arc) and centre is None:
+            centre = segment.north, segment.east
+        north, east, here.course, length = _along(segment, north, east, here.course, to_speed, length)
+        if length <= 0.0 or count >= _MOST_SEGMENTS:
+            break
+    here.lat, here.lon, here.h = displaced(lat0, lon0, to_h, np.array([north, east, 0.0]))
+    here.speed = to_speed
+    item = _item(leg, here)
+    if centre is not None and item.command in (mav.MAV_CMD_NAV_LOITER_TURNS, mav.MAV_CMD_NAV_LOITER_TIME):
+        lat, lon, _ = displaced(lat0, lon0, to_h, np.array([*centre, 0.0]))
+        item = replace(item, lat=lat, lon=lon)
+    return item
+
+
+def _along(
+    segment: guidance.Segment, north: float, east: float, course: float, speed: float, length: float
+) -> tuple[float, float, float, float]:
+    """Where a segment ends, or ``length`` [m] runs out: north, east, course, and what is left of the length."""
+    if isinstance(segment, guidance.Line):
+        course = segment.course
+        gone = min(segment.length, length)
+        gone = gone if math.isfinite(gone) else 0.0
+        return north + gone * math.cos(course), east + gone * math.sin(course), course, length - gone
+    if isinstance(segment, guidance.HeadingTurn):
+        radius, turn = guidance.turn_radius(speed, guidance.TURN_BANK), segment.remaining
+        side = math.copysign(1.0, turn)
+        middle = north - side * radius * math.sin(course), east + side * radius * math.cos(course)
+        sweep = abs(turn)
+    else:
+        assert isinstance(segment, guidance.Arc)
+        radius, side, middle = segment.radius, float(segment.side), (segment.north, segment.east)
+        sweep = segment.sweep
+        off_north, off_east = north - middle[0], east - middle[1]
+        if math.hypot(off_north, off_east) > 1.0:  # onto the circle by the straight way
+            course = math.atan2(off_east, off_north) + side * 0.5 * math.pi
+    sweep = min(sweep, length / radius)
+    sweep = sweep if math.isfinite(sweep) else 0.0
+    course += side * sweep
+    end = middle[0] + side * radius * math.sin(course), middle[1] - side * radius * math.cos(course)
+    return *end, guidance.wrap(course), length - sweep * radius
+
+
+def _item(leg: guidance.Leg, end: _Here) -> Item:
+    """The item of a leg that ends there."""
+    place = end.lat, end.lon, end.h
+    match leg:
+        case guidance.Climb() | guidance.Descend():
+            way = 1.0 if isinstance(leg, guidance.Climb) else 2.0
+            return Item(mav.MAV_CMD_NAV_CONTINUE_AND_CHANGE_ALT, (way, 0.0, 0.0, 0.0), *place)
+        case guidance.Airspeed():
+            return Item(mav.MAV_CMD_DO_CHANGE_SPEED, (0.0, leg.to_mps, -1.0, 0.0), 0.0, 0.0, end.h)
+        case guidance.Loiter() | guidance.Racetrack() | guidance.FigureEight():
+            radius = leg.radius_m if leg.direction == "right" else -leg.radius_m
+            rounds = leg.laps if isinstance(leg, guidance.Racetrack) else leg.turns
+            if rounds is not None:
+                return Item(mav.MAV_CMD_NAV_LOITER_TURNS, (rounds, 0.0, radius, 0.0), *place)
+            assert leg.duration_s is not None
+            return Item(mav.MAV_CMD_NAV_LOITER_TIME, (leg.duration_s, 0.0, radius, 0.0), *place)
+    return Item(mav.MAV_CMD_NAV_WAYPOINT, (0.0, 0.0, 0.0, math.degrees(end.course) % 360), *place)
+
+
+def _driven(truth: KinematicTruth, duration_s: float) -> list[Item]:
+    """Where the segments of a kinematic motion end, each for the last time; waypoints all of them."""
+    if not truth.segments:
+        return []
+    rows = Kinematic(truth.start, 1.0, truth.track(), truth.body).advance(math.ceil(duration_s) + 1)
+    ends: list[Item] = []
+    at = 0
+    for index in range(len(truth.segments)):
+        passed = np.flatnonzero(rows.leg == index)
+        at = int(passed[-1]) if len(passed) else at  # a repeat has no rows of its own, what is not reached has none yet
+        ends.append(
+            Item(
+                mav.MAV_CMD_NAV_WAYPOINT,
+                (0.0, 0.0, 0.0, math.nan),
+                float(rows.lat[at]),
+                float(rows.lon[at]),
+                float(rows.h[at]),
+            )
+        )
+    return ends

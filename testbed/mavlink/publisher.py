@@ -1,0 +1,328 @@
+"""Between a run and its ground stations: sends what is due, hears what is asked, hands over what concerns the run."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from nav.local_filter import ISOLATED, OUTSIDE
+from nav.samples import Array, Estimate, ImuSamples, Sample, Status, UpdateReport
+from testbed.control import Request, settings
+from testbed.mavlink import messages, mission
+from testbed.mavlink.answers import Answers, Talk
+from testbed.mavlink.encode import Encoder, microseconds
+from testbed.mavlink.identity import identity_of
+from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
+from testbed.mavlink.messages import Point, Snapshot
+from testbed.mavlink.parameters import Parameters
+from testbed.mavlink.signing import Signing
+from testbed.mavlink.stream import BESIDE_VEHICLES, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
+from testbed.scenario import Scenario
+from testbed.sensors.imu import ImuConfig
+from testbed.truth import TruthBlock
+
+HEARD_A_TURN = 8192  # bytes that are taken from each link at a time; the rest waits, or is lost
+HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s
+_TOO_SOON_S = 0.1  # after a heartbeat by the wall clock, for one by the run's
+SILENT_S, SILENT_PERIODS = 1.2, 3  # a sensor that says nothing for longer counts as failed
+REFUSED = 10  # samples of a receiver in a row, before it is held for spoofed
+MOST_VEHICLES = 254
+
+
+class MavlinkPublisher:
+    """The vehicle that ground stations see: fixed wing, system 1 component 1, on a mode of its own.
+
+    It is handed a row of a run every `period_s` of simulated time and sends what is due to every station and log. A
+    telemetry log holds what goes out by itself, at the usual rates: with the same run it has the same bytes, whatever
+    stations ask. Answers, and heartbeats by the wall clock, go to stations only.
+    """
+
+    period_s = 1 / PUBLISH_HZ
+
+    def __init__(
+        self,
+        urls: Sequence[str],
+        scenario: Scenario,
+        *,
+        identity: str = "px4",
+        readonly: bool = False,
+        key: str | None = None,
+        vehicles: bool = False,
+    ) -> None:
+        """Open ``urls`` (see `testbed.mavlink.link`); the run starts at midnight UTC of the scenario's date.
+
+        ``identity`` is one of `testbed.mavlink.identity.IDENTITIES`. ``readonly`` denies what would change the run.
+        With a ``key`` (see `testbed.mavlink.signing.key_bytes`) what is not signed with it is not heard, and what goes
+        to stations is signed. ``vehicles`` shows truth, system 2, and the other estimators, from 3 on, as vehicles.
+        Raises UserError when an address, the identity or the key is wrong or can't be had; then nothing stays open.
+        """
+        midnight = datetime.datetime.combine(scenario.date, datetime.time(), datetime.UTC)
+        self._start_us = int(midnight.timestamp()) * 10**6
+        self._sent_us = 0
+        self._identity = identity_of(identity)
+        self._signing = Signing(key) if key is not None else None
+        self._own = settings(scenario)
+        self._items = mission.items(scenario, self._identity.home_first)
+        self._legs = len(self._items) - (self._identity.home_first and len(self._items) > 0)
+        self._silent_s = {
+            name: max(SILENT_S, SILENT_PERIODS / config.rate_hz)
+            for name, config in scenario.sensors.items()
+            if not isinstance(config, ImuConfig)
+        }
+        self._streams = BESIDE_VEHICLES if vehicles else STREAMS
+        self._schedule = Schedule(self._streams)
+        self._encoder = Encoder()
+        self._calls = 0
+        self._long_texts = 0
+        self._vehicles = vehicles
+        self._beside: list[Answers] = []  # truth and the other estimators, when they are vehicles
+        self._beside_schedule = Schedule(VEHICLE_STREAMS)
+        self._beside_encoders: list[Encoder] = []
+        self._heartbeat_at = -math.inf
+        self._quiet: dict[str, float] = {}
+        self._talks: WeakKeyDictionary[Station, Talk] = WeakKeyDictionary()
+        self._readonly = readonly
+        self._scenario = scenario
+        self._begin()
+        self._logs: list[TelemetryLog] = []
+        self._links: list[Link] = []
+        for link in connect_all(urls):
+            if isinstance(link, TelemetryLog):
+                self._logs.append(link)
+            else:
+                self._links.append(link)
+
+    def _begin(self) -> None:
+        """Forget what was of a run, for another to begin."""
+        self._t = -math.inf
+        self._leg = -1.0
+        self._home: Point | None = None
+        self._imu_before: ImuSamples | None = None
+        self._gyro: Array = np.full(3, math.nan)
+        self._accel: Array = np.full(3, math.nan)
+        self._ratios: dict[str, float] = {}
+        self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
+        self._isolated: dict[tuple[str, str], bool] = {}
+        self._main = Answers(
+            self._identity,
+            Parameters(self._identity.facts, self._own, self._identity.byte_wise),
+            self._items,
+            self._streams,
+            scenario=self._scenario,
+            readonly=self._readonly,
+        )
+        for talk in self._talks.values():
+            talk.lists.clear()
+
+    def publish(
+        self,
+        truth: TruthBlock,
+        estimate: Estimate,
+        samples: Mapping[str, Sample],
+        imu: ImuSamples | None,
+        others: Sequence[tuple[str, Estimate]],
+        reports: Sequence[UpdateReport] = (),
+    ) -> None:
+        """Send what is due at the time of ``truth`` (one row).
+
+        ``samples`` is the newest of each sensor, ``imu`` increments around now (those up to now are used), ``others``
+        the estimates shown beside this one, ``reports`` this estimator's updates since the last call.
+        """
+        t = float(truth.t[0])
+        if t < self._t:
+            self._begin()
+        self._t = t
+        self._beats()
+        with np.errstate(all="ignore"):  # an estimate may be anything; the encoder copes
+            self._read_imu(imu, t)
+            for report in reports:
+                self._read_report(report)
+            if self._home is None:
+                self._home = messages.known_point(estimate)
+            snapshot = Snapshot(
+                truth,
+                estimate,
+                samples,
+                self._gyro,
+                self._accel,
+                others,
+                self._home,
+                self._start_us,
+                self._ratios,
+                self._identity,
+                self._legs,
+                self._silent_s,
+                frozenset(sensor for (sensor, _), is_so in self._isolated.items() if is_so),
+                frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
+            )
+            self._main.snapshot = snapshot
+            events = self._reached(snapshot)
+            self._send(t, self._due(self._encoder, self._main, self._schedule, events))
+            if self._vehicles:
+                self._send_beside(snapshot)
+        self._calls += 1
+
+    def requests(self) -> Sequence[Request]:
+        """Answer what stations have asked since the last call, and give what concerns the run; never waits."""
+        for link in self._links:
+            for station, data in link.receive(HEARD_A_TURN):
+                talk = self._talk(station)
+                for message in talk.hear(data):
+                    for vehicle in (self._main, *self._beside):
+                        vehicle.answer(message, talk)
+        due = time.monotonic() - self._heartbeat_at > HEARTBEAT_S
+        heartbeats = [vehicle.heartbeat() for vehicle in (self._main, *self._beside)] if due else []
+        if due:
+            self._heartbeat_at = time.monotonic()
+        for link in self._links:
+            for station in link.stations:
+                talk = self._talk(station)
+                for vehicle in (self._main, *self._beside):
+                    vehicle.go_on(talk)
+                talk.flush(heartbeats)
+        asked, self._main.asked = self._main.asked, []
+        return asked
+
+    def event(self, t: float, severity: str, text: str) -> None:
+        """Say ``text`` as STATUSTEXT; severity is info, warning or error."""
+        chunks = messages.statustext(severity, text, self._long_texts)
+        self._long_texts += len(chunks) > 1
+        frames = [self._encoder.frame("STATUSTEXT", chunk) for chunk in chunks]
+        self._send(t, lambda rates: frames)
+
+    def close(self) -> None:
+        """Close every link; harmless when done twice."""
+        with contextlib.ExitStack() as stack:
+            for close in [link.close for link in self._links] + [log.close for log in self._logs]:
+                stack.callback(close)
+
+    def _talk(self, station: Station) -> Talk:
+        talk = self._talks.get(station)
+        if talk is None:
+            talk = self._talks[station] = Talk(station, self._signing)
+        return talk
+
+    def _due(
+        self, encoder: Encoder, vehicle: Answers, schedule: Schedule, events: Sequence[bytes] = ()
+    ) -> Callable[[Mapping[str, float]], list[bytes]]:
+        """What gives the frames due now at given rates. Each is made once; those at usual rates by ``encoder``."""
+        made: dict[int, bytes | None] = {}
+
+        def frame(stream: Stream, usual: bool) -> bytes | None:
+            if id(stream) not in made:
+                fields = stream.fields(snapshot) if (snapshot := vehicle.snapshot) else None
+                made[id(stream)] = (
+                    None
+                    if fields is None
+                    else encoder.frame(stream.message, fields)
+                    if usual
+                    else vehicle.frame(stream)
+                )
+            return made[id(stream)]
+
+        def frames(rates: Mapping[str, float]) -> list[bytes]:
+            due = [frame(stream, not rates) for stream in schedule.due(self._calls, rates)]
+            return [*events, *(one for one in due if one is not None)]
+
+        return frames
+
+    def _send(self, t: float, due: Callable[[Mapping[str, float]], list[bytes]]) -> None:
+        """Send to logs, which come first so that their numbers are the run's alone, and to stations."""
+        self._sent_us = max(self._sent_us, self._start_us + microseconds(t))  # events tell of times before the last row
+        if self._logs:
+            frames = due({})
+            for log in self._logs:
+                log.send(self._sent_us, frames)
+        for link in self._links:
+            for station in link.stations:
+                talk = self._talk(station)
+                talk.flush(due({**talk.rates, **self._quiet} if self._quiet else talk.rates))
+
+    def _beats(self) -> None:
+        """See to it that no heartbeat follows one by the wall clock at once."""
+        self._quiet = {}
+        if self._calls % PUBLISH_HZ == 0:
+            now = time.monotonic()
+            if now - self._heartbeat_at < _TOO_SOON_S:
+                self._quiet = {"HEARTBEAT": 0.0}
+            else:
+                self._heartbeat_at = now
+
+    def _send_beside(self, shown: Snapshot) -> None:
+        """Truth and the other estimators as vehicles of their own, each with its home and without the plan."""
+        estimates = [("truth", _as_estimate(shown.truth)), *shown.others][: MOST_VEHICLES - 1]
+        if not self._beside:
+            for system, (name, _) in enumerate(estimates, 2):
+                facts = {name: (system, text) for name, (_, text) in list(self._identity.facts.items())[:1]}
+                parameters = Parameters(facts, {}, self._identity.byte_wise)
+                self._beside.append(
+                    Answers(self._identity, parameters, (), VEHICLE_STREAMS, system=system, readonly=True)
+                )
+                self._beside_encoders.append(Encoder(system))
+                self.event(shown.t, "info", f"system {system} is {name}")
+        for vehicle, encoder, (_, estimate) in zip(self._beside, self._beside_encoders, estimates, strict=True):
+            before = vehicle.snapshot
+            home = before.home if before is not None and before.t <= shown.t else None
+            vehicle.snapshot = replace(
+                shown,
+                estimate=estimate,
+                gyro=shown.truth.omega_b[0] + estimate.gyro_bias,
+                others=(),
+                home=home or messages.known_point(estimate),
+                legs=0,
+            )
+            self._send(shown.t, self._due(encoder, vehicle, self._beside_schedule))
+
+    def _reached(self, snapshot: Snapshot) -> list[bytes]:
+        """MISSION_ITEM_REACHED when a leg has ended."""
+        before, self._leg = self._leg, float(snapshot.truth.leg[0])
+        if before == self._leg or before < 0:
+            return []
+        number = int(before) + self._identity.home_first
+        return [self._encoder.frame("MISSION_ITEM_REACHED", {"seq": number})]
+
+    def _read_report(self, report: UpdateReport) -> None:
+        ratio = float(np.float64(report.nis) / report.threshold)
+        self._ratios[report.aid] = math.sqrt(ratio) if ratio >= 0 else math.nan
+        part = report.sensor, report.aid
+        self._isolated[part] = report.reason == ISOLATED
+        if report.reason == OUTSIDE:
+            self._refused[part] = self._refused.get(part, 0) + 1
+        elif report.weight > 0:
+            self._refused[part] = 0
+
+    def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
+        """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""
+        for block in (imu, self._imu_before):
+            newest = int(block.t.searchsorted(t + 1e-6)) - 1 if block is not None else -1
+            if block is not None and newest >= 0:
+                self._gyro = block.dtheta[newest] / block.dt[newest]
+                self._accel = block.dv[newest] / block.dt[newest]
+                break
+        self._imu_before = imu
+
+
+def _as_estimate(truth: TruthBlock) -> Estimate:
+    """Truth as an estimate without error."""
+    none = np.zeros(3)
+    return Estimate(
+        t=float(truth.t[0]),
+        lat=float(truth.lat[0]),
+        lon=float(truth.lon[0]),
+        h=float(truth.h[0]),
+        v_n=truth.v_n[0],
+        q_nb=truth.q_nb[0],
+        gyro_bias=none,
+        accel_bias=none,
+        covariance=np.zeros((9, 9)),
+        sigma_gyro_bias=none,
+        sigma_accel_bias=none,
+        status=Status.ALIGNED | Status.GNSS_FUSED,
+    )
