@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -110,7 +110,22 @@ def run(
     overrides: Overrides = None,
     mavlink: Annotated[
         list[str] | None,
-        typer.Option(metavar="URL", help="Stream to udpout, tcp or tcpin:HOST:PORT, or to tlog:FILE; repeatable."),
+        typer.Option(
+            metavar="URL", help="Be seen at udpout, udpin, tcp or tcpin:HOST:PORT, serial:DEVICE, tlog:FILE; repeatable."
+        ),
+    ] = None,
+    mavlink_identity: Annotated[
+        str, typer.Option(metavar="NAME", help="Whose ways the vehicle has: px4 or ardupilot.")
+    ] = "px4",
+    mavlink_vehicles: Annotated[
+        bool, typer.Option("--mavlink-vehicles", help="Show truth and the other estimators as vehicles of their own.")
+    ] = False,
+    mavlink_readonly: Annotated[
+        bool, typer.Option("--mavlink-readonly", help="Let stations watch, but change nothing.")
+    ] = False,
+    mavlink_key: Annotated[
+        str | None,
+        typer.Option(metavar="KEY", help="Hear only what is signed with this passphrase or 64 hexadecimal digits."),
     ] = None,
     estimator: Annotated[
         str | None, typer.Option(metavar="NAME", help="Which estimator to stream; the scenario's first.")
@@ -137,7 +152,16 @@ def run(
     if (folder / "run.nc").resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with _output_folder(folder):
-        links = _connect(mavlink or [], loaded, folder, estimator)
+        links = _connect(
+            mavlink or [],
+            loaded,
+            folder,
+            estimator,
+            identity=mavlink_identity,
+            vehicles=mavlink_vehicles,
+            readonly=mavlink_readonly,
+            key=mavlink_key,
+        )
         result = _fly(loaded, folder, seed=seed, links=links, shown=estimator, realtime=realtime, replay=replay)
         _conclude(result.dataset, result.metrics, folder / "run.nc", report)
     if _lost(result):
@@ -382,8 +406,13 @@ def _keeping(what_is_left: str) -> Iterator[None]:
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def _connect(urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None) -> list[Publisher]:
-    """Open the links, once it is sure that there is something to show and that no log would overwrite a result."""
+def _connect(
+    urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, **options: Any
+) -> list[Publisher]:
+    """Open the links, once it is sure that there is something to show and that no log would overwrite a result.
+
+    ``options`` are those of `testbed.mavlink.MavlinkPublisher`.
+    """
     if not urls:
         return []
     from testbed.loop import shown_estimator
@@ -394,7 +423,7 @@ def _connect(urls: Sequence[str], scenario: Scenario, folder: Path, estimator: s
         path = log_path(url)
         if path is not None and path.resolve().parent == folder.resolve() and is_result(path.name):
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
-    return [MavlinkPublisher(urls, scenario)]
+    return [MavlinkPublisher(urls, scenario, **options)]
 
 
 def _fly(
