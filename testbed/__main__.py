@@ -111,7 +111,7 @@ def run(
     mavlink: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="URL", help="Be seen at udpout, udpin, tcp or tcpin:HOST:PORT, serial:DEVICE, tlog:FILE; repeatable."
+            metavar="URL", help="To udpout, udpin, tcp or tcpin:HOST:PORT, serial:DEVICE, tlog:FILE; repeatable."
         ),
     ] = None,
     mavlink_identity: Annotated[
