@@ -416,7 +416,8 @@ class Answers:
 
     def _set_interval(self, params: Params, talk: Talk) -> int:
         """Of this station's streams only: 0 is the usual interval, -1 none."""
-        name, interval = self._numbers.get(whole_number(params[0]) or 0), params[1]
+        number, interval = whole_number(params[0]), params[1]
+        name = None if number is None else self._numbers.get(number)
         if name is None or self._scenario is None or not (interval >= 0 or interval == -1):
             return int(mav.MAV_RESULT_DENIED)
         if interval == 0:

@@ -104,7 +104,8 @@ class _Layout:
         self.id: int = message.id
         self.crc_extra = bytes([message.crc_extra])
         self._pack = message.unpacker.pack
-        self._values = itemgetter(*message.ordered_fieldnames)
+        names = message.ordered_fieldnames
+        self._values = itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         self._numbers: list[_Number] = []
         self._arrays: list[int] = []  # positions among the fields, the last first: each is replaced by its numbers
         for position, (field, length) in enumerate(zip(message.ordered_fieldnames, message.array_lengths, strict=True)):
