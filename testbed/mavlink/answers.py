@@ -164,6 +164,7 @@ class Answers:
             mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
             mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
+            mav.MAV_CMD_GET_HOME_POSITION: lambda params, talk: self._stream("HOME_POSITION", talk),
         }
         self._changes: Mapping[int, Callable[[Params, Talk], int]] = {
             mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
@@ -353,10 +354,7 @@ class Answers:
     def _request_message(self, params: Params, talk: Talk) -> int:
         number, which = whole_number(params[0]), whole_number(params[1])
         if number in self._numbers:
-            frames = [frame for stream in self._streams[self._numbers[number]] if (frame := self.frame(stream))]
-            for frame in frames:
-                talk.later(frame)
-            return int(mav.MAV_RESULT_ACCEPTED if frames else mav.MAV_RESULT_TEMPORARILY_REJECTED)
+            return self._stream(self._numbers[number], talk)
         if number == mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             return self._capabilities(params, talk)
         if number == mav.MAVLINK_MSG_ID_AVAILABLE_MODES and which in (0, 1):
@@ -368,6 +366,13 @@ class Answers:
         else:
             return int(mav.MAV_RESULT_DENIED)
         return int(mav.MAV_RESULT_ACCEPTED)
+
+    def _stream(self, name: str, talk: Talk) -> int:
+        """The newest of what is streamed; not yet when there is nothing to say."""
+        frames = [frame for stream in self._streams[name] if (frame := self.frame(stream))]
+        for frame in frames:
+            talk.later(frame)
+        return int(mav.MAV_RESULT_ACCEPTED if frames else mav.MAV_RESULT_TEMPORARILY_REJECTED)
 
     def _capabilities(self, params: Params, talk: Talk) -> int:
         self._say(talk, "AUTOPILOT_VERSION", self._version())

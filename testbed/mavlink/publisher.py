@@ -28,7 +28,7 @@ from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig
 from testbed.truth import TruthBlock
 
-HEARD_A_TURN = 8192  # bytes that are taken from each link at a time; the rest waits, or is lost
+HEARD_A_TURN = 4096  # bytes that are taken from each link at a time; the rest waits, or is lost
 HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s
 _TOO_SOON_S = 0.1  # after a heartbeat by the wall clock, for one by the run's
 SILENT_S, SILENT_PERIODS = 1.2, 3  # a sensor that says nothing for longer counts as failed
@@ -110,6 +110,7 @@ class MavlinkPublisher:
         self._ratios: dict[str, float] = {}
         self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
         self._isolated: dict[tuple[str, str], bool] = {}
+        self._told: frozenset[str] = frozenset()  # isolations
         self._main = Answers(
             self._identity,
             Parameters(self._identity.facts, self._own, self._identity.byte_wise),
@@ -162,6 +163,7 @@ class MavlinkPublisher:
                 frozenset(sensor for (sensor, _), is_so in self._isolated.items() if is_so),
                 frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
             )
+            self._tell_isolations(t, snapshot.isolated)
             self._main.snapshot = snapshot
             events = self._reached(snapshot)
             self._send(t, self._due(self._encoder, self._main, self._schedule, events))
@@ -279,6 +281,14 @@ class MavlinkPublisher:
                 legs=0,
             )
             self._send(shown.t, self._due(encoder, vehicle, self._beside_schedule))
+
+    def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
+        """Say which sensors the shown estimator has shut out since the last call, and which it has let in again."""
+        before, self._told = self._told, isolated
+        for sensor in sorted(isolated - before):
+            self.event(t, "warning", f"{sensor} isolated")
+        for sensor in sorted(before - isolated):
+            self.event(t, "info", f"{sensor} no longer isolated")
 
     def _reached(self, snapshot: Snapshot) -> list[bytes]:
         """MISSION_ITEM_REACHED when a leg has ended."""

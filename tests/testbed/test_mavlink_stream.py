@@ -583,9 +583,11 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert last(heard, "EKF_STATUS_REPORT", "flags") & mav.EKF_GPS_GLITCHING
     healthy = bool(last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS)
     assert healthy == (how != "isolated")
+    assert [message.text for message in heard["STATUSTEXT"]] == ["gnss isolated"] * (how == "isolated")
     heard = log_of(tmp_path, range(200), reports=reports)
     assert last(heard, "GNSS_INTEGRITY", "spoofing_state") == mav.GPS_SPOOFING_STATE_NOT_SPOOFED
     assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
+    assert how != "isolated" or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
 
 
 def test_receiver_without_fix_shows_as_jammed_not_spoofed(tmp_path):
