@@ -9,7 +9,6 @@ import socket
 import struct
 import time
 
-import numpy as np
 import pymap3d
 import pytest
 from mavlink_world import SCENARIO, publish, read_log
@@ -22,7 +21,7 @@ from testbed.mavlink import MavlinkPublisher, link, mission, signing
 from testbed.mavlink.stream import STREAMS
 
 ACCEPTED, REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
-PATIENCE_S = 2.0
+PATIENCE_S, QUIET_S = 2.0, 0.015  # for an answer, and after the last
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +73,7 @@ class Peer:
     def drain(self):
         """All that comes within a moment, by type."""
         heard = collections.defaultdict(list)
-        while message := self.hear(patience=0.05):
+        while message := self.hear(patience=QUIET_S):
             heard[message.get_type()].append(message)
         return heard
 
@@ -761,4 +760,3 @@ def test_asking_nothing_costs_next_to_nothing(meet):
     for _ in range(2000):
         peer.publisher.requests()
     assert (time.perf_counter() - start) / 2000 < 100e-6
-    assert np.isfinite(time.perf_counter())

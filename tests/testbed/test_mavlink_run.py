@@ -136,3 +136,46 @@ def test_nothing_is_claimed_before_alignment(watched, messages):
         assert messages[name][0].time_boot_ms > first - 100
     assert messages["HEARTBEAT"][0].system_status == mav.MAV_STATE_CALIBRATING
     assert messages["HEARTBEAT"][-1].system_status == mav.MAV_STATE_ACTIVE
+
+
+def test_station_breaks_the_receiver_and_heals_it(tmp_path, monkeypatch):
+    """Within two seconds of the run its health says so, and the record has both requests."""
+    monkeypatch.setenv("MAVLINK20", "1")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    scenario = Scenario.load("u_turn", ["duration_s=14"])
+    publisher = MavlinkPublisher([f"udpin:127.0.0.1:{port}"], scenario)
+    station = mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}", dialect="all")
+    asked, health, over = {}, [], threading.Event()
+
+    def converse():
+        station.mav.heartbeat_send(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+        t = 0.0
+        while not over.is_set():
+            message = station.recv_match(blocking=True, timeout=0.1)
+            if message is None:
+                continue
+            t = getattr(message, "time_boot_ms", t * 1e3) / 1e3
+            for when, kind in ((4.0, mav.FAILURE_TYPE_OFF), (9.0, mav.FAILURE_TYPE_OK)):
+                if t > when and kind not in asked:
+                    asked[kind] = t
+                    station.mav.command_long_send(1, 1, 420, 0, mav.FAILURE_UNIT_SENSOR_GPS, kind, 0, 0, 0, 0, 0)
+            if message.get_type() == "SYS_STATUS":
+                gps = message.onboard_control_sensors_health & mav.MAV_SYS_STATUS_SENSOR_GPS
+                health.append((t, bool(gps)))
+
+    thread = threading.Thread(target=converse, daemon=True)
+    thread.start()
+    try:
+        dataset = run(scenario, links=[publisher], realtime=4.0).dataset
+    finally:
+        over.set()
+        thread.join(5.0)
+        station.close()
+    off, ok = asked[mav.FAILURE_TYPE_OFF], asked[mav.FAILURE_TYPE_OK]
+    assert all(healthy for t, healthy in health if 1.5 < t < off)
+    assert not any(healthy for t, healthy in health if off + 2.0 < t < ok)
+    assert all(healthy for t, healthy in health if t > ok + 2.0)
+    assert len([t for t, _ in health if t > ok + 2.0]) > 1
+    assert dataset["requests"]["kind"].values.astype(str).tolist() == ["inject", "clear"]
