@@ -70,31 +70,26 @@ Params: TypeAlias = Sequence[float]
 
 
 class Talk:
-    """What passes between us and one station, as long as it is there."""
+    """What has passed between us and one station, as long as it is there."""
 
-    def __init__(self, station: Station, signing: Signing | None) -> None:
-        self._station = station
+    def __init__(self, signing: Signing | None) -> None:
         self._reader = Reader(signing)
         self._voice = Voice(signing)
-        self.due: list[bytes] = []
+        self.due: list[bytes] = []  # frames for the next `flush`
         self.rates: dict[str, float] = {}  # of messages whose rate it has asked for [Hz]
         self.lists: dict[int, int] = {}  # the parameter that is next in the list under way, by vehicle
 
-    def hear(self, data: bytes) -> list[Message]:
+    def hear(self, station: Station, data: bytes) -> list[Message]:
         """The messages in what it said; with the first it is one of ours."""
-        heard = list(self._reader.read(data, self._station.datagrams))
+        heard = list(self._reader.read(data, station.datagrams))
         if heard:
-            self._station.admit()
+            station.admit()
         return heard
 
-    def later(self, frame: bytes) -> None:
-        """Send a frame with the next `flush`."""
-        self.due.append(frame)
-
-    def flush(self, frames: Sequence[bytes] = ()) -> None:
+    def flush(self, station: Station, frames: Sequence[bytes] = ()) -> None:
         """Send what is due, and ``frames``."""
         if self.due or frames:
-            self._station.send([self._voice.say(frame) for frame in (*self.due, *frames)])
+            station.send([self._voice.say(frame) for frame in (*self.due, *frames)])
             self.due.clear()
 
 
@@ -128,7 +123,7 @@ class Answers:
         self._numbers = {mav_id(name): name for name in self._streams}
         self._scenario = scenario
         self._readonly = readonly
-        self._encoder = Encoder(system, COMPONENT)
+        self.encoder = Encoder(system, COMPONENT)
         self._texts = 0
         self._requests: Mapping[str, Callable[[Message, Talk], None]] = {
             "PARAM_REQUEST_LIST": self._param_list,
@@ -197,15 +192,15 @@ class Answers:
 
     def heartbeat(self) -> bytes:
         """A HEARTBEAT of now."""
-        return self._encoder.frame("HEARTBEAT", messages.heartbeat(self.snapshot, self._identity))
+        return self.encoder.frame("HEARTBEAT", messages.heartbeat(self.snapshot, self._identity))
 
     def frame(self, stream: Stream) -> bytes | None:
         """The newest of a stream; None when there is nothing to say."""
         fields = stream.fields(self.snapshot) if self.snapshot else None
-        return self._encoder.frame(stream.message, fields) if fields else None
+        return self.encoder.frame(stream.message, fields) if fields else None
 
     def _say(self, talk: Talk, name: str, fields: Fields) -> None:
-        talk.later(self._encoder.frame(name, fields))
+        talk.due.append(self.encoder.frame(name, fields))
 
     def _text(self, talk: Talk, text: str) -> None:
         chunks = messages.statustext("warning", text, self._texts)
@@ -254,7 +249,7 @@ class Answers:
         if kind != mav.MAV_MISSION_TYPE_MISSION or number >= len(self._items):
             self._mission_ack(message, talk, kind, mav.MAV_MISSION_INVALID_SEQUENCE)
             return
-        fields = mission.fields(self._items, number, self._current(), self._items[0].h)
+        fields = mission.fields(self._items, number, self._current(), self._home_h())
         if message.name == "MISSION_REQUEST":
             self._say(talk, "MISSION_ITEM", {**mission.with_floats(fields), **_to(message)})
         else:
@@ -272,7 +267,13 @@ class Answers:
         for stream in self._streams.get("MISSION_CURRENT", ()):
             frame = self.frame(stream)
             if frame:
-                talk.later(frame)
+                talk.due.append(frame)
+
+    def _home_h(self) -> float:
+        """Height of home, as HOME_POSITION has it; before it is known, the start's."""
+        if self.snapshot and self.snapshot.home:
+            return self.snapshot.home[2]
+        return float(self._scenario.truth.start.alt_m) if self._scenario else 0.0
 
     def _current(self) -> int:
         return messages.current_item(self.snapshot) if self.snapshot else 0
@@ -300,12 +301,12 @@ class Answers:
 
     def _ack(self, message: Message, command: int, result: int) -> bytes:
         fields = {"command": command, "result": result, "progress": 0, "result_param2": 0, **_to(message)}
-        return self._encoder.frame("COMMAND_ACK", fields)
+        return self.encoder.frame("COMMAND_ACK", fields)
 
     def _set_mode(self, message: Message, talk: Talk) -> None:
         """The message that was there before the command: acknowledged by its own number, as ArduPilot does."""
         is_mode = message["custom_mode"] == self._identity.mode and not self._readonly
-        talk.later(self._ack(message, mav.MAVLINK_MSG_ID_SET_MODE, _granted(is_mode)))
+        talk.due.append(self._ack(message, mav.MAVLINK_MSG_ID_SET_MODE, _granted(is_mode)))
 
     def _do_set_mode(self, params: Params, talk: Talk) -> int:
         """The one mode that there is may be asked for: it is flown already."""
@@ -371,7 +372,7 @@ class Answers:
         """The newest of what is streamed; not yet when there is nothing to say."""
         frames = [frame for stream in self._streams[name] if (frame := self.frame(stream))]
         for frame in frames:
-            talk.later(frame)
+            talk.due.append(frame)
         return int(mav.MAV_RESULT_ACCEPTED if frames else mav.MAV_RESULT_TEMPORARILY_REJECTED)
 
     def _capabilities(self, params: Params, talk: Talk) -> int:

@@ -166,7 +166,7 @@ class MavlinkPublisher:
             self._tell_isolations(t, snapshot.isolated)
             self._main.snapshot = snapshot
             events = self._reached(snapshot)
-            self._send(t, self._due(self._encoder, self._main, self._schedule, events))
+            self._send(t, self._due(self._encoder, self._main, snapshot, self._schedule, events))
             if self._vehicles:
                 self._send_beside(snapshot)
         self._calls += 1
@@ -176,7 +176,7 @@ class MavlinkPublisher:
         for link in self._links:
             for station, data in link.receive(HEARD_A_TURN):
                 talk = self._talk(station)
-                for message in talk.hear(data):
+                for message in talk.hear(station, data):
                     for vehicle in (self._main, *self._beside):
                         vehicle.answer(message, talk)
         due = time.monotonic() - self._heartbeat_at > HEARTBEAT_S
@@ -188,7 +188,7 @@ class MavlinkPublisher:
                 talk = self._talk(station)
                 for vehicle in (self._main, *self._beside):
                     vehicle.go_on(talk)
-                talk.flush(heartbeats)
+                talk.flush(station, heartbeats)
         asked, self._main.asked = self._main.asked, []
         return asked
 
@@ -208,29 +208,29 @@ class MavlinkPublisher:
     def _talk(self, station: Station) -> Talk:
         talk = self._talks.get(station)
         if talk is None:
-            talk = self._talks[station] = Talk(station, self._signing)
+            talk = self._talks[station] = Talk(self._signing)
         return talk
 
     def _due(
-        self, encoder: Encoder, vehicle: Answers, schedule: Schedule, events: Sequence[bytes] = ()
+        self,
+        encoder: Encoder,
+        vehicle: Answers,
+        snapshot: Snapshot,
+        schedule: Schedule,
+        events: Sequence[bytes] = (),
     ) -> Callable[[Mapping[str, float]], list[bytes]]:
         """What gives the frames due now at given rates. Each is made once; those at usual rates by ``encoder``."""
         made: dict[int, bytes | None] = {}
 
-        def frame(stream: Stream, usual: bool) -> bytes | None:
+        def frame(stream: Stream, maker: Encoder) -> bytes | None:
             if id(stream) not in made:
-                fields = stream.fields(snapshot) if (snapshot := vehicle.snapshot) else None
-                made[id(stream)] = (
-                    None
-                    if fields is None
-                    else encoder.frame(stream.message, fields)
-                    if usual
-                    else vehicle.frame(stream)
-                )
+                fields = stream.fields(snapshot)
+                made[id(stream)] = None if fields is None else maker.frame(stream.message, fields)
             return made[id(stream)]
 
         def frames(rates: Mapping[str, float]) -> list[bytes]:
-            due = [frame(stream, not rates) for stream in schedule.due(self._calls, rates)]
+            maker = vehicle.encoder if rates else encoder
+            due = [frame(stream, maker) for stream in schedule.due(self._calls, rates)]
             return [*events, *(one for one in due if one is not None)]
 
         return frames
@@ -245,7 +245,7 @@ class MavlinkPublisher:
         for link in self._links:
             for station in link.stations:
                 talk = self._talk(station)
-                talk.flush(due({**talk.rates, **self._quiet} if self._quiet else talk.rates))
+                talk.flush(station, due({**talk.rates, **self._quiet} if self._quiet else talk.rates))
 
     def _beats(self) -> None:
         """See to it that no heartbeat follows one by the wall clock at once."""
@@ -280,7 +280,7 @@ class MavlinkPublisher:
                 home=home or messages.known_point(estimate),
                 legs=0,
             )
-            self._send(shown.t, self._due(encoder, vehicle, self._beside_schedule))
+            self._send(shown.t, self._due(encoder, vehicle, vehicle.snapshot, self._beside_schedule))
 
     def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
         """Say which sensors the shown estimator has shut out since the last call, and which it has let in again."""
@@ -293,7 +293,7 @@ class MavlinkPublisher:
     def _reached(self, snapshot: Snapshot) -> list[bytes]:
         """MISSION_ITEM_REACHED when a leg has ended."""
         before, self._leg = self._leg, float(snapshot.truth.leg[0])
-        if before == self._leg or before < 0:
+        if before == self._leg or not 0 <= before < self._legs:
             return []
         number = int(before) + self._identity.home_first
         return [self._encoder.frame("MISSION_ITEM_REACHED", {"seq": number})]

@@ -235,6 +235,8 @@ def test_mission_is_downloaded(meet):
     start = SCENARIO.truth.start
     lat, lon, _ = pymap3d.ned2geodetic(0, SCENARIO.plan[0].length_m, 0, start.lat_deg, start.lon_deg, start.alt_m)
     assert (items[0].x / 1e7, items[0].y / 1e7) == pytest.approx((lat, lon), abs=2e-5)
+    home = peer.command(mav.MAV_CMD_GET_HOME_POSITION)[1]["HOME_POSITION"][0]
+    assert home.altitude / 1e3 + items[0].z == pytest.approx(start.alt_m, abs=1e-3)
     assert items[1].y / 1e7 == pytest.approx(items[0].y / 1e7, abs=2e-5)
     assert items[1].x > items[0].x
     back = SCENARIO.plan[0].length_m - SCENARIO.plan[2].length_m
@@ -623,11 +625,12 @@ def test_two_stations_a_late_one_and_one_that_vanishes(meet, port, monkeypatch):
 
 def test_strangers_that_speak_no_mavlink_are_no_stations(meet, port):
     peer = meet()
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        for k in range(50):
+    for k in range(50):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.sendto(b"GET / HTTP/1.1\r\n\r\n" * k, ("127.0.0.1", port))
     peer.drain()
     assert len(peer.publisher._links[0].stations) == 1
+    assert len(peer.publisher._talks) == 1
 
 
 def test_station_on_tcp_and_on_a_known_address(port):

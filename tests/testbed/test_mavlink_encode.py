@@ -239,6 +239,8 @@ def broken_run(deal, status, fix):
 
 
 @settings(max_examples=150, deadline=None)
+@example(state=np.full(397, math.nan), before=np.full(397, math.nan), status=Status.ALIGNED, fix=FixType.FIX_3D)
+@example(state=np.full(397, math.inf), before=np.full(397, -math.inf), status=Status.ALIGNED, fix=FixType.NO_FIX)
 @given(
     state=arrays(np.float64, 397, elements=numbers),
     before=arrays(np.float64, 397, elements=numbers),

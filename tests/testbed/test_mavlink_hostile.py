@@ -283,12 +283,12 @@ def test_a_million_hostile_frames(readonly):
         listener.datagrams = k % 2 == 0
         begun = time.perf_counter()
         for data in rng.choices(pool, k=50):
-            for message in talk.hear(data):
+            for message in talk.hear(listener, data):
                 for vehicle in (publisher._main, *publisher._beside):
                     vehicle.answer(message, talk)
             for vehicle in (publisher._main, *publisher._beside):
                 vehicle.go_on(talk)
-            talk.flush()
+            talk.flush(listener)
         worst = max(worst, time.perf_counter() - begun)
         if k % 1000 == 0:
             publish(publisher, [1 + k // 1000])
