@@ -369,16 +369,16 @@ class Serial:
     """A serial port. When the device goes away, the link falls silent."""
 
     def __init__(self, url: str, where: str) -> None:
-        device, colon, rate = where.rpartition(":")
-        if not colon:
+        device, _, rate = where.rpartition(":")
+        if not rate.isdecimal():  # names of devices may have colons, too
             device, rate = where, str(BAUD)
         try:
             import termios
             import tty
         except ImportError:
             raise UserError(f"{url}: serial ports are for POSIX systems; use udpout: or tcp: here") from None
-        speed = getattr(termios, f"B{rate}", None) if rate.isdecimal() else None
-        if not device or speed is None:
+        speed = getattr(termios, f"B{rate}", None)
+        if not speed:  # 0 would hang up
             raise UserError(
                 f"{url}: {rate!r} is no baud rate of this system; use serial:device:57600 or another usual one"
             )
@@ -390,6 +390,7 @@ class Serial:
         try:
             tty.setraw(self._file, termios.TCSANOW)
             settings = termios.tcgetattr(self._file)
+            settings[2] |= termios.CLOCAL | termios.CREAD
             settings[4] = settings[5] = speed
             termios.tcsetattr(self._file, termios.TCSANOW, settings)
         except termios.error:

@@ -139,6 +139,8 @@ def test_start_up_is_quick(arguments: list[str]) -> None:
         ),
         (["run", "u_turn", "--mavlink", "tlog:o/report.html", "--out", "o"], "a result of the run goes there"),
         (["run", "u_turn", "--mavlink", "udp"], "testbed: udp: not a MAVLink address"),
+        (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-key", " "], "testbed: --mavlink-key: is empty"),
+        (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-identity", "apm"], "choose from px4, ardupilot"),
         (["run", "u_turn", "--mavlink", "udpout:127.0.0.1:99999"], "testbed: udpout:127.0.0.1:99999: no port number"),
         (["run", "u_turn", "--bogus"], "No such option"),
         (["run"], "Missing argument"),
