@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from testbed.control import Recorded
     from testbed.loop import Publisher, RunResult
-    from testbed.scenario import Bounds, Scenario
+    from testbed.scenario import Scenario
 
 EXIT_FAILED, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
 RUNS = Path("runs")
@@ -170,24 +170,52 @@ def run(
 
 @app.command()
 def check(
-    names: Annotated[list[str], typer.Argument(metavar="SCENARIO...", help="Scenario files or shipped names.")],
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[SCENARIO...]", help="Scenario files or shipped names; all shipped.")
+    ] = None,
+    golden: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of golden metrics; tests/golden where there is one.")
+    ] = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Write golden metrics anew where they have changed.")
+    ] = False,
+    junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Write a JUnit report too.")] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Show the metrics that are as they should be too.")
+    ] = False,
 ) -> None:
-    """Run scenarios and compare their metrics with their [expect]; exit code 1 if anything failed."""
-    loaded = {name: _load(name) for name in names}
-    for name, one in loaded.items():
-        if not one.expect:
-            raise UserError(f"{name}: has no [expect], so there is nothing to check: add it")
-    failed = False
-    for name, one in loaded.items():
-        folder = RUNS / "check" / Path(name).stem
-        with _output_folder(folder):
-            result = _fly(one, folder)
-        verdicts = judge(one.expect, result.metrics)
-        _show_verdicts(name, one.expect, result.metrics, verdicts)
-        if _lost(result) or not all(verdicts.values()):
-            failed = True
-            print(f"{name}: failed; the record is kept in {folder}")
-    if failed:
+    """Fly scenarios side by side, and hold their metrics against [expect] and golden ones; exit code 1 on failure."""
+    from testbed import check as checks
+    from testbed import progress
+    from testbed.data import write_file
+
+    if golden is not None and not golden.is_dir() and not update:
+        raise UserError(f"--golden {golden}: no such folder: make it with --update")
+    if junit is not None and not junit.parent.is_dir():
+        raise UserError(f"--junit {junit}: there is no folder {junit.parent}: make it first")
+    folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
+    if folder is None and update:
+        raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")
+    todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
+    with (
+        _output_folder(RUNS / "check"),
+        _keeping("nothing was concluded"),
+        progress.shown(_console(stderr=True), "check") as tell,
+    ):
+        outcomes = checks.fly_all(todo, tell)
+    if update and folder is not None:
+        outcomes = checks.update(outcomes, folder)
+    shown = checks.table(outcomes, verbose)
+    if shown is not None:
+        _console().print(shown)
+    for outcome in outcomes:
+        print(outcome)
+        print(outcome.failure, end="\n" if outcome.failure else "", file=sys.stderr)
+    if folder is None:
+        print(f"Only [expect] was checked: there is no {checks.GOLDEN} here. Give golden metrics with --golden DIR.")
+    if junit is not None:
+        write_file(junit, checks.junit(outcomes))
+    if any(outcome.failed for outcome in outcomes):
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -291,11 +319,6 @@ def bench() -> None:
         raise typer.Exit(EXIT_FAILED)
 
 
-def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> dict[str, bool]:
-    """Whether each expected metric is there and within its bounds. One that is missing, or NaN, is not."""
-    return {key: key in metrics and bounds.hold(metrics[key]) for key, bounds in expect.items()}
-
-
 def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:
     """The varied keys of ``key=a,b,c`` texts; commas inside brackets, braces and quotes do not separate values.
 
@@ -379,7 +402,7 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
 
 @contextmanager
 def _output_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and see that it can be written; if the work is then refused, no empty folder stays behind."""
+    """Make a folder and see that it can be written; no empty one stays behind."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -389,11 +412,10 @@ def _output_folder(folder: Path) -> Iterator[None]:
         raise UserError(f"{folder}: can't be written: {error.strerror}: choose another folder with --out") from None
     try:
         yield
-    except UserError:
+    finally:
         for path in made:
             with suppress(OSError):
                 path.rmdir()
-        raise
 
 
 @contextmanager
@@ -484,19 +506,6 @@ def _lost(result: RunResult) -> bool:
         t = column(result.dataset, "truth/time")[-1]
         print(f"testbed: the flight ended after {t:.0f} s: {result.failure}", file=sys.stderr)
     return bool(result.failure)
-
-
-def _show_verdicts(
-    name: str, expect: Mapping[str, Bounds], metrics: Mapping[str, float], verdicts: Mapping[str, bool]
-) -> None:
-    from rich.table import Table
-
-    table = Table("metric", "measured", "expected", "verdict", title=name, title_justify="left")
-    table.columns[0].no_wrap = True
-    for key, bounds in expect.items():
-        measured = f"{metrics[key]:.4g}" if key in metrics else "missing"
-        table.add_row(key, measured, str(bounds), "passed" if verdicts[key] else "[bold red]FAILED")
-    _console().print(table)
 
 
 if __name__ == "__main__":

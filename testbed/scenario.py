@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias, get_args
 from pydantic import Field, PlainValidator, PrivateAttr, ValidationError, model_validator
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
-from testbed import guidance, keypath
+from testbed import guidance, keypath, measures
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.keypath import KeyPath
@@ -514,7 +514,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         yield from _estimator_faults(("estimator", index), estimator, scenario.sensors, taken)
         taken.add(estimator.name)
     for key in scenario.expect:
-        yield from _expect_faults(key, taken)
+        yield from _expect_faults(key, taken, scenario.fault)
 
 
 def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
@@ -693,16 +693,35 @@ def _federated_faults(
         yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
 
 
-def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
+def _expect_faults(key: str, estimators: set[str], configured: Sequence[faults.Fault]) -> Iterator[tuple[KeyPath, str]]:
+    """What is wrong with the name of an expected metric: no run of the scenario could have it."""
+    path: KeyPath = ("expect", key)
     match = _EXPECT_KEY.fullmatch(key)
     if not match:
         yield (
-            ("expect", key),
+            path,
             'is no metric: write it quoted as "<estimator>.<quantity>_<statistic>_<unit>", such as'
             ' "ins.position_horizontal_rms_m" = 5.0',
         )
-    elif match["whose"] not in estimators | {"run"}:
-        yield ("expect", key), _unknown("estimator", match["whose"], sorted(estimators | {"run"}))
+        return
+    whose, metric = match["whose"], match["metric"]
+    kind, _, of = metric.partition(".")
+    if whose not in estimators | {"run"}:
+        yield path, _unknown("estimator", whose, sorted(estimators | {"run"}))
+    elif whose == "run":
+        if metric not in measures.OF_THE_MACHINE:
+            yield path, _unknown("metric of a run", metric, measures.OF_THE_MACHINE)
+    elif measures.find(metric) is None:
+        named = (
+            f"{one}.<{what}>" for what, own in (("aid", measures.OF_AIDS), ("fault", measures.OF_FAULTS)) for one in own
+        )
+        yield path, _unknown("metric", metric, [*measures.MEASURES, *named])
+    elif kind in measures.OF_FAULTS:
+        names: list[str] = []
+        for fault in configured:
+            names.append(faults.label(fault, names))
+        if of not in names:
+            yield path, _unknown("fault", of, names)
 
 
 def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:

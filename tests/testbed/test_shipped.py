@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from testbed import Scenario, run
-from testbed.__main__ import judge
 from testbed.data import data_dir
 
 SCENARIOS = sorted(path.stem for path in data_dir("scenarios").glob("*.toml"))

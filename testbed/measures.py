@@ -1,0 +1,105 @@
+"""Every metric there is: its name, which way is better, and how much it may differ from a golden value.
+
+Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.metrics`; ``run.*`` are of the machine.
+
+Tolerances. A run gives the same bits again on the same machine. On another, the last bits of sines, of exponentials
+and of matrix products differ. Measured by running all shipped scenarios with numpy, OpenBLAS, glibc and LLVM held to
+the instructions of a processor of 2008: no metric differs by more than 1e-5 of its value, as every filter forgets
+where it was. So 2 % has room for a thousand times that, and for rounding in the golden files, while filters that are
+wrong by a sign, by a latency or by a milligal differ by 5 % and more. Floors are for what is next to zero. Metrics that
+count events, or say when one was, jump by whole events if one sample lies at the edge of a gate: a few events, or looks
+of a sensor at 5 Hz, are no difference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from itertools import product
+
+SHARE = 0.02
+
+
+class Aim(Enum):
+    """Which way is better."""
+
+    LESS = "less"
+    MORE = "more"
+    ONE = "nearer to one"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """Which way a metric is better, and its tolerance: a share of the golden value, and at least ``floor``."""
+
+    aim: Aim = Aim.LESS
+    floor: float = 0.0
+    share: float = SHARE
+
+    def verdict(self, golden: float, now: float) -> str:
+        """same, better, worse, or changed where no way is better."""
+        if abs(now - golden) <= max(self.floor, self.share * abs(golden)):
+            return "same"
+        if self.aim is Aim.NONE:
+            return "changed"
+        return "better" if self._badness(now) < self._badness(golden) else "worse"
+
+    def _badness(self, value: float) -> float:
+        if self.aim is Aim.ONE:
+            return abs(math.log(max(value, 1e-12)))
+        return -value if self.aim is Aim.MORE else value
+
+
+def _statistics() -> dict[str, Measure]:
+    """The metrics that there are with GNSS and, with ``outage_`` in front, without."""
+    position, velocity, angle = (Measure(floor=floor) for floor in (2e-3, 2e-4, 2e-4))
+    of_axes = tuple(product(("north", "east", "down"), ("rms", "max", "std")))
+    found = {
+        **dict.fromkeys([f"position_{axis}_{statistic}_m" for axis, statistic in of_axes], position),
+        **dict.fromkeys([f"velocity_{axis}_{statistic}_mps" for axis, statistic in of_axes], velocity),
+        **dict.fromkeys([f"position_horizontal_{statistic}_m" for statistic in ("rms", "max")], position),
+        "position_vertical_rms_m": position,
+        **dict.fromkeys([f"velocity_{statistic}_mps" for statistic in ("rms", "max")], velocity),
+        **dict.fromkeys([f"roll_pitch_{statistic}_deg" for statistic in ("rms", "max")], angle),
+        **dict.fromkeys(
+            [f"{axis}_{one}_deg" for axis, one in product(("roll", "pitch", "heading"), ("rms", "max", "std"))], angle
+        ),
+        **dict.fromkeys(
+            [f"{what}_nees_mean" for what in ("position", "velocity", "attitude")], Measure(Aim.ONE, floor=2e-3)
+        ),
+    }
+    return found | {f"outage_{name}": measure for name, measure in found.items()}
+
+
+# By the name without estimator,
+MEASURES: dict[str, Measure] = _statistics() | {
+    **{f"outage_position_horizontal_at_{mark}s_m": Measure(floor=2e-3) for mark in (60, 120, 300, 600)},
+    "aligned_s": Measure(floor=0.5),
+    "recovery_s": Measure(floor=0.5),
+    "unrecovered_outages": Measure(share=0.0),
+    "nonfinite_samples": Measure(share=0.0),
+    "false_alarms_per_h": Measure(floor=50.0, share=0.1),
+    "false_alarms_per_look": Measure(floor=1e-3, share=0.1),
+}
+# and of those that have, after a dot, the name of an aid,
+OF_AIDS = {
+    "nis_mean": Measure(Aim.ONE, floor=2e-3),
+    "rejected_fraction": Measure(Aim.NONE, floor=2e-3, share=0.1),
+}
+# or of a fault.
+OF_FAULTS = {
+    "detection_delay_s": Measure(floor=0.5),
+    "end_lag_s": Measure(floor=0.5),
+    "coverage": Measure(Aim.MORE, floor=0.01),
+    "missed": Measure(share=0.0),
+    "isolation_correct": Measure(Aim.MORE, share=0.0),
+}
+OF_THE_MACHINE = ("wall_s", "truth_s", "realtime_factor")  # ``run.*``, never the same twice
+
+
+def find(name: str) -> Measure | None:
+    """What is to be known of a metric, given without its estimator; None when there is no such metric."""
+    kind, dot, _ = name.partition(".")
+    return (OF_AIDS | OF_FAULTS).get(kind) if dot else MEASURES.get(name)
