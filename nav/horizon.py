@@ -90,11 +90,14 @@ class FusionHorizon:
     ) -> tuple[list[UpdateReport], list[Estimate]]:
         """`push`, and the estimates at ``times`` [s] on the way, ascending, the last less than an increment ahead.
 
-        Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``.
+        Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``, and none that
+        had not arrived.
         """
         for sample in samples:
             t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
-            heapq.heappush(self._queue, (t, sample.sensor, self._count, sample))
+            known = sample.t_arrival - self.lag_s  # not before, however early it is handed over
+            turn = known if known > t + COINCIDENT else t
+            heapq.heappush(self._queue, (turn, sample.sensor, self._count, sample))
             self._count += 1
         if len(imu):
             self._append(imu)
@@ -139,9 +142,12 @@ class FusionHorizon:
             return
         horizon = self._ends[stop - 1] - (self.lag_s if self.estimator.listening else 0.0)
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
-            t, _, _, sample = heapq.heappop(self._queue)
+            turn, _, _, sample = heapq.heappop(self._queue)
             if not self.estimator.accepts(sample):
                 continue
+            t = sample.t if math.isfinite(sample.t) else turn
+            if turn > t:  # too late, wherever the blocks were cut
+                self._propagate_to(turn, reports)
             if t < self._t - COINCIDENT:
                 reports += self.estimator.refuse(sample, f"{self._t - t:.3g} s too late")
                 continue

@@ -218,17 +218,24 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         if task.golden is not None:
             rows += against_golden(task.golden, result.metrics)
         outcome = Outcome(task, rows, result.metrics, failure, time.perf_counter() - started)
-        if outcome.failed:
-            seen = visibility.table(visibility.of_run(result.dataset))
-            report.write_report(result.dataset, result.metrics, task.folder, seen)
-        else:
-            clear(task.folder)
-        return outcome
     except Exception as error:
-        failure = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-        if not isinstance(error, UserError):
-            failure += "\n" + traceback.format_exc()
-        return Outcome(task, failure=failure, wall_s=time.perf_counter() - started)
+        return Outcome(task, failure=_told(error), wall_s=time.perf_counter() - started)
+    if not outcome.failed:
+        clear(task.folder)
+        return outcome
+    try:
+        seen = visibility.table(visibility.of_run(result.dataset))
+        report.write_report(result.dataset, result.metrics, task.folder, seen)
+    except Exception as error:
+        return replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
+    return outcome
+
+
+def _told(error: Exception) -> str:
+    """What an error says; where it comes from too, unless it is a user's mistake."""
+    if isinstance(error, UserError):
+        return str(error)
+    return f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
 
 
 def clear(folder: Path) -> None:

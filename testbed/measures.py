@@ -54,7 +54,7 @@ class Measure:
 
 def _statistics() -> dict[str, Measure]:
     """The metrics that there are with GNSS and, with ``outage_`` in front, without."""
-    position, velocity, angle = (Measure(floor=floor) for floor in (2e-3, 2e-4, 2e-4))
+    position, velocity, angle = (Measure(floor=floor) for floor in (1e-4, 1e-5, 1e-5))
     of_axes = tuple(product(("north", "east", "down"), ("rms", "max", "std")))
     found = {
         **dict.fromkeys([f"position_{axis}_{statistic}_m" for axis, statistic in of_axes], position),
@@ -75,7 +75,7 @@ def _statistics() -> dict[str, Measure]:
 
 # By the name without estimator,
 MEASURES: dict[str, Measure] = _statistics() | {
-    **{f"outage_position_horizontal_at_{mark}s_m": Measure(floor=2e-3) for mark in (60, 120, 300, 600)},
+    **{f"outage_position_horizontal_at_{mark}s_m": Measure(floor=1e-4) for mark in (60, 120, 300, 600)},
     "aligned_s": Measure(floor=0.5),
     "recovery_s": Measure(floor=0.5),
     "unrecovered_outages": Measure(share=0.0),

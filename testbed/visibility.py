@@ -68,13 +68,14 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     for name, running in estimators.build(scenario, scenario.seed).items():
         ins = running.horizon.estimator
         if isinstance(ins, Ins) and name in scores.names(dataset):
-            seen = _of_ins(dataset, name, ins)
+            receiver = next((one for one in running.sensors if scenario.sensors[one].kind == "gnss"), "")
+            seen = _of_ins(dataset, name, ins, receiver)
             if seen is not None:
                 found[name] = seen
     return found
 
 
-def _of_ins(dataset: xarray.DataTree, name: str, ins: Ins) -> Visibility | None:
+def _of_ins(dataset: xarray.DataTree, name: str, ins: Ins, receiver: str) -> Visibility | None:
     e = scores.errors(dataset, name, 0.0)
     t = column(dataset, "truth/time")
     if e.aligned_s is None or t[-1] - e.aligned_s < 2 * SHORTEST_S:
@@ -104,7 +105,7 @@ def _of_ins(dataset: xarray.DataTree, name: str, ins: Ins) -> Visibility | None:
             first += size
             if isinstance(aid, GnssAid) and (denied[k] or _turns_too_fast(aid, part, omega_b[k])):
                 continue
-            sample = _sample(dataset, aid, initial, reference, float(true["airspeed"][k]))
+            sample = _sample(dataset, aid, initial, reference, float(true["airspeed"][k]), receiver)
             look = inner.look(reference, state, aid, part, sample)
             if look is not None and not look.withheld:
                 H[k, rows], variance[rows] = look.H, look.R
@@ -122,13 +123,15 @@ def _turns_too_fast(aid: GnssAid, part: str, omega_b: Array) -> bool:
     return part == "gnss_course" and aid.course is not None and abs(float(omega_b[2])) > aid.course.max_turn_rate
 
 
-def _sample(dataset: xarray.DataTree, aid: Aid, here: InitialState, reference: Reference, airspeed: float) -> Sample:
-    """What the aid's sensor would say here without error, with the accuracy that it usually reports."""
+def _sample(
+    dataset: xarray.DataTree, aid: Aid, here: InitialState, reference: Reference, airspeed: float, receiver: str
+) -> Sample:
+    """What the aid's sensor would say here without error, with the accuracy that the ``receiver`` usually reports."""
     t = here.t
     match aid:
         case GnssAid():
             position, velocity = (
-                np.nanmedian(column(dataset, f"sensors/{aid.sensor}/sigma_{what}_n"), axis=0)
+                np.nanmedian(column(dataset, f"sensors/{receiver}/sigma_{what}_n"), axis=0)
                 for what in ("position", "velocity")
             )
             return GnssSample(

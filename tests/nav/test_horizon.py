@@ -98,9 +98,21 @@ def test_a_sample_after_its_time_is_refused():
     horizon = FusionHorizon(log, lag_s=0.05)
     horizon.push(increments(30))
     assert horizon.push(part(increments(31), 30, 31), [BarometerSample(0.1, 0.31, 9e4)]) == [
-        ("barometer", "0.15 s too late")
+        ("barometer", "0.16 s too late")
     ]
     assert [name for name, _ in log.seen] == ["imu", "imu"]
+
+
+@pytest.mark.parametrize("rows", [1, 7, 30])
+def test_a_sample_handed_over_before_it_arrives_is_not_known_earlier(rows):
+    log = Logbook()
+    horizon = FusionHorizon(log, lag_s=0.05)
+    samples = [BarometerSample(0.1, 0.2, 9e4), BarometerSample(0.12, 0.17, 9e4, "punctual")]
+    reports = []
+    for k in range(0, 30, rows):
+        reports += horizon.push(part(increments(30), k, k + rows), samples if k == 0 else [])
+    assert reports[-1] == ("barometer", "0.05 s too late")
+    assert [name for name, _ in log.seen if name != "imu"] == ["punctual"]
 
 
 def test_estimate_at_knows_its_limits():
