@@ -73,7 +73,10 @@ def test_a_sensor_may_have_any_name_when_it_says_its_kind() -> None:
         ("estimator.ins.aids=[]", lambda s: s.estimator[0].aids == ()),
         ("truth.wind.turbulence=none", lambda s: s.truth.wind.turbulence == "none"),
         ("record.imu=false", lambda s: s.record.imu is False),  # the file has no [record]: the table is made
-        ('expect."ins.position_north_rms_m"={min=0.1, max=3}', lambda s: "ins.position_north_rms_m" in s.expect and s.expect["ins.position_north_rms_m"].min == 0.1),
+        (
+            'expect."ins.recovery_s"={min=0.1, max=3}',
+            lambda s: "ins.recovery_s" in s.expect and s.expect["ins.recovery_s"].min == 0.1,
+        ),
     ],
 )
 def test_override(override: str, read: Callable[[Any], bool]) -> None:

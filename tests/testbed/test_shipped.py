@@ -8,16 +8,18 @@ from pathlib import Path
 
 import pytest
 
-from testbed import Scenario, run
+from testbed import Scenario, check, measures, run
 from testbed.data import data_dir
 
 SCENARIOS = sorted(path.stem for path in data_dir("scenarios").glob("*.toml"))
 SHORT_S = 400.0
+GOLDEN = Path(__file__).parents[1] / "golden"
 
 
 def test_the_promised_scenarios_are_shipped() -> None:
     promised = {"loiter_gnss_outage", "u_turn", "survey_racetrack_wind", "jammer_zone", "static_bench"}
     promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
+    promised |= {"regression"}
     assert promised <= set(SCENARIOS)
 
 
@@ -43,21 +45,32 @@ def test_all_that_is_recorded_has_a_known_unit(name: str) -> None:
     assert not {path for path, unit in units.items() if unit and "unknown" in unit}
 
 
-def keeps_its_promises(name: str) -> None:
-    scenario = Scenario.load(name)
-    verdicts = judge(scenario.expect, run(scenario).metrics)
-    assert all(verdicts.values()), verdicts
+def passes_its_check(name: str, out: Path) -> None:
+    (task,) = check.tasks([name], out, GOLDEN)
+    assert task.golden is not None, "no golden metrics: testbed check --update"
+    outcome = check.fly(task)
+    assert not outcome.failed, "\n".join([str(outcome), *(str(row) for row in outcome.rows if not row.sound)])
 
 
 @pytest.mark.parametrize("name", [n for n in SCENARIOS if Scenario.load(n).duration_s <= SHORT_S])
-def test_short_scenario_meets_its_expectations(name: str) -> None:
-    keeps_its_promises(name)
+def test_short_scenario_passes_its_check(name: str, tmp_path: Path) -> None:
+    passes_its_check(name, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [n for n in SCENARIOS if Scenario.load(n).duration_s > SHORT_S])
-def test_long_scenario_meets_its_expectations(name: str) -> None:
-    keeps_its_promises(name)
+def test_long_scenario_passes_its_check(name: str, tmp_path: Path) -> None:
+    passes_its_check(name, tmp_path)
+
+
+def test_golden_metrics_are_of_shipped_scenarios_and_known() -> None:
+    assert {path.stem for path in GOLDEN.iterdir()} == set(SCENARIOS), "testbed check --update, or delete what is left"
+    for path in GOLDEN.iterdir():
+        golden = check.read_golden(path)
+        assert golden
+        assert path.read_text("utf-8").count("\n") == len(golden) + 2, "one metric a line"
+        assert list(golden) == sorted(golden)
+        assert {key for key in golden if measures.find(key.partition(".")[2]) is None} == set()
 
 
 @pytest.mark.slow
