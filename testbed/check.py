@@ -189,14 +189,13 @@ def against_golden(golden: Mapping[str, float], metrics: Mapping[str, float]) ->
     """Each metric beside its golden value, those of the machine left out."""
     rows = []
     for key in sorted(golden.keys() | metrics.keys()):
-        whose, _, name = key.partition(".")
-        if whose == "run":
+        if key.startswith("run."):
             continue
         before, now = golden.get(key), metrics.get(key)
         if before is None:
             rows.append(Row(key, "none", now, "new", True))
         else:
-            measure = measures.find(name) or measures.Measure(measures.Aim.NONE)
+            measure = measures.find(key) or measures.Measure(measures.Aim.NONE)
             verdict = "missing" if now is None else measure.verdict(before, now)
             rows.append(Row(key, f"{before:.4g}", now, verdict, True))
     return rows

@@ -1,12 +1,13 @@
 """Every metric there is: its name, which way is better, and how much it may differ from a golden value.
 
-Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.metrics`; ``run.*`` are of the machine.
+Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.metrics`; ``flight.*`` are of the aircraft and
+``run.*`` of the machine.
 
 Tolerances. A run gives the same bits again on the same machine. On another, the last bits of sines, of exponentials
 and of matrix products differ. Measured by running all shipped scenarios with numpy, OpenBLAS, glibc and LLVM held to
 the instructions of a processor of 2008: no metric differs by more than 1e-5 of its value, as every filter forgets
 where it was. So 2 % has room for a thousand times that, and for rounding in the golden files, while filters that are
-wrong by a sign, by a latency or by a milligal differ by 5 % and more. Floors are for what is next to zero. Metrics that
+wrong by a sign, by a latency or by a milli-g differ by 5 % and more. Floors are for what is next to zero. Metrics that
 count events, or say when one was, jump by whole events if one sample lies at the edge of a gate: a few events, or looks
 of a sensor at 5 Hz, are no difference.
 """
@@ -73,7 +74,7 @@ def _statistics() -> dict[str, Measure]:
     return found | {f"outage_{name}": measure for name, measure in found.items()}
 
 
-# By the name without estimator,
+# Of an estimator, by the name without it,
 MEASURES: dict[str, Measure] = _statistics() | {
     **{f"outage_position_horizontal_at_{mark}s_m": Measure(floor=1e-4) for mark in (60, 120, 300, 600)},
     "aligned_s": Measure(floor=0.5),
@@ -96,10 +97,34 @@ OF_FAULTS = {
     "missed": Measure(share=0.0),
     "isolation_correct": Measure(Aim.MORE, share=0.0),
 }
-OF_THE_MACHINE = ("wall_s", "truth_s", "realtime_factor")  # ``run.*``, never the same twice
+# ``flight.*``, of the aircraft,
+OF_FLIGHT = {
+    prefix + name: measure
+    for prefix in ("", "outage_", "recovery_")
+    for name, measure in {
+        "bank_max_deg": Measure(Aim.NONE),
+        "stall_margin_min_mps": Measure(Aim.MORE, floor=0.05),
+        "overspeed_margin_min_mps": Measure(Aim.MORE, floor=0.05),
+        "altitude_error_max_m": Measure(floor=1e-2),
+        "path_error_rms_m": Measure(floor=1e-2),
+        "path_error_max_m": Measure(floor=1e-2),
+    }.items()
+}
+# and ``run.*``, of the machine: never the same twice.
+OF_RUN = dict.fromkeys(("wall_s", "truth_s", "realtime_factor"), Measure(Aim.NONE))
 
 
-def find(name: str) -> Measure | None:
-    """What is to be known of a metric, given without its estimator; None when there is no such metric."""
+def find(metric: str) -> Measure | None:
+    """What is to be known of a metric; None when there is no such metric, whatever the estimator is called."""
+    whose, _, name = metric.partition(".")
+    if whose in ("flight", "run"):
+        return (OF_FLIGHT if whose == "flight" else OF_RUN).get(name)
     kind, dot, _ = name.partition(".")
     return (OF_AIDS | OF_FAULTS).get(kind) if dot else MEASURES.get(name)
+
+
+def names(whose: str) -> list[str]:
+    """The names of the metrics of an estimator, of ``flight`` or of ``run``."""
+    if whose in ("flight", "run"):
+        return list(OF_FLIGHT if whose == "flight" else OF_RUN)
+    return [*MEASURES, *(f"{kind}.<aid>" for kind in OF_AIDS), *(f"{kind}.<fault>" for kind in OF_FAULTS)]

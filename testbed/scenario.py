@@ -72,7 +72,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
 _TAG_KEYS = ("leg", "source", "kind")  # whose values tell sections of a union apart
-_RESERVED = frozenset({"run", "truth"})  # `run.wall_s` and the like would become ambiguous
+_RESERVED = frozenset({"run", "flight", "truth"})  # `run.wall_s` and the like would become ambiguous
 
 
 class Start(Section):
@@ -514,7 +514,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         yield from _estimator_faults(("estimator", index), estimator, scenario.sensors, taken)
         taken.add(estimator.name)
     for key in scenario.expect:
-        yield from _expect_faults(key, taken, scenario.fault)
+        yield from _expect_faults(key, taken)
 
 
 def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
@@ -693,7 +693,7 @@ def _federated_faults(
         yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
 
 
-def _expect_faults(key: str, estimators: set[str], configured: Sequence[faults.Fault]) -> Iterator[tuple[KeyPath, str]]:
+def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
     """What is wrong with the name of an expected metric: no run of the scenario could have it."""
     path: KeyPath = ("expect", key)
     match = _EXPECT_KEY.fullmatch(key)
@@ -705,23 +705,10 @@ def _expect_faults(key: str, estimators: set[str], configured: Sequence[faults.F
         )
         return
     whose, metric = match["whose"], match["metric"]
-    kind, _, of = metric.partition(".")
-    if whose not in estimators | {"run"}:
-        yield path, _unknown("estimator", whose, sorted(estimators | {"run"}))
-    elif whose == "run":
-        if metric not in measures.OF_THE_MACHINE:
-            yield path, _unknown("metric of a run", metric, measures.OF_THE_MACHINE)
-    elif measures.find(metric) is None:
-        named = (
-            f"{one}.<{what}>" for what, own in (("aid", measures.OF_AIDS), ("fault", measures.OF_FAULTS)) for one in own
-        )
-        yield path, _unknown("metric", metric, [*measures.MEASURES, *named])
-    elif kind in measures.OF_FAULTS:
-        names: list[str] = []
-        for fault in configured:
-            names.append(faults.label(fault, names))
-        if of not in names:
-            yield path, _unknown("fault", of, names)
+    if whose not in estimators | {"run", "flight"}:
+        yield path, _unknown("estimator", whose, sorted(estimators | {"run", "flight"}))
+    elif measures.find(key) is None:
+        yield path, _unknown("metric", metric, measures.names(whose))
 
 
 def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:

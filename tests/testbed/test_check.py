@@ -88,7 +88,7 @@ def test_a_metric_of_no_known_family_may_not_change() -> None:
 
 
 def test_tolerances_leave_no_room_for_a_tenth() -> None:
-    for name, measure in (measures.MEASURES | measures.OF_AIDS | measures.OF_FAULTS).items():
+    for name, measure in (measures.MEASURES | measures.OF_AIDS | measures.OF_FAULTS | measures.OF_FLIGHT).items():
         large = 1e4
         assert measure.verdict(large, 1.11 * large) in ("worse", "better", "changed"), name
         assert measure.verdict(large, large) == "same"

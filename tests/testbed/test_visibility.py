@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from testbed import metrics, run, visibility
+from testbed import Scenario, metrics, run, visibility
 from testbed.papers import cheng2020
 from testbed.report import write_report
 
@@ -15,6 +15,9 @@ STRAIGHT = [
     "truth.start.speed_mps=3",
     'truth.segments=[{ leg = "straight", duration_s = 1e4 }]',
 ]
+
+
+HEALTHY = ["sensors.precise.denied=[]", "sensors.plain.denied=[]"]
 
 
 def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tmp_path: Path) -> None:
@@ -40,3 +43,10 @@ def test_a_record_without_its_scenario_has_none() -> None:
     dataset.attrs["scenario"] = "title = 3"
     assert visibility.of_run(dataset) == {}
     assert visibility.table({}) == [["state"], ["rank"]]
+
+
+def test_a_receiver_may_have_any_name() -> None:
+    flown = run(Scenario.load("regression", ["duration_s=30", "fault=[]", *HEALTHY, "expect={}"])).dataset
+    found = visibility.of_run(flown)
+    assert list(found) == ["ins"]
+    assert np.isfinite(found["ins"].seen_from()[found["ins"].names.index("dv down")])
