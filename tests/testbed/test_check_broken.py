@@ -113,18 +113,20 @@ BREAKS = [
     pytest.param(noise("gnss"), "ins.nis_mean.gnss_position", id="R-x-100-gnss"),
     pytest.param(no_detector, "federated.missed.ramp", id="no-detector"),
     pytest.param(samples_as_they_arrive, "ins.position_horizontal_rms_m", id="latency-ignored"),
-    pytest.param(gravity, "ins.outage_position_horizontal_max_m", id="gravity-1-mg"),
+    pytest.param(gravity, "federated.outage_position_horizontal_max_m", id="gravity-1-mg"),
 ]
 MORE = [
     pytest.param(sign("gnss_velocity", VEL), "ins.velocity_rms_mps", id="sign-gnss-velocity"),
     pytest.param(no_lag, "ins.position_horizontal_rms_m", id="no-lag"),
-    pytest.param(sign("gnss_position", PHI), "ins.velocity_rms_mps", id="sign-lever-arm"),
+    pytest.param(sign("gnss_position", PHI), "federated.outage_position_horizontal_rms_m", id="sign-lever-arm"),
     pytest.param(sign("gnss_position", POS), "ins.position_horizontal_rms_m", id="sign-gnss-position"),
     pytest.param(sign("barometer", POS), "ins.position_vertical_rms_m", id="sign-barometer"),
-    pytest.param(sign("sideslip", PHI), "ins.heading_rms_deg", id="sign-sideslip"),
+    pytest.param(sign("sideslip", PHI), "federated.heading_rms_deg", id="sign-sideslip"),
+    pytest.param(noise("barometer"), "ins.outage_position_vertical_rms_m", id="R-x-100-barometer"),
+    pytest.param(noise("magnetometer"), "federated.nis_mean.magnetometer", id="R-x-100-magnetometer"),
     *(
         pytest.param(noise(part), f"ins.nis_mean.{part}", id=f"R-x-100-{part}")
-        for part in ("gnss_velocity", "barometer", "magnetometer", "airspeed", "sideslip")
+        for part in ("gnss_velocity", "airspeed", "sideslip")
     ),
     pytest.param(noise("", 0.01), "ins.position_nees_mean", id="R-over-100"),
 ]
