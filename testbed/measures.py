@@ -6,8 +6,8 @@ Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.metrics`; `
 Tolerances. A run gives the same bits again on the same machine. On another, the last bits of sines, of exponentials
 and of matrix products differ. Measured by running all shipped scenarios with numpy, OpenBLAS, glibc and LLVM held to
 the instructions of a processor of 2008: no metric differs by more than 1e-5 of its value, as every filter forgets
-where it was. Where the autopilot flies on an estimate, differences grow: most metrics differ by less than 1 %, the worst
-of an estimator by 2.7 %, the worst of the flight by 6 %. So the tolerance is 5 %, and 10 % of the flight's, while
+where it was. Where the autopilot flies on an estimate, differences grow: most metrics differ by less than 1 %, the
+worst of an estimator by 2.7 %, the worst of the flight by 6 %. So the tolerance is 5 %, and 10 % of the flight's, while
 filters that are wrong by a sign, by a latency or by a milli-g differ by more. Floors are for what is next to zero.
 Metrics that count events, or say when one was, jump by whole events if one sample lies at the edge of a gate: a few
 events, or looks of a sensor at 5 Hz, are no difference.
