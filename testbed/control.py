@@ -12,7 +12,7 @@ stuck         "keeps reporting the same value": stuck at the first value from no
 garbage       "reporting complete garbage": garbage
 wrong         "consistently wrong": a step of the size in `WRONG`; of an airspeed a leak in the pitot line
 slow          "reporting at slower than expected rate": one sample of `SLOW`
-delayed       "delayed in time": the values of `DELAYED_S` ago, under the time of now
+delayed       "delayed in time": the values of `DELAYED_S` ago, under the time of now; until then the first
 intermittent  "sometimes working, sometimes not": away for the first half of every `INTERMITTENT_S`
 ok            "used to reset a previous failure": ends what was injected there; scheduled faults go on
 """
