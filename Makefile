@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+CLIENTS := .venv-clients
 export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: run test test-all lint bench setup lock clean
@@ -12,7 +13,7 @@ run: $(VENV)/.ready
 test: $(VENV)/.ready
 	$(BIN)/pytest -n 2 --dist worksteal
 
-test-all: $(VENV)/.ready
+test-all: $(VENV)/.ready $(CLIENTS)/.ready
 	$(BIN)/pytest -n 2 --dist worksteal -m "slow or not slow"
 
 lint: $(VENV)/.ready
@@ -39,5 +40,12 @@ $(VENV)/.bench: $(VENV)/.ready requirements-bench.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
 	@touch $@
 
+# The ground stations that the slow tests connect, apart from the testbed's environment. Without what MAVProxy needs for
+# its windows only, hence --no-deps.
+$(CLIENTS)/.ready: requirements-clients.lock
+	$(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $<
+	@touch $@
+
 clean:
-	rm -rf $(VENV) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
