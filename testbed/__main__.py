@@ -1,4 +1,4 @@
-"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | bench``.
+"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | watch | bench``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -306,6 +306,21 @@ def papers(
     print(f"{out / library.RESULTS} and figures beside it")
     if any(claim.verdict == "missed" for own in claims.values() for claim in own):
         raise typer.Exit(EXIT_FAILED)
+
+
+@app.command()
+def watch(
+    source: Annotated[
+        str, typer.Argument(metavar="URL|RUN.tlog", help="udpin:HOST:PORT, tcp:HOST:PORT, or a telemetry log.")
+    ] = "udpin:127.0.0.1:14550",
+    speed: Annotated[float, typer.Option(metavar="FACTOR", help="How fast a log is replayed.")] = 10,
+) -> None:
+    """Watch a run in the terminal: mode, leg, errors against sigma, sensors, detections. Ctrl-C ends it."""
+    from testbed.mavlink.watch import watch as show
+
+    if not (math.isfinite(speed) and speed > 0):
+        raise UserError(f"--speed {speed:g}: the factor must be above 0, such as 10")
+    show(source, _console(), speed)
 
 
 @app.command()

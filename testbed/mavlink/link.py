@@ -92,7 +92,7 @@ def connect(url: str) -> Link | TelemetryLog:
         return Serial(url, where)
     if kind not in _KINDS:
         raise UserError(f"{url}: not a MAVLink address; use {_FORMS}")
-    return _KINDS[kind](url, _resolve(url, where))
+    return _KINDS[kind](url, resolve(url, where))
 
 
 def connect_all(urls: Sequence[str]) -> list[Link | TelemetryLog]:
@@ -108,10 +108,11 @@ def connect_all(urls: Sequence[str]) -> list[Link | TelemetryLog]:
     return [links[url] for url in urls]
 
 
-def _resolve(url: str, where: str) -> tuple[str, int]:
+def resolve(url: str, where: str, forms: str = _FORMS) -> tuple[str, int]:
+    """Address of ``host:port`` at the end of ``url``; UserError, naming the right ``forms``, when there is none."""
     host, colon, port = where.rpartition(":")
     if not colon or not port.isdecimal() or not 0 < int(port) < 2**16:
-        raise UserError(f"{url}: no port number between 1 and 65535 at its end; use {_FORMS}")
+        raise UserError(f"{url}: no port number between 1 and 65535 at its end; use {forms}")
     try:
         found = socket.getaddrinfo(host or "127.0.0.1", int(port), socket.AF_INET, socket.SOCK_STREAM)
     except (OSError, UnicodeError):
