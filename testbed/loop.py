@@ -126,6 +126,11 @@ def motion(scenario: Scenario, seed: int) -> MotionSource:
     return Kinematic(truth.start, truth.rate_hz, truth.track(), truth.body)
 
 
+def patience(rate_hz: float) -> float:
+    """After how long [s] without a sample a sensor is silent."""
+    return 1 / rate_hz + max(SILENT_S, 0.5 / rate_hz)
+
+
 @dataclass(slots=True)
 class _EventWatch:
     """Turns changes in samples, reports, estimates and legs into events."""
@@ -359,7 +364,7 @@ def _fly(
         for name, config in scenario.sensors.items():
             if not isinstance(config, ImuConfig):
                 watch.heard[name] = config.offset_s + config.latency_s
-                watch.patience[name] = 1 / config.rate_hz + max(SILENT_S, 0.5 / config.rate_hz)
+                watch.patience[name] = patience(config.rate_hz)
         director.begin(Desk(scenario, Plant(faults, aiding, filters, source)), recorder, emit, say)
         latest = _Latest()
         unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given

@@ -27,6 +27,7 @@ from nav.samples import (
     FixType,
     GnssSample,
     MagnetometerSample,
+    PositionSample,
     Sample,
     Status,
 )
@@ -122,6 +123,15 @@ class Snapshot:
         """The receiver's newest epoch if it has a fix."""
         sample = self.newest(GnssSample)
         return sample if sample and sample.fix_type != FixType.NO_FIX else None
+
+    @cached_property
+    def fixed(self) -> bool:
+        """Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer."""
+        return any(
+            isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.fix_type != FixType.NO_FIX)
+            for sample in self.samples.values()
+            if self.t - sample.t_arrival < self.silent_s[sample.sensor]
+        )
 
     def works(self, kind: type[S]) -> bool:
         """Whether the first sensor of this kind says something, and is not isolated."""
@@ -507,9 +517,12 @@ def odometry(s: Snapshot) -> Fields | None:
     }
 
 
-def _solution(status: Status) -> int:
-    """What an aligned estimator knows, in the bits that ESTIMATOR_STATUS and EKF_STATUS_REPORT have in common."""
-    if Status.ATTITUDE_ONLY in status:
+def _solution(s: Snapshot) -> int:
+    """What an aligned estimator knows, in the bits that ESTIMATOR_STATUS and EKF_STATUS_REPORT have in common.
+
+    MAVSDK has its health from the latter, so position is no longer absolute as soon as nothing fixes it.
+    """
+    if Status.ATTITUDE_ONLY in s.estimate.status:
         return int(mav.EKF_ATTITUDE)
     known: int = (
         mav.EKF_ATTITUDE
@@ -519,14 +532,15 @@ def _solution(status: Status) -> int:
         | mav.EKF_POS_VERT_ABS
         | mav.EKF_PRED_POS_HORIZ_REL
     )
-    return known if Status.DEAD_RECKONING in status else known | mav.EKF_POS_HORIZ_ABS | mav.EKF_PRED_POS_HORIZ_ABS
+    absolute: int = mav.EKF_POS_HORIZ_ABS | mav.EKF_PRED_POS_HORIZ_ABS
+    return known if Status.DEAD_RECKONING in s.estimate.status or not s.fixed else known | absolute
 
 
 def estimator_status(s: Snapshot) -> Fields:
     """What the estimator holds for known, innovations over their gates, its own sigma."""
     return {
         "time_usec": s.usec,
-        "flags": (_solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else 0)
+        "flags": (_solution(s) if Status.ALIGNED in s.estimate.status else 0)
         | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
         "vel_ratio": s.ratio("gnss_velocity"),
         "pos_horiz_ratio": s.ratio("gnss_position"),
@@ -542,7 +556,7 @@ def estimator_status(s: Snapshot) -> Fields:
 def ekf_status_report(s: Snapshot) -> Fields:
     """The same in ArduPilot's form."""
     return {
-        "flags": (_solution(s.estimate.status) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED)
+        "flags": (_solution(s) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED)
         | (mav.EKF_GPS_GLITCHING if s.doubted else 0),
         "velocity_variance": s.ratio("gnss_velocity"),  # "variance" means the same ratio, in ArduPilot's usage
         "pos_horiz_variance": s.ratio("gnss_position"),

@@ -15,6 +15,7 @@ import numpy as np
 from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, Estimate, ImuSamples, Sample, Status, UpdateReport
 from testbed.control import Request, settings
+from testbed.loop import patience
 from testbed.mavlink import messages, mission
 from testbed.mavlink.answers import Answers, Talk
 from testbed.mavlink.encode import Encoder, microseconds
@@ -31,7 +32,6 @@ from testbed.truth import TruthBlock
 HEARD_A_TURN = 4096  # bytes that are taken from each link at a time; the rest waits, or is lost
 HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s
 _TOO_SOON_S = 0.1  # after a heartbeat by the wall clock, for one by the run's
-SILENT_S, SILENT_PERIODS = 1.2, 3  # a sensor that says nothing for longer counts as failed
 REFUSED = 10  # samples of a receiver in a row, before it is held for spoofed
 MOST_VEHICLES = 254
 
@@ -72,7 +72,7 @@ class MavlinkPublisher:
         self._items = mission.items(scenario, self._identity.home_first)
         self._legs = len(self._items) - (self._identity.home_first and len(self._items) > 0)
         self._silent_s = {
-            name: max(SILENT_S, SILENT_PERIODS / config.rate_hz)
+            name: patience(config.rate_hz)
             for name, config in scenario.sensors.items()
             if not isinstance(config, ImuConfig)
         }
@@ -104,6 +104,7 @@ class MavlinkPublisher:
         self._t = -math.inf
         self._leg = -1.0
         self._home: Point | None = None
+        self._health: object = None
         self._imu_before: ImuSamples | None = None
         self._gyro: Array = np.full(3, math.nan)
         self._accel: Array = np.full(3, math.nan)
@@ -165,7 +166,7 @@ class MavlinkPublisher:
             )
             self._tell_isolations(t, snapshot.isolated)
             self._main.snapshot = snapshot
-            events = self._reached(snapshot)
+            events = [*self._reached(snapshot), *self._health_changed(snapshot)]
             self._send(t, self._due(self._encoder, self._main, snapshot, self._schedule, events))
             if self._vehicles:
                 self._send_beside(snapshot)
@@ -297,6 +298,15 @@ class MavlinkPublisher:
             return []
         number = int(before) + self._identity.home_first
         return [self._encoder.frame("MISSION_ITEM_REACHED", {"seq": number})]
+
+    def _health_changed(self, snapshot: Snapshot) -> list[bytes]:
+        """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
+        sensors, filters = messages.sys_status(snapshot), messages.ekf_status_report(snapshot)
+        before, self._health = self._health, (sensors["onboard_control_sensors_health"], filters["flags"])
+        if before in (None, self._health):
+            return []
+        self._heartbeat_at = -math.inf
+        return [self._encoder.frame("SYS_STATUS", sensors), self._encoder.frame("EKF_STATUS_REPORT", filters)]
 
     def _read_report(self, report: UpdateReport) -> None:
         ratio = float(np.float64(report.nis) / report.threshold)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from programs import ROOT, Program, free_port
+from programs import ROOT, START_S, Program, free_port
 
 CLIENTS = ROOT / ".venv-clients"
 
@@ -38,12 +41,21 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
 
 @pytest.fixture
 def fly(start: Callable[..., Program]) -> Callable[..., int]:
-    """Start a run in real time that sends to the port returned."""
+    """Start a run in real time that sends to the port returned; it has begun to."""
 
     def run(scenario: str, *arguments: str, realtime: float = 1.0) -> int:
         port = free_port()
         command = [sys.executable, "-m", "testbed", "run", scenario, "--realtime", str(realtime), "--no-report"]
-        start(*command, "--out", "run", "--mavlink", f"udpout:127.0.0.1:{port}", *arguments)
-        return port
+        flight = start(*command, "--out", "run", "--mavlink", f"udpout:127.0.0.1:{port}", *arguments)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as early:
+            early.bind(("127.0.0.1", port))
+            early.settimeout(0.2)
+            limit = time.monotonic() + START_S
+            while time.monotonic() < limit:
+                with contextlib.suppress(TimeoutError):
+                    early.recv(65535)
+                    return port
+                flight.check()
+        pytest.fail(f"the run says nothing within {START_S} s")
 
     return run

@@ -69,6 +69,12 @@ class Program:
             assert chunk, f"ended without {pattern!r}:\n{self.output[-4000:]}"
             self.output += chunk.decode(errors="replace")
 
+    def check(self) -> None:
+        """Fail the test if it has ended."""
+        if self._process.poll() is not None:
+            self.wait(5)
+            pytest.fail(f"ended:\n{self.output[-4000:]}")
+
     def wait(self, timeout_s: float) -> int:
         """Let it end by itself; its exit code."""
         self._process.wait(timeout_s)

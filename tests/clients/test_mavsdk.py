@@ -30,7 +30,7 @@ def listen(clients: Path, fly: Callable[..., int], start: Callable[..., Program]
     def session(off_s: float, ok_s: float, *arguments: str, realtime: float = 1.0) -> Session:
         port = fly("u_turn", *arguments, realtime=realtime)
         station = start(clients / "python", STATION, f"udpin://127.0.0.1:{port}", str(off_s), str(ok_s))
-        assert station.wait(START_S + 120) == 0, station.output[-4000:]
+        assert station.wait(START_S) == 0, station.output[-4000:]
         told: Session = json.loads(station.output.splitlines()[-1])
         return told
 
