@@ -1,6 +1,6 @@
 """A MAVSDK ground station: connects, asks everything, fails the GNSS and heals it, prints as JSON what it was told.
 
-Run by the Python of the clients' environment: ``mavsdk_station.py URL OFF_S OK_S``.
+Run by the Python of the clients' environment: ``mavsdk_station.py URL BEFORE_S OFF_S OK_S``.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-async def session(url: str, off_s: float, ok_s: float) -> dict[str, Any]:
+async def session(url: str, before_s: float, off_s: float, ok_s: float) -> dict[str, Any]:
     """Everything heard, by stream as [time, value], and everything asked, as time it took and answer."""
     heard: dict[str, list[Any]] = {name: [] for name in STREAMS}
     asked: dict[str, Any] = {}
@@ -82,6 +82,7 @@ async def session(url: str, off_s: float, ok_s: float) -> dict[str, Any]:
         limit = time.monotonic() + CONNECT_S
         while not (heard["health_all_ok"] and heard["health_all_ok"][-1][1]) and time.monotonic() < limit:
             await asyncio.sleep(0.1)
+        await asyncio.sleep(before_s)
         failure = FailureAsync(vehicle)
         await ask("off", failure.inject(FailureUnit.SENSOR_GPS, FailureType.OFF, 0))
         await asyncio.sleep(off_s)
@@ -95,4 +96,4 @@ async def session(url: str, off_s: float, ok_s: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    json.dump(asyncio.run(session(sys.argv[1], float(sys.argv[2]), float(sys.argv[3]))), sys.stdout)
+    print(json.dumps(asyncio.run(session(sys.argv[1], *map(float, sys.argv[2:])))))

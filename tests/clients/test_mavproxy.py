@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,6 +43,7 @@ def test_vehicle_parameters_mission_and_map(
         seen.append([int(number) for number in found.groups()])
         station.say("status SIMSTATE")
         station.expect(r"SIMSTATE \{.*lat : \d+, lng : \d+", 5)
+        time.sleep(0.5)
     (t0, lat0, lon0), (t1, lat1, lon1) = seen
     assert t1 > t0
     assert (lat0, lon0) != (lat1, lon1)
