@@ -36,12 +36,12 @@ SCRIPTS = [line[1:] for line in LINES if line[0] == "python"]
 
 def test_there_is_something_to_test() -> None:
     assert {command[0] for command in COMMANDS} == {
-        "scenarios", "run", "check", "report", "export", "campaign", "papers", "bench"
+        "scenarios", "run", "check", "report", "export", "campaign", "papers", "watch", "bench"
     }  # fmt: skip
     assert SCRIPTS
     assert blocks("toml")
     assert len(blocks("python")) == 2
-    assert all(line[0] in ("testbed", "python", "make") for line in LINES)
+    assert all(line[0] in ("testbed", "python", "make", "mavproxy.py") for line in LINES)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)

@@ -44,6 +44,7 @@ NO_OFFSET = [0.0, 0.0, 0.0, 0.0]  # ATTITUDE_QUATERNION: no other attitude for d
 
 # Blocks of an estimate's covariance.
 _POSITION, _VELOCITY, _ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
+_DOWN, _HEADING = slice(2, 3), slice(8, 9)
 _UPPER = np.flatnonzero(np.triu(np.ones((6, 6))))  # upper right triangle of 6 x 6, row by row
 _RATES = [21, 28, 35]  # the last three of its diagonal
 
@@ -171,7 +172,12 @@ class Snapshot:
         if self.euler is None:
             return {}
         turn = _floats(rotvec_from_quat(quat_multiply(self.estimate.q_nb, quat_conjugate(self.truth.q_nb[0]))))
-        of_attitude = {"err_tilt": math.degrees(math.hypot(turn[0], turn[1])), "err_head": math.degrees(turn[2])}
+        of_attitude = {
+            "err_tilt": math.degrees(math.hypot(turn[0], turn[1])),
+            "err_head": math.degrees(turn[2]),
+            "sig_tilt": math.degrees(self.sigma(_ATTITUDE, 2)),
+            "sig_head": math.degrees(self.sigma(_HEADING)),
+        }
         if self.point is None:
             return of_attitude
         north, east, down = _floats(position_difference_n(*self.point, *self.true_point))
@@ -182,6 +188,8 @@ class Snapshot:
             "err_vel": math.hypot(*speed),
             **of_attitude,
             "sig_horiz": self.sigma(_POSITION, 2),
+            "sig_down": self.sigma(_DOWN),
+            "sig_vel": self.sigma(_VELOCITY),
         }
 
     def newest(self, kind: type[S]) -> S | None:

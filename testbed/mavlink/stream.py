@@ -63,7 +63,7 @@ STREAMS = (
     Stream("AHRS3", 5, messages.ahrs3, _ATTITUDE),
     *(
         Stream("NAMED_VALUE_FLOAT", 1, partial(messages.error, name), _REST)
-        for name in ("err_horiz", "err_down", "err_vel", "err_tilt", "err_head", "sig_horiz")
+        for name in (f"{kind}_{error}" for error in ("horiz", "down", "vel", "tilt", "head") for kind in ("err", "sig"))
     ),
 )
 

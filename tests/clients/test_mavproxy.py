@@ -47,3 +47,7 @@ def test_vehicle_parameters_mission_and_map(
     (t0, lat0, lon0), (t1, lat1, lon1) = seen
     assert t1 > t0
     assert (lat0, lon0) != (lat1, lon1)
+    station.say("param set SIM_GPS1_ENABLE 0")
+    station.expect("AP: gnss silent", 3)
+    station.say("param set SIM_GPS1_ENABLE 1")
+    station.expect("AP: gnss (heard again|reacquired)", 3)

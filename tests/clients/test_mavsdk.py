@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -121,6 +122,15 @@ def test_a_client_sees_the_estimate_leave_the_truth_and_return(listen: Callable[
     assert after < 10
     seen.draw(PICTURE)
     assert 10_000 < PICTURE.stat().st_size < 150_000
+
+
+def test_program_of_the_readme(
+    clients: Path, fly: Callable[..., int], start: Callable[..., Program], tmp_path: Path
+) -> None:
+    [program] = re.findall(r"^```py\n(.*?)^```$", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    assert program.count("14540") == 1
+    (tmp_path / "program.py").write_text(program.replace("14540", str(fly("u_turn"))))
+    start(clients / "python", tmp_path / "program.py").expect("gnss (silent|denied)", 30)
 
 
 class Seen:

@@ -261,7 +261,7 @@ def test_a_station_sees_the_attitude_and_no_position(flown: Any) -> None:
     assert all(math.isnan(message.pos_horiz_accuracy) for message in heard["ESTIMATOR_STATUS"])
     assert heard["HEARTBEAT"][-1].system_status == mav.MAV_STATE_ACTIVE
     named = collections.Counter(message.name for message in heard["NAMED_VALUE_FLOAT"])
-    assert set(named) == {"err_tilt", "err_head"}
+    assert set(named) == {"err_tilt", "err_head", "sig_tilt", "sig_head"}
     assert all(abs(m.value) < 2.0 for m in heard["NAMED_VALUE_FLOAT"] if m.name == "err_tilt" and m.time_boot_ms > 6e4)
 
 

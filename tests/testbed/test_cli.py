@@ -24,7 +24,7 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 
 QUICK = ["--set", "duration_s=3", "--no-report"]
-PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "bench"}
+PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "watch", "bench"}
 
 
 class Ended:

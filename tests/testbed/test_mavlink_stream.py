@@ -199,7 +199,7 @@ def test_rates(tmp_path):
         "SIM_STATE": 1,
         "AHRS2": 5,
         "AHRS3": 5,
-        "NAMED_VALUE_FLOAT": 6,
+        "NAMED_VALUE_FLOAT": 10,
     }
     assert {name: len(messages) / seconds for name, messages in heard.items()} == expected
     # Evenly: never more than one call early or late.
@@ -328,6 +328,19 @@ def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples):
     assert heard["GNSS_INTEGRITY"].jamming_state == mav.GPS_JAMMING_STATE_DETECTED
 
 
+def test_health_is_told_as_soon_as_it_changes(tmp_path):
+    publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], SCENARIO)
+    publish(publisher, range(153))
+    publish(publisher, range(153, 154), samples=denied)  # a call at which neither message is due
+    publish(publisher, range(154, 155))
+    publisher.close()
+    told = [message for _, message in read_log(tmp_path / "run.tlog")]
+    health = [m.onboard_control_sensors_health for m in told if m.get_type() == "SYS_STATUS"][-3:]
+    assert [bool(bits & mav.MAV_SYS_STATUS_SENSOR_GPS) for bits in health] == [True, False, True]
+    flags = [m.flags for m in told if m.get_type() == "EKF_STATUS_REPORT"][-3:]  # whatever the estimator still holds
+    assert [bool(bits & mav.EKF_POS_HORIZ_ABS) for bits in flags] == [True, False, True]
+
+
 def test_dead_reckoning_drops_the_absolute_position_flag(tmp_path):
     lost = Status.ALIGNED | Status.DEAD_RECKONING
     heard = log_of(tmp_path, range(1), estimate=lambda t: estimate(t, lost))
@@ -439,6 +452,11 @@ def test_errors(tmp_path):
     assert errors["err_tilt"] == pytest.approx(2.0, abs=1e-4)
     assert errors["err_head"] == pytest.approx(1.0, abs=1e-4)
     assert errors["sig_horiz"] == pytest.approx(5.0)
+    sigma = np.sqrt(np.diag(estimate(0.0).covariance))
+    assert errors["sig_down"] == pytest.approx(sigma[2])
+    assert errors["sig_vel"] == pytest.approx(np.linalg.norm(sigma[3:6]))
+    assert errors["sig_tilt"] == pytest.approx(math.degrees(np.linalg.norm(sigma[6:8])), rel=1e-6)
+    assert errors["sig_head"] == pytest.approx(math.degrees(sigma[8]), rel=1e-6)
 
 
 def test_other_estimators(tmp_path):
