@@ -219,8 +219,13 @@ class Picture:
         return f"{mavutil.mode_string_v10(heartbeat)}, {armed}"
 
     def _progress(self) -> str:
-        current = self._latest.get("MISSION_CURRENT")
-        return self._leg or (f"{current.seq + 1}" if current else "")
+        """Number and name of the leg; the name is only told as it begins."""
+        current, heartbeat = self._latest.get("MISSION_CURRENT"), self._latest.get("HEARTBEAT")
+        if current is None or heartbeat is None or not current.total:
+            return self._leg
+        home_first = heartbeat.autopilot == mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+        number = f"{current.seq + (not home_first)}/{current.total}"
+        return self._leg if self._leg.startswith(f"{number} ") else number
 
     def _solution(self) -> str:
         status = self._latest.get("ESTIMATOR_STATUS")

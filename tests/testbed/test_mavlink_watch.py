@@ -185,6 +185,27 @@ def test_another_run_begins_anew() -> None:
     assert "77.0 m" not in picture.line()
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "seq", "said", "expected"),
+    [
+        (mav.MAV_AUTOPILOT_PX4, 1, b"leg 2/3 u_turn", "leg 2/3 u_turn"),
+        (mav.MAV_AUTOPILOT_PX4, 2, b"leg 2/3 u_turn", "leg 3/3  "),  # the newer text was lost
+        (mav.MAV_AUTOPILOT_PX4, 0, b"ins aligned", "leg 1/3  "),
+        (mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 2, b"leg 2/3 u_turn", "leg 2/3 u_turn"),  # 0 is home
+    ],
+)
+def test_leg(autopilot: int, seq: int, said: bytes, expected: str) -> None:
+    picture, vehicle = Picture(""), Vehicle()
+    for message in (
+        mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, autopilot, 149, 12, 4, 3),
+        mav.MAVLink_statustext_message(6, said),
+        mav.MAVLink_mission_current_message(seq, 3),
+        sys_status(ALL),
+    ):
+        picture.hear(vehicle.message(message), 0.0)
+    assert expected in picture.line()
+
+
 def test_other_vehicles_and_stations_are_left_out() -> None:
     picture, vehicle, other = Picture(""), Vehicle(), Vehicle(system=2)
     station = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
