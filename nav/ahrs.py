@@ -25,6 +25,7 @@ import numpy as np
 
 from nav import aiding
 from nav._jit import njit
+from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import ImuModel
 from nav.kalman import predict, update
@@ -132,13 +133,13 @@ class Ahrs:
     """Attitude filter behind the estimator protocol of `nav.horizon`; position and velocity are NaN throughout.
 
     ``field_n`` (3,) [T] is the reference magnetic field, NED; without it the magnetometer is not used. The filter
-    levels itself from the first increments, or `start` sets it at a known attitude. ``autopilot_level`` is for the host
-    to set when an autopilot knows better than the sensors that the body manoeuvres.
+    levels itself from the first increments, or `start` sets it at a known attitude. An autopilot that knows better than
+    the sensors that the body manoeuvres says so by `flight_control`.
     """
 
     def __init__(self, config: AhrsConfig, field_n: Array | None = None) -> None:
         self.config = config
-        self.autopilot_level = True
+        self._commanded = (np.empty(0), np.empty(0, bool))  # times, and whether level flight was commanded up to each
         self.t = math.nan
         self._state: _State | None = None
         self._airspeed = TrueAirspeed(config.h, config.airspeed_smoothing_s)
@@ -181,6 +182,17 @@ class Ahrs:
         state.P = self._initial_covariance()
         state.air_velocity_n = self._air_velocity_n(state, t)
         self.t = t
+
+    def flight_control(self, t: Array, level: Mask) -> None:
+        """What was commanded over the intervals that end at ``t`` (N,) [s], on from the last ones: level flight or not.
+
+        Its word is taken for periods to come, which it must hence reach before the increments do; without it, or beyond
+        its end, the sensors judge alone.
+        """
+        times, before = self._commanded
+        since = 0.0 if math.isnan(self.t) else self.t - 2 * self.config.period_s
+        kept = slice(int(np.searchsorted(times, since)), None)
+        self._commanded = (np.concatenate([times[kept], t]), np.concatenate([before[kept], level]))
 
     def propagate(self, imu: ImuSamples) -> list[UpdateReport]:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates.
@@ -327,7 +339,7 @@ class Ahrs:
         f_n, compensated = self._steady_force(s, t)
         limits = config.compensated_motion if compensated else config.motion
         omega_b = s.angle / s.elapsed[1] - s.gyro_bias
-        if not limits.judge(f_n, omega_b, self._g, self.autopilot_level).low:
+        if not limits.judge(f_n, omega_b, self._g, self._level_commanded(t - float(s.elapsed[1]), t)).low:
             s.mode_counter = s.correction_counter = 0
             return
         s.mode_counter += 1
@@ -336,6 +348,12 @@ class Ahrs:
             variance += config.airspeed_sigma**2 * float(omega_b @ omega_b)
         reports.append(_fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level"))
         self._feed_back(s)
+
+    def _level_commanded(self, start: float, end: float) -> bool:
+        """Whether nothing but level flight was commanded from ``start`` to ``end`` [s], as far as is known."""
+        times, level = self._commanded
+        first, stop = np.searchsorted(times, (start + COINCIDENT, end + COINCIDENT))
+        return bool(level[first:stop].all())
 
     def _feed_back(self, s: _State) -> None:
         """Move estimated errors into attitude and gyro bias, in small steps (equations 10, 11)."""

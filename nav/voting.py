@@ -23,9 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.detection import Mask, chi_square_threshold
 from nav.error_model import ImuModel
 from nav.samples import Array, ImuSamples
+
+MOST = np.repeat([RATE_LIMIT, FORCE_LIMIT], 3)  # what a unit could possibly report
 
 
 class Ballot(NamedTuple):
@@ -66,6 +69,9 @@ class Voter:
             self._failed = np.full(len(blocks), False)
             self._passes, self._sums = np.zeros(len(blocks)), np.zeros((len(blocks), 6))
         rows = np.stack([np.hstack([b.dtheta, b.dv]) for b in blocks])  # (units, N, 6)
+        rows = np.where(
+            np.abs(rows) <= MOST * first.dt[:, None], rows, np.nan
+        )  # of another size it is no number either
         used = np.empty(rows.shape[1:])
         ballots = []
         start = 0

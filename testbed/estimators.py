@@ -7,9 +7,10 @@ A filter knows the datasheets, never the errors that were drawn from them. Terms
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from nav.ins import Ins, InsConfig
 from nav.local_filter import Aid, BodyVelocityAid, Course, Policy, PositionFixAid, StarAid, Watched
 from nav.motion import LowDynamics
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_rotate
-from nav.samples import Array, ImuSamples, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
 from nav.unscented import Scaling
 from nav.voting import Voter
 from nav.weighting import Fading, MahalanobisInflation, SageHusa
@@ -61,6 +62,36 @@ LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizon
 IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
 GNSS_LOOKS = ("gnss_position", "gnss_velocity", "gnss_course")
 NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
+LEVEL_BANK = math.radians(5.0)  # commanded; a straight in light turbulence takes 2.5 (99 % of the time)
+
+
+class Tracked(NamedTuple):
+    """What an estimator integrated, its reports on redundant units and on samples, and its estimates."""
+
+    increments: ImuSamples
+    votes: list[UpdateReport]
+    reports: list[UpdateReport]
+    estimates: list[Estimate]
+
+
+@dataclass
+class FlightControl:
+    """Tells an AHRS when its autopilot commands level flight: no turn, no climb, no change of speed.
+
+    An autopilot knows its own commands, so they are no truth. `LEVEL_BANK` is what keeping a straight course in gusts
+    takes.
+    """
+
+    ahrs: Ahrs
+    _held: Array = field(default_factory=lambda: np.full(2, np.nan))  # last commanded altitude [m] and airspeed [m/s]
+
+    def tell(self, truth: TruthBlock) -> None:
+        """Pass on what is in effect over the intervals that end at these rows."""
+        bank, held = truth.commands[:, 0], truth.commands[:, 1:]
+        before = np.vstack([self._held, held[:-1]])
+        moved = (held != before) & ~np.isnan(before)
+        self._held = held[-1].copy()
+        self.ahrs.flight_control(truth.t, (np.abs(bank) <= LEVEL_BANK) & ~moved.any(axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +99,7 @@ class Running:
     """An estimator behind its fusion horizon: the IMUs it integrates, the sensors whose samples it is handed.
 
     ``imus`` has how each IMU is mounted, C_sb (3, 3), by name; of several the ``voter`` makes one. The estimate is of
-    the point where the first sits.
+    the point where the first sits. ``flight_control`` is for one that listens to the autopilot.
     """
 
     horizon: FusionHorizon
@@ -76,6 +107,27 @@ class Running:
     sensors: tuple[str, ...]
     handover: Handover | None = None
     voter: Voter | None = None
+    flight_control: FlightControl | None = None
+
+    def begin(self, truth: TruthBlock) -> None:
+        """Hand over the first row of ``truth`` where that is how it starts."""
+        if self.handover is not None:
+            self.handover.take_over(truth)
+
+    def track(
+        self, truth: TruthBlock, imu: Mapping[str, ImuSamples], samples: Mapping[str, Sequence[Sample]],
+        times: Sequence[float],
+    ) -> Tracked:  # fmt: skip
+        """Give it what the sensors delivered over the rows of ``truth``, of which it gets the commands alone.
+
+        ``times`` [s] are those at which estimates are wanted.
+        """
+        if self.flight_control is not None:
+            self.flight_control.tell(truth)
+        increments, votes = self.increments(imu)
+        handed = [sample for aid in self.sensors for sample in samples[aid]]
+        reports, estimates = self.horizon.track(increments, handed, times)
+        return Tracked(increments, votes, reports, estimates)
 
     @property
     def imu(self) -> str:
@@ -451,4 +503,5 @@ def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         imus,
         config.aids,
         voter=voter,
+        flight_control=FlightControl(ahrs) if config.autopilot else None,
     )

@@ -387,10 +387,33 @@ def test_the_autopilot_has_a_say():
     truth = level_flight()
     filter_ = Ahrs(PAPER)
     filter_.start(0.0, truth.q_nb[0])
-    filter_.autopilot_level = False
-    assert not filter_.propagate(cut(imu(truth, 0), slice(0, 4000)))
-    filter_.autopilot_level = True
-    assert len(filter_.propagate(cut(imu(truth, 0), slice(4000, 8000)))) > 15
+    ends = (1 + np.arange(6000)) / 200.0
+    turning = (ends > 5.0) & (ends < 15.0)
+    filter_.flight_control(ends, ~turning)  # and nothing about what comes after 30 s
+    levelled = {round(report.t) for report in filter_.propagate(cut(imu(truth, 0), slice(0, 8000)))}
+    alone = Ahrs(PAPER)
+    alone.start(0.0, truth.q_nb[0])
+    unadvised = {round(report.t) for report in alone.propagate(cut(imu(truth, 0), slice(0, 8000)))}
+    assert levelled == unadvised - {*range(6, 16)}  # periods that end at these times touch the turn
+    assert len(unadvised) - len(levelled) > 7
+
+
+def test_the_autopilots_word_counts_whatever_the_blocks():
+    truth = level_flight()
+    ends = (1 + np.arange(6000)) / 200.0
+    level = np.sin(ends) < 0.9
+    whole, pieces = Ahrs(PAPER), Ahrs(PAPER)
+    for filter_ in (whole, pieces):
+        filter_.start(0.0, truth.q_nb[0])
+    whole.flight_control(ends, level)
+    expected = [report.t for report in whole.propagate(cut(imu(truth, 0), slice(0, 6000)))]
+    found = []
+    for start in range(0, 6000, 70):
+        rows = slice(start, min(start + 70, 6000))
+        pieces.flight_control(ends[rows], level[rows])
+        found += [report.t for report in pieces.propagate(cut(imu(truth, 0), rows))]
+    assert found == expected
+    assert 10 < len(found) < 25
 
 
 def test_bias_feedback_finds_level_biases_and_leaves_the_vertical_gyro_alone():

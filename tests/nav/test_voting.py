@@ -106,6 +106,16 @@ def test_an_increment_that_is_no_number_is_left_out_at_once():
     assert ballots[-1].failed == (False, False, False)
 
 
+@pytest.mark.parametrize("value", [math.inf, -math.inf, 1e300, -1e9])
+def test_nor_is_one_that_cant_be(value):
+    _, (good, bad, other) = units(3, duration=3)
+    during = (bad.t > 1.0) & (bad.t <= 2.0)
+    spoilt = dataclasses.replace(bad, dtheta=np.where(during[:, None], value, bad.dtheta))
+    used, ballots = Voter(CONSUMER).vote([good, spoilt, other])
+    np.testing.assert_allclose(used.dtheta[during], (good.dtheta + other.dtheta)[during] / 2, rtol=1e-12)
+    assert [b.failed for b in ballots if 1.1 < b.t < 2.1] == [(False, True, False)] * 5
+
+
 def test_blocks_of_any_size_give_the_same_bits():
     _, blocks = units(3)
     blocks[1] = faulty(blocks[1], 10, 15, dv=0.5)
