@@ -24,13 +24,18 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
   while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
   ``false_alarms_per_h``: the same per hour of such time.
+* ``flight.`` is how the aircraft flew, in truth, whatever it flew on: ``bank``; ``stall_margin`` and
+  ``overspeed_margin``, equivalent airspeed above the stall at its bank and below the fastest that is flown;
+  ``altitude_error`` from the altitude commanded; ``path_error``, across the circle of loiters that have a ``centre``,
+  from where it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the first `RETURN_S` after an
+  outage.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
@@ -42,7 +47,10 @@ from nav import earth
 from nav.detection import Verdict
 from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, FixType, Status
+from testbed import guidance
 from testbed.data import write_file
+from testbed.errors import UserError
+from testbed.scenario import FlightTruth, Scenario
 from testbed.sensors.faults import FaultTruth
 
 if TYPE_CHECKING:
@@ -57,6 +65,8 @@ SAME_TIME_S = 1e-6
 SILENT = 2.5  # sample intervals without a sample, after which a receiver counts as having no fix
 SUSTAINED_S = 2.0  # for how long an alarm has to go on to be a sustained one,
 SUSTAINED_SHARE = 0.8  # and at how many of the looks
+ON_CIRCLE_M = 5.0  # as near as guidance keeps to it in light turbulence
+RETURN_S = 60.0  # after an outage, in which an aircraft that flew on its estimate flies back
 AXES = ("north", "east", "down")
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
@@ -278,6 +288,55 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
     for name in names(dataset):
         own = _estimator(dataset, name, windows, settling_s)
         result |= {f"{name}.{key}": float(value) for key, value in own.items()}
+    return result | {f"flight.{key}": float(value) for key, value in _flight(dataset, windows).items()}
+
+
+def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]:
+    """How the aircraft flew; nothing when none did, or of a record whose scenario is no longer read."""
+    try:
+        overrides = json.loads(dataset.attrs.get("overrides", "[]"))
+        scenario = Scenario.parse(str(dataset.attrs["scenario"]), overrides)
+    except (KeyError, ValueError, UserError):
+        return {}
+    if not isinstance(scenario.truth, FlightTruth):
+        return {}
+    t, bank = column(dataset, "truth/time"), np.abs(euler(column(dataset, "truth/q_nb"))[:, 0])
+    eas = column(dataset, "truth/airspeed") * np.sqrt(column(dataset, "truth/density") / earth.SEA_LEVEL_DENSITY)
+    stall = guidance.STALL_EAS / np.sqrt(np.maximum(np.cos(bank), 0.01))
+    climb_error = np.abs(column(dataset, "truth/h") - column(dataset, "truth/commands")[:, 1])
+    path_error = _path_error(dataset, scenario.plan)
+    denied = inside(t, windows)
+    returning = inside(t, [(end, end + RETURN_S) for _, end in windows]) & ~denied
+    result: dict[str, float] = {}
+    for prefix, mask in (("", ~denied & ~returning), ("outage_", denied), ("recovery_", returning)):
+        if not mask.any():
+            continue
+        result |= {
+            f"{prefix}bank_max_deg": float(np.rad2deg(bank[mask].max())),
+            f"{prefix}stall_margin_min_mps": float((eas - stall)[mask].min()),
+            f"{prefix}overspeed_margin_min_mps": float((guidance.MAX_EAS - eas)[mask].min()),
+            f"{prefix}altitude_error_max_m": float(climb_error[mask].max()),
+        }
+        on_path = path_error[mask & np.isfinite(path_error)]
+        if len(on_path):
+            result |= {f"{prefix}path_error_rms_m": _rms(on_path), f"{prefix}path_error_max_m": float(on_path.max())}
+    return result
+
+
+def _path_error(dataset: xarray.DataTree, plan: Sequence[guidance.Leg]) -> Array:
+    """Distance (N,) [m] from the circle that is being flown, NaN where there is none."""
+    leg = column(dataset, "truth/leg")
+    result = np.full(len(leg), np.nan)
+    for index, one in enumerate(plan):
+        rows = np.flatnonzero(leg == index)
+        if not isinstance(one, guidance.Loiter) or one.centre is None or not len(rows):
+            continue
+        lat, lon, h = (column(dataset, f"truth/{name}")[rows] for name in ("lat", "lon", "h"))
+        centre = np.deg2rad([one.centre.lat_deg, one.centre.lon_deg])
+        away = earth.position_difference_n(lat, lon, h, np.full(len(rows), centre[0]), np.full(len(rows), centre[1]), h)
+        error = np.abs(np.hypot(away[:, 0], away[:, 1]) - one.radius_m)
+        reached = np.logical_or.accumulate(error <= ON_CIRCLE_M)
+        result[rows[reached]] = error[reached]
     return result
 
 
