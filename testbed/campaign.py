@@ -325,12 +325,17 @@ def _require_control(source: MotionSource) -> None:
 
 
 def _same_motion(one: Scenario, other: Scenario) -> bool:
-    return (one.truth, one.plan, one.duration_s) == (other.truth, other.plan, other.duration_s)
+    return _moving(one) == _moving(other)
+
+
+def _moving(scenario: Scenario) -> tuple[object, ...]:
+    """All that the motion depends on but the seed, and what is estimated when that is fed back."""
+    return scenario.truth, scenario.plan, scenario.duration_s, scenario.autopilot
 
 
 def _seed_leaves_motion(scenario: Scenario) -> bool:
     """Whether the motion is the same for every seed: nothing estimated is fed back, and no gust follows the seed."""
-    if scenario.autopilot.feedback != "truth":
+    if scenario.autopilot.feedback.estimators:
         return False
     if not isinstance(scenario.truth, FlightTruth):
         return True

@@ -112,7 +112,7 @@ class Flight:
         self._feedback: Feedback | None = None
         self._wind_asked: tuple[float, float] | None = None  # north, east [m/s]
         alt, speed = truth.start.alt_m, truth.start.airspeed_mps
-        self._guidance = Guidance(plan, self._true_feedback(), alt, speed, self._frame / truth.rate_hz)
+        self._guidance = Guidance(plan, self.true_feedback(), alt, speed, self._frame / truth.rate_hz)
         self._commands = (0.0, alt, speed, 0.0)  # bank, altitude, airspeed, leg
 
     def advance(self, ticks: int) -> TruthBlock:
@@ -148,13 +148,17 @@ class Flight:
         north, east, _ = _v_n(speed_mps, from_deg)
         self._wind_asked = (-north, -east)
 
+    def give_up(self, why: str) -> None:
+        """End the flight here, with ``why`` for a failure."""
+        self.failure, self._ended = why, True
+
     def activity(self) -> str:
         """The leg being flown, or why the flight ended."""
         return self.failure or self._guidance.activity()
 
     def _guide(self) -> None:
         """One step of guidance, or the end of the flight."""
-        true = self._true_feedback()
+        true = self.true_feedback()
         self.failure = _loss_of_control(true)
         if self.failure:
             self._ended = True
@@ -173,7 +177,8 @@ class Flight:
         elif len(self._winds) > 1:
             self._aircraft.wind(*_wind_at(self._winds, true.h))
 
-    def _true_feedback(self) -> Feedback:
+    def true_feedback(self) -> Feedback:
+        """The true state at the newest row."""
         lat, lon, h, *v, roll, pitch, heading, p, q, r, w_north, w_east, w_down = self._row[:15]
         north, east, down = (FOOT * component for component in v)
         airspeed = math.dist((north, east, down), (FOOT * w_north, FOOT * w_east, FOOT * w_down))

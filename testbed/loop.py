@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Protocol
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
 from testbed import estimators, metrics, sensors
 from testbed.ahead import Ahead
+from testbed.autopilot import Autopilot, Steered
 from testbed.control import Desk, Director, Plant, Recorded, Request, Restarted
 from testbed.data import remove_derived
 from testbed.errors import UserError
@@ -323,11 +324,15 @@ def _fly(
         publish_every = max(1, round(min(link.period_s for link in links) * rate_hz)) if links else 0
         paced = min(publish_every or ticks, max(1, round(PACED_S * rate_hz)))
         batch = round(BATCH_S * rate_hz)
-        if source is None and not director.listens and isinstance(scenario.truth, FlightTruth) and Ahead.possible():
+        closed = bool(scenario.autopilot.feedback.estimators)  # on something else than truth
+        by_itself = isinstance(scenario.truth, FlightTruth) and not closed and not director.listens
+        if source is None and by_itself and Ahead.possible():
             source = ahead = Ahead(partial(motion, scenario, seed), rate_hz, batch, ticks)
             ending.callback(ahead.close)
         elif source is None:
             source = motion(scenario, seed)
+        if closed and not isinstance(source, Steered):
+            raise UserError("autopilot.feedback: a motion flown before can't follow an estimate")
         site = scenario.site()
         inertial: dict[str, sensors.Imu] = {}
         aiding: dict[str, sensors.AidingSensor] = {}
@@ -360,6 +365,18 @@ def _fly(
             if progress is not None:
                 progress(Progress(t, scenario.duration_s, t / (time.perf_counter() - started), text))
 
+        def sense(block: TruthBlock) -> tuple[dict[str, ImuSamples], dict[str, Sequence[Sample]]]:
+            return (
+                {name: faults.apply(name, sensor.sense(block)) for name, sensor in inertial.items()},
+                {name: faults.apply(name, sensor.sense(block)) for name, sensor in aiding.items()},
+            )
+
+        def wanted(n: int) -> list[int]:
+            """The rows of the next ``n`` at which anybody wants an estimate."""
+            every = (record_every, events_every, publish_every)
+            return sorted(set().union(*(range(-tick % one, n, one) for one in every if one)))
+
+        pilot = Autopilot(source, scenario, filters, sense) if closed and isinstance(source, Steered) else None
         watch = _EventWatch(emit, faults.truth)
         for name, config in scenario.sensors.items():
             if not isinstance(config, ImuConfig):
@@ -372,42 +389,40 @@ def _fly(
         votes: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # on redundant units, nor these
         arrived: list[Sample] = []  # nor these
         truth_s = 0.0
+        tick = 0
         # Samples come by the million, and the collector would walk all that was there before again and again.
         gc.freeze()
         ending.callback(gc.unfreeze)
-        tick = 0
         while tick < ticks and director.ready(tick):
             before = time.perf_counter()
-            turn = paced if director.pacer is not None else batch
-            block = source.advance(min(turn, ticks - tick, director.room(tick)))
-            truth_s += time.perf_counter() - before
+            turn = min(paced if director.pacer is not None else batch, ticks - tick, director.room(tick))
+            if pilot is None:
+                block, flown = source.advance(turn), None
+                truth_s += time.perf_counter() - before
+            else:
+                flown = pilot.advance(turn, wanted(turn))
+                block, truth_s = flown.block, pilot.truth_s
             if not len(block):
                 break
             if tick == 0 and out is not None:  # from here on what an earlier run left there would not fit the record
                 remove_derived(out)
-            if tick == 0:
-                for one in filters.values():
-                    if one.handover is not None:
-                        one.handover.take_over(block)
-            imu = {name: faults.apply(name, sensor.sense(block)) for name, sensor in inertial.items()}
-            samples = {name: faults.apply(name, sensor.sense(block)) for name, sensor in aiding.items()}
+            imu, samples = sense(block) if flown is None else (flown.imu, flown.samples)
             for own in samples.values():
                 latest.add(own)
-            rows = (
-                range(-tick % every, len(block), every)
-                for every in (record_every, events_every, publish_every)
-                if every
-            )
-            outputs = sorted(set().union(*rows))
+            outputs = wanted(len(block))
             times = [float(block.t[k]) for k in outputs]
             estimates: dict[str, list[Estimate]] = {}
             integrated: dict[str, ImuSamples] = {}
             for name, one in filters.items():
-                handed = [sample for aid in one.sensors for sample in samples[aid]]
-                integrated[name], parity = one.increments(imu)
+                if flown is not None and name in flown.tracked:
+                    tracked = flown.tracked[name]
+                else:
+                    if tick == 0:
+                        one.begin(block)
+                    tracked = one.track(block, imu, samples, times)
+                integrated[name], parity, reports, estimates[name] = tracked
                 recorder.reports(name, parity)
                 votes[name].extend(parity)
-                reports, estimates[name] = one.horizon.track(integrated[name], handed, times)
                 recorder.reports(name, reports)
                 unread[name].extend(reports)
                 if links and name == shown:
@@ -423,6 +438,9 @@ def _fly(
                 arrived += latest.until(times[i])
                 now = [(name, values[i]) for name, values in estimates.items()]
                 if (tick + k) % events_every == 0:
+                    if pilot is not None:
+                        for event in pilot.take_events(times[i]):
+                            emit(*event)
                     for sample in arrived:
                         watch.sample(sample)
                     arrived.clear()
@@ -450,6 +468,12 @@ def _fly(
                 progress(Progress(t, scenario.duration_s, factor, activity))
         end = (tick - 1) / rate_hz
         remarks = []
+        if pilot is not None:
+            for event in pilot.take_events():
+                emit(*event)
+            if not pilot.closed:
+                remarks.append("the autopilot flew on truth to the end: what it was to fly on was never ready")
+                emit(end, "warning", remarks[-1])
         if source.failure:
             emit(end, "error", source.failure)
         elif director.ended:

@@ -63,7 +63,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
         ),
         ("federated",),
     ),
-    **dict.fromkeys(("heading_deg", "levelling", "level"), ("ahrs",)),
+    **dict.fromkeys(("heading_deg", "levelling", "level", "autopilot"), ("ahrs",)),
     **dict.fromkeys(("handover", "nonholonomic_mps"), ("ins", "federated")),
     **dict.fromkeys(("engine", "course", "sage_husa", "fading", "false_rejection"), ("ins",)),
     "literal": ("federated", "ahrs"),
@@ -271,6 +271,7 @@ class EstimatorConfig(Section):
     heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
     levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
     level: LevelConfig | None = Field(default=None, description="how an AHRS levels; none: as light turbulence wants")
+    autopilot: bool = Field(default=False, description="true: an AHRS levels only while level flight is commanded")
     locals: tuple[LocalConfig, ...] = ()
     structure: Literal["no_reset", "full_reset", "partial"] = "no_reset"
     sharing: Literal["fixed", "by_covariance", "none"] = "fixed"
@@ -305,10 +306,31 @@ class EstimatorConfig(Section):
         return self.kind == "ahrs"
 
 
-class AutopilotConfig(Section):
-    """What the autopilot flies on."""
+class FeedbackConfig(Section):
+    """Whose attitude and whose position: an estimator's name, or ``truth``. In the file one name may stand for both."""
 
-    feedback: Literal["truth"] = "truth"
+    attitude: str = "truth"
+    position: str = "truth"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_for_both(cls, value: Any) -> Any:
+        if not isinstance(value, str | dict):
+            raise ValueError(
+                'must be an estimator\'s name, or a table of attitude and position; "truth" is one as well'
+            )
+        return {"attitude": value, "position": value} if isinstance(value, str) else value
+
+    @property
+    def estimators(self) -> tuple[str, ...]:
+        """The estimators that are flown on, each once."""
+        return tuple(dict.fromkeys(name for name in (self.attitude, self.position) if name != "truth"))
+
+
+class AutopilotConfig(Section):
+    """What the autopilot flies on: ``testbed.autopilot`` says what comes from where."""
+
+    feedback: FeedbackConfig = FeedbackConfig()
 
 
 class RecordConfig(Section):
@@ -513,6 +535,7 @@ def _inconsistencies(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     for index, estimator in enumerate(scenario.estimator):
         yield from _estimator_faults(("estimator", index), estimator, scenario.sensors, taken)
         taken.add(estimator.name)
+    yield from _autopilot_faults(scenario)
     for key in scenario.expect:
         yield from _expect_faults(key, taken)
 
@@ -691,6 +714,40 @@ def _federated_faults(
         yield (*path, "cross_check"), text
     if config.combination != "information" and config.sharing != "none":
         yield (*path, "sharing"), f'combination {config.combination!r} needs no shares: set sharing = "none"'
+
+
+def _autopilot_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    path: KeyPath = ("autopilot", "feedback")
+    feedback = scenario.autopilot.feedback
+    flown = isinstance(scenario.truth, FlightTruth)
+    for index, config in enumerate(scenario.estimator):
+        if config.autopilot and not flown:
+            yield (
+                ("estimator", index, "autopilot"),
+                f"a body of source {scenario.truth.source!r} has none: leave it out",
+            )
+    if not feedback.estimators:
+        return
+    if not flown:
+        text = f"a body of source {scenario.truth.source!r} has no autopilot that could follow: leave it out"
+        yield path, text
+        return
+    known = {config.name: config for config in scenario.estimator}
+    groups = [((*path, key), getattr(feedback, key)) for key in ("attitude", "position")]
+    if feedback.attitude == feedback.position:
+        groups = [(path, feedback.attitude)]
+    for where, name in groups:
+        if name != "truth" and name not in known:
+            yield where, _unknown("estimator", name, [*known, "truth"])
+    kinds = {section.kind for section in scenario.sensors.values()}
+    if feedback.position not in known:
+        return
+    where = groups[-1][0]
+    if "airspeed" not in kinds:
+        yield where, "flying on an estimate takes an airspeed sensor: add [sensors.airspeed]"
+    if known[feedback.position].attitude_only and "barometer" not in kinds:
+        text = f"{feedback.position!r} estimates attitude alone, and height must come from a barometer"
+        yield where, f"{text}: add [sensors.barometer], or take the position of another estimator"
 
 
 def _expect_faults(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
