@@ -134,9 +134,25 @@ def line_of(text: str, start: str) -> int:
         ("[expect]", '[expect]\n"ins.x_m" = {min = 2, max = 1}', 'expect."ins.x_m": min 2 is above max 1'),
         (
             "[expect]",
-            '[autopilot]\nfeedback = "ins"\n[expect]',
-            'autopilot.feedback: can\'t be "ins": choose from truth',
+            '[autopilot]\nfeedback = "inz"\n[expect]',
+            'autopilot.feedback: there is no estimator "inz": did you mean ins? Choose from ins, truth',
         ),
+        (
+            "[expect]",
+            '[autopilot]\nfeedback = { attitude = "ins", position = "gps" }\n[expect]',
+            'autopilot.feedback.position: there is no estimator "gps": choose from ins, truth',
+        ),
+        (
+            "[expect]",
+            '[autopilot]\nfeedback = { altitude = "ins" }\n[expect]',
+            "autopilot.feedback.altitude: unknown key: did you mean attitude? Choose from attitude, position",
+        ),
+        (
+            "[expect]",
+            "[autopilot]\nfeedback = 3\n[expect]",
+            "autopilot.feedback: must be an estimator's name, or a table of",
+        ),
+        ("[expect]", '[expect]\n"flights.bank_max_deg" = 3', 'there is no estimator "flights": did you mean flight?'),
         (
             "[expect]",
             "[record]\nrate_hz = 30\n[expect]",
@@ -421,7 +437,7 @@ def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
 
 def test_names_that_are_not_shipped() -> None:
     assert load_complaint("uturn").endswith("did you mean u_turn?")
-    assert "shipped are jammer_zone, kinematic_u_flight, loiter_ahrs_continuous" in load_complaint("zzz")
+    assert "shipped are closed_loop_ahrs_only, closed_loop_gnss_outage, closed_loop_" in load_complaint("zzz")
 
 
 # --- whatever comes

@@ -171,6 +171,7 @@ def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
         (["truth.wind.turbulence=none"], True),
         ([], False),
         (["truth.wind.turbulence_seed=3"], True),
+        (["truth.wind.turbulence=none", "autopilot.feedback=ins"], False),
     ],
 )
 def test_truth_is_shared_when_the_seed_does_not_move_it(overrides: list[str], shared: bool) -> None:
@@ -181,6 +182,8 @@ def test_truth_is_not_shared_when_it_is_varied(at_rest: Path) -> None:
     here, there = (Scenario.load(at_rest, [f"truth.start.alt_m={alt}"]) for alt in (500, 600))
     assert campaigns._same_motion(here, Scenario.load(at_rest, ["sensors.gnss.rate_hz=1"]))
     assert not campaigns._same_motion(here, there)
+    on_truth, on_estimate = (Scenario.load("u_turn", [f"autopilot.feedback={name}"]) for name in ("truth", "ins"))
+    assert not campaigns._same_motion(on_truth, on_estimate)
 
 
 # --- the same numbers, however flown
