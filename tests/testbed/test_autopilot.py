@@ -17,6 +17,7 @@ from nav.samples import AirspeedSample, BarometerSample, Estimate, UpdateReport
 from testbed import RunResult, Scenario, autopilot, loop, run
 from testbed.__main__ import judge
 from testbed.autopilot import HOLD_S, AirData, DeadReckoning
+from testbed.control import Clear, Inject, Recorded
 from testbed.errors import UserError
 from testbed.flight import Flight
 from testbed.guidance import Feedback
@@ -77,12 +78,14 @@ def test_on_perfect_sensors_it_flies_as_on_truth() -> None:
 
 @pytest.mark.parametrize("batch_s", [0.065, 7.0])
 def test_the_result_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch, batch_s: float) -> None:
-    fault = "fault=[{sensor='airspeed',channel='speed',kind='step',size=-8,window=[12,18]}]"
-    overrides = [*SHORT, "sensors.gnss.latency_s=0.13", "sensors.gnss.denied=[[14, 17]]", fault]
-    reference = closed(overrides)
+    """Requests cut frames, too: here after three of four ticks, and after two."""
+    overrides = [*SHORT, "sensors.gnss.latency_s=0.13", "sensors.gnss.denied=[[14, 17]]"]
+    low = Inject({"sensor": "airspeed", "channel": "speed", "kind": "step", "size": -8.0})
+    asked: list[tuple[float, Recorded]] = [(12.015, low), (18.01, Clear("airspeed"))]
+    reference = closed(overrides, replay=asked)
     assert any("ground velocity less wind" in text for _, text in events(reference))
     monkeypatch.setattr(loop, "BATCH_S", batch_s)
-    assert same(reference.dataset, closed(overrides).dataset)
+    assert same(reference.dataset, closed(overrides, replay=asked).dataset)
 
 
 def test_live_and_batch_give_the_same_bits() -> None:
