@@ -226,10 +226,14 @@ def test_endless_input_is_taken_a_little_at_a_time():
 
 
 def flown(urls, **options):
-    """Bits of a short run, with links or without."""
+    """Digest of a short run, with links or without."""
     scenario = Scenario.load("u_turn", ["duration_s=8"])
     links = [MavlinkPublisher(urls, scenario, **options)] if urls else []
-    dataset = run(scenario, links=links, realtime=10.0 if urls else None).dataset
+    return bits(run(scenario, links=links, realtime=10.0 if urls else None).dataset)
+
+
+def bits(dataset):
+    """A digest of all that was computed."""
     digest = hashlib.sha256()
     for group in sorted(dataset.groups):
         if group == "/" or group.startswith("/requests"):
@@ -297,6 +301,37 @@ def test_a_million_hostile_frames(readonly):
     assert (asked == 0) == readonly
     assert listener.frames > 200_000
     publisher.close()
+
+
+@pytest.mark.slow
+def test_a_million_hostile_frames_into_a_run_change_none_of_its_bits():
+    scenario = Scenario.load("u_turn", ["duration_s=8"])
+    publisher = MavlinkPublisher([], scenario, readonly=True)
+    fire = _Fire(random.Random(4))
+    publisher._links.append(fire)
+    begun = time.perf_counter()
+    under_fire = bits(run(scenario, links=[publisher], realtime=1000.0).dataset)
+    assert time.perf_counter() - begun < 300.0
+    assert fire.shots >= 1_000_000
+    assert fire.stations[0].frames > 100_000  # it was answered, too
+    assert under_fire == flown([])
+
+
+class _Fire:
+    """A link on which one station says thousands of hostile datagrams a turn."""
+
+    def __init__(self, rng):
+        self.stations = [_Deaf()]
+        self.shots = 0
+        self._rng = rng
+        self._pool = [hostile_bytes(rng) for _ in range(50_000)]
+
+    def receive(self, budget):
+        self.shots += 5000
+        return [(self.stations[0], data) for data in self._rng.choices(self._pool, k=5000)]
+
+    def close(self):
+        pass
 
 
 class _Deaf:
