@@ -241,7 +241,7 @@ def _figure(
     figure = Figure(figsize=(10.5, tall), dpi=100)
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=rows > 1)
-    figure.subplots_adjust(0.085, 0.55 / tall, 0.99, 1 - head / tall, wspace=0.2, hspace=gap / height)
+    figure.subplots_adjust(0.085, 0.55 / tall, 0.975, 1 - head / tall, wspace=0.2, hspace=gap / height)
     return figure, axes
 
 
