@@ -120,6 +120,8 @@ class Reference:
             np.zeros((MOTION, n)),
         )
         self.share_noise(shares)
+        # The longest kernel is loaded here, or compiled, and not when samples wait for it.
+        self._propagate(State(self.common, filters, n), NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES)
 
     def share_noise(self, shares: Sequence[float] | Array) -> None:
         """New shares of the noise of the common states."""
@@ -155,11 +157,8 @@ class Reference:
             # the kernel takes linear steps only: sigma points stop it before one is due
             stop = len(imu) if self.scaling is None else first + max(1, period - int(s.elapsed[1]))
             part = slice(first, stop)
-            bad = _propagate(
-                s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
-                self.driven, self._decay_rate, self._variance_rate, *self._scratch,
-                period if self.scaling is None else NEVER, imu.dtheta[part], imu.dv[part], imu.dt[part], False,
-            )  # fmt: skip
+            every = period if self.scaling is None else NEVER
+            bad = self._propagate(s, every, imu.dtheta[part], imu.dv[part], imu.dt[part])
             if bad >= 0:
                 last_bad = float(imu.t[first + bad])
             if self.scaling is not None and s.elapsed[1] >= period:
@@ -176,11 +175,14 @@ class Reference:
                 self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
         elif s.elapsed[0] > 0:
-            _propagate(
-                s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
-                self.driven, self._decay_rate, self._variance_rate, *self._scratch,
-                NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES, True,
-            )  # fmt: skip
+            self._propagate(s, NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES, settle=True)
+
+    def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
+        """See the kernel."""
+        return _propagate(
+            s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
+            self.driven, self._decay_rate, self._variance_rate, *self._scratch, period, dtheta, dv, dt, settle,
+        )  # fmt: skip
 
     def correct(self, state: State, correction: Array) -> None:
         """Put a correction (common,) of the common states into the nominal ones and take it from every filter's."""
