@@ -322,22 +322,24 @@ class DeadReckoning:
         self._lat, self._lon, self._h, self._climb = start.lat, start.lon, start.h, -start.v_down
         self._setting = start.h - altimeter
         self._t = self._seen = math.nan  # now, and when the newest pressure was true
+        self._a = 0.0  # upwards [m/s^2], as it was last
 
     def advance(
         self, t: float, airspeed: float, heading: float, rising: float, air: AirData
     ) -> tuple[float, float, float, tuple[float, float, float]]:
         """Go on to ``t``: latitude, longitude [rad], height [m], velocity NED [m/s]. Height is NaN without pressure.
 
-        ``airspeed`` [m/s] is true, ``rising`` specific force upwards [m/s^2], NaN when there is no new one. Without a
-        heading it stays where it is, and knows nothing.
+        ``airspeed`` [m/s] is true, ``rising`` specific force upwards [m/s^2], NaN when there is no new one: then it is
+        as it was, as with an IMU slower than the frames. Without a heading it stays where it is, and knows nothing.
         """
         if not math.isfinite(heading):
             return math.nan, math.nan, math.nan, (math.nan, math.nan, math.nan)
         T = 0.0 if math.isnan(self._t) else t - self._t
         self._t = t
-        a = rising - gravity(self._lat, self._h) if math.isfinite(rising) else 0.0
-        self._h += (self._climb + 0.5 * a * T) * T
-        self._climb += a * T
+        if math.isfinite(rising):
+            self._a = rising - gravity(self._lat, self._h)
+        self._h += (self._climb + 0.5 * self._a * T) * T
+        self._climb += self._a * T
         if air.altitude_t != self._seen:
             dt = 0.0 if math.isnan(self._seen) else min(air.altitude_t - self._seen, LONGEST_LOOK_S)
             age = t - air.altitude_t

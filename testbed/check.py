@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from testbed.progress import Tell
 
 GOLDEN = Path("tests/golden")  # of a checkout; they are not shipped
+_ANEW = "delete it, and make it again with `testbed check --update`"
 DIGITS = 4  # of a golden metric; tolerances are a hundred times that
 QUIET = ("kept", "same")  # the verdicts that nobody has to read
 SOUND = (*QUIET, "better", "updated")  # and all that are no failure
@@ -141,9 +142,10 @@ def read_golden(path: Path) -> dict[str, float] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise UserError(f"{path}: {error}: make it again with `testbed check --update`") from None
-    if not isinstance(found, dict) or not all(type(value) in (int, float) for value in found.values()):
-        raise UserError(f"{path}: is no table of metrics: make it again with `testbed check --update`")
+        raise UserError(f"{path}: {error}: {_ANEW}") from None
+    numbers = found.values() if isinstance(found, dict) else [None]
+    if not all(type(value) in (int, float) and math.isfinite(value) for value in numbers):
+        raise UserError(f"{path}: is no table of metrics: {_ANEW}")
     return found
 
 
