@@ -193,6 +193,8 @@ def check(
         raise UserError(f"--golden {golden}: no such folder: make it with --update")
     if junit is not None and not junit.parent.is_dir():
         raise UserError(f"--junit {junit}: there is no folder {junit.parent}: make it first")
+    if junit is not None and junit.is_dir():
+        raise UserError(f"--junit {junit}: is a folder: name the file in it")
     folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
     if folder is None and update:
         raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")

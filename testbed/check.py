@@ -211,7 +211,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
     started = time.perf_counter()
     try:
         result = loop.run(task.scenario, out=task.folder, progress=lambda now: tell(now.t / now.duration))
-        failure = ""
+        failure = loop.NEVER_CLOSED if loop.NEVER_CLOSED in result.remarks else ""
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
             failure = f"the flight ended after {t:.0f} s: {result.failure}"

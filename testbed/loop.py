@@ -40,6 +40,7 @@ SILENT_S = 0.5  # beyond its period, or half of it if that is longer, before a s
 REFUSALS = 10  # of an aid in a row, before it is worth an event
 REHEARSAL_S = 5.0  # that an estimator aligns in
 LARGEST_SEED = 2**63 - 1
+NEVER_CLOSED = "the autopilot flew on truth to the end: what it was to fly on was never ready"
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
 
 
@@ -472,7 +473,7 @@ def _fly(
             for event in pilot.take_events():
                 emit(*event)
             if not pilot.closed:
-                remarks.append("the autopilot flew on truth to the end: what it was to fly on was never ready")
+                remarks.append(NEVER_CLOSED)
                 emit(end, "warning", remarks[-1])
         if source.failure:
             emit(end, "error", source.failure)

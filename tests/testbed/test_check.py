@@ -139,7 +139,9 @@ def test_an_update_leaves_out_what_failed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "[1]", '{"a": "b"}', '{"a": NaN}', '{"a": 1e999}', '{"a": true}'])
 def test_a_damaged_golden_file_is_a_mistake(tmp_path: Path, text: str) -> None:
     (tmp_path / "static_bench.json").write_text(text)
-    with pytest.raises(UserError, match=r"static_bench\.json: .*delete it, and make it again with `testbed check --update`"):
+    with pytest.raises(
+        UserError, match=r"static_bench\.json: .*delete it, and make it again with `testbed check --update`"
+    ):
         check.tasks(["static_bench"], tmp_path, tmp_path)
 
 
@@ -189,7 +191,7 @@ def test_an_error_is_a_failure_of_the_scenario(
 
 def test_a_lost_flight_fails_though_all_bounds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     truth = {"truth/time": SimpleNamespace(values=[0.0, 12.0])}
-    lost = SimpleNamespace(metrics={}, failure="control lost: bank 80 deg", dataset=truth)
+    lost = SimpleNamespace(metrics={}, failure="control lost: bank 80 deg", dataset=truth, remarks=())
     monkeypatch.setattr(loop, "run", lambda *_, **__: lost)
     monkeypatch.setattr(report, "write_report", lambda *_: None)
     monkeypatch.setattr(visibility, "of_run", lambda _: {})
@@ -197,6 +199,21 @@ def test_a_lost_flight_fails_though_all_bounds_are_kept(tmp_path: Path, monkeypa
     outcome = check.fly(Task("mine", loaded, tmp_path, {}))
     assert outcome.failure == "the flight ended after 12 s: control lost: bank 80 deg"
     assert outcome.failed
+
+
+def test_a_loop_that_never_closes_fails_though_all_bounds_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How well the aircraft flew on truth is no answer."""
+    monkeypatch.setattr(report, "write_report", lambda *_: None)
+    silent = "fault=[{sensor='barometer',kind='dropout',window=[0,10]}]"
+    bound = 'expect={"flight.bank_max_deg" = 45}'
+    for fault in ("fault=[]", silent):
+        loaded = Scenario.load("closed_loop_ahrs_only", ["duration_s=10", fault, bound])
+        outcome = check.fly(Task("mine", loaded, tmp_path, None))
+        assert [row.verdict for row in outcome.rows] == ["kept"]
+        assert outcome.failed == (fault == silent)
+        assert outcome.failure == (loop.NEVER_CLOSED if fault == silent else "")
 
 
 def test_a_report_that_fails_hides_no_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,6 +326,16 @@ def test_an_interrupt_leaves_no_process_and_no_file(tmp_path: Path) -> None:
 
 
 # --- JUnit
+
+
+def test_a_junit_file_that_cant_be_is_told_before_the_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(check, "fly_all", lambda *_: pytest.fail("flown"))
+    for place, why in ((tmp_path, "is a folder"), (tmp_path / "no" / "check.xml", "there is no folder")):
+        told = command("static_bench", "--junit", place, monkeypatch=monkeypatch, capsys=capsys)
+        assert told.code == 2
+        assert f"--junit {place}: {why}" in told.err
 
 
 def valid(root: ElementTree.Element) -> None:
