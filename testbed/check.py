@@ -143,8 +143,9 @@ def read_golden(path: Path) -> dict[str, float] | None:
         return None
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: {error}: {_ANEW}") from None
-    numbers = found.values() if isinstance(found, dict) else [None]
-    if not all(type(value) in (int, float) and math.isfinite(value) for value in numbers):
+    if not isinstance(found, dict) or not all(
+        type(value) in (int, float) and math.isfinite(value) for value in found.values()
+    ):
         raise UserError(f"{path}: is no table of metrics: {_ANEW}")
     return found
 
