@@ -28,6 +28,9 @@ PSF = 47.88025898  # one pound-force per square foot [Pa]
 RANKINE = 5 / 9  # [K]
 
 GUIDANCE_HZ = 10.0
+# One for all threads and for good: JSBSim lets go of a thread's logger as the thread ends, without Python's lock, which
+# is the end of the process when nobody else holds it.
+LOGGER = jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR)
 WIND_CHANGE_S = 5.0  # time constant of a change of wind in flight, as in ArduPilot's simulation (SIM_WIND_TC)
 SETTLING_S = 90.0  # of straight and level flight before the run starts
 
@@ -223,7 +226,7 @@ class Aircraft:
     """A JSBSim model with its property nodes held; SI at every method."""
 
     def __init__(self, name: str, rate_hz: float) -> None:
-        jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))  # per thread; no banner
+        jsbsim.set_logger(LOGGER)  # per thread; no banner
         folder = data_dir("aircraft")
         self.fdm = jsbsim.FGFDMExec(str(folder))
         self.fdm.set_debug_level(0)

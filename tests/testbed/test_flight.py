@@ -6,10 +6,12 @@ import hashlib
 import math
 import subprocess
 import sys
+import threading
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+import jsbsim
 import numpy as np
 import pymap3d
 import pytest
@@ -19,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import testbed
 from nav import earth, strapdown
 from testbed.data import data_dir
-from testbed.flight import Flight
+from testbed.flight import LOGGER, Aircraft, Flight
 from testbed.guidance import Feedback, Leg, check_plan
 from testbed.scenario import FlightTruth
 from testbed.truth import COLUMNS, TruthBlock
@@ -407,3 +409,17 @@ def test_specific_force_is_not_taken_from_the_simulator() -> None:
     sources = [*Path(testbed.__file__).parent.rglob("*.py"), *data_dir("aircraft").rglob("*.xml")]
     assert len(sources) > 20
     assert not [path.name for path in sources if "a-pilot" in path.read_text(encoding="utf-8")]
+
+
+def test_a_thread_that_ends_is_never_the_last_to_hold_its_logger() -> None:
+    """JSBSim drops a thread's logger without Python's lock: freeing it there crashes the process now and then."""
+    held: list[object] = []
+
+    def fly() -> None:
+        Aircraft("loiter", 200.0)
+        held.append(jsbsim.get_logger() is LOGGER)
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    thread.join()
+    assert held == [True]
