@@ -377,7 +377,7 @@ class _Timed:
     """A publisher, and the processor time that it takes."""
 
     def __init__(self, publisher: loop.Publisher) -> None:
-        self.period_s = publisher.period_s
+        self.period_s, self.asks = publisher.period_s, publisher.asks
         self.seconds = 0.0
         self.publish = self._timed(publisher.publish)
         self.requests = self._timed(publisher.requests)

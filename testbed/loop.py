@@ -70,9 +70,13 @@ class RunResult:
 
 
 class Publisher(Protocol):
-    """Whoever watches a run: handed plain data every ``period_s`` of simulated time, and may ask for something."""
+    """Whoever watches a run: handed plain data every ``period_s`` of simulated time.
+
+    ``asks`` says whether it may ever ask for something; without, `requests` is not called.
+    """
 
     period_s: float
+    asks: bool
 
     def publish(
         self,
@@ -284,7 +288,7 @@ def run(
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
-        asking = (*(link.requests for link in links), *controls)
+        asking = (*(link.requests for link in links if link.asks), *controls)
         director = Director(scenario, asking, replay, realtime, rate_hz, source is None)
         if (
             realtime is not None and source is None

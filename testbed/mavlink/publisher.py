@@ -98,6 +98,7 @@ class MavlinkPublisher:
                 self._logs.append(link)
             else:
                 self._links.append(link)
+        self.asks = bool(self._links)
 
     def _begin(self) -> None:
         """Forget what was of a run, for another to begin."""

@@ -58,6 +58,8 @@ def healthy_run(seconds: float, *more: str) -> Any:
 class Station:
     """A link that asks for what its script says, each as soon as it has been shown a row of that time or later."""
 
+    asks = True
+
     def __init__(self, script: Sequence[tuple[float, Request]], period_s: float = 0.04) -> None:
         self.script = list(script)
         self.period_s = period_s

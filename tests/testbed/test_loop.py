@@ -25,6 +25,7 @@ class Watcher:
     """A link that keeps what it is handed."""
 
     period_s = 0.04
+    asks = False
 
     def __init__(self) -> None:
         self.rows: list[float] = []

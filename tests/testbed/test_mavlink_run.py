@@ -11,7 +11,7 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mav
 from scipy.spatial.transform import Rotation
 
-from testbed import Scenario, run
+from testbed import Scenario, loop, run
 from testbed.mavlink import MavlinkPublisher
 
 SECONDS = 12
@@ -179,3 +179,24 @@ def test_station_breaks_the_receiver_and_heals_it(tmp_path, monkeypatch):
     assert all(healthy for t, healthy in health if t > ok + 2.0)
     assert len([t for t, _ in health if t > ok + 2.0]) > 1
     assert dataset["requests"]["kind"].values.astype(str).tolist() == ["inject", "clear"]
+
+
+@pytest.mark.parametrize("listening", [False, True])
+def test_only_what_may_ask_keeps_the_run_from_flying_ahead(listening, monkeypatch, tmp_path):
+    ahead = []
+
+    class Counted(loop.Ahead):
+        def __init__(self, *arguments):
+            ahead.append(self)
+            super().__init__(*arguments)
+
+    monkeypatch.setattr(loop, "Ahead", Counted)
+    monkeypatch.setattr(Counted, "possible", staticmethod(lambda: True))
+    scenario = Scenario.load("u_turn", ["duration_s=8"])
+    urls = [f"tlog:{tmp_path / 'run.tlog'}", *(["udpout:127.0.0.1:9"] if listening else [])]
+    watched = run(scenario, links=[MavlinkPublisher(urls, scenario)]).dataset
+    assert len(ahead) == (0 if listening else 1)
+    unwatched = run(scenario, controls=[tuple]).dataset  # flown in this process
+    for group in ("truth", "estimators"):
+        for mine, own in zip(watched[group].subtree, unwatched[group].subtree, strict=True):
+            assert mine.dataset.equals(own.dataset)
