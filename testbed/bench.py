@@ -382,6 +382,7 @@ class _Timed:
         self.publish = self._timed(publisher.publish)
         self.requests = self._timed(publisher.requests)
         self.event = self._timed(publisher.event)
+        self.settings = publisher.settings
         self.close = publisher.close
 
     def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:

@@ -375,13 +375,13 @@ def _check(request: Recorded, scenario: Scenario, knobs: Mapping[str, _Knob], t:
 
 
 class Desk:
-    """Carries out, on the parts of one run, what changes its results."""
+    """Carries out, on the parts of one run, what changes its results; ``values`` are those of the settings now."""
 
     def __init__(self, scenario: Scenario, plant: Plant) -> None:
         self._scenario = scenario
         self._plant = plant
         self._knobs = _knobs(scenario)
-        self._values = {name: knob.setting.value for name, knob in self._knobs.items()}
+        self.values = {name: knob.setting.value for name, knob in self._knobs.items()}
         self._open: dict[int, str] = {}  # faults that go on, by their place, and the setting that they come from
 
     def carry_out(self, request: Recorded, t: float) -> list[FaultTruth]:
@@ -417,15 +417,15 @@ class Desk:
         return [self._plant.faults.end(k, t) for k in which]
 
     def _change(self, name: str, value: float, t: float) -> list[FaultTruth]:
-        knob, before = self._knobs[name], self._values[name]
-        self._values[name] = value
+        knob, before = self._knobs[name], self.values[name]
+        self.values[name] = value
         ended: list[FaultTruth] = []
         if knob.faults is not None and knob.faults(value) != knob.faults(before):
             ended = self._end([k for k, setting in self._open.items() if setting == name], t)
             for table in knob.faults(value):
                 self._begin(table, name, t)
         if knob.act is not None:
-            knob.act(self._plant, self._values)
+            knob.act(self._plant, self.values)
         return ended
 
 
@@ -460,12 +460,15 @@ class Director:
         self._rate_hz, self._repeatable = rate_hz, repeatable
         self._sleep = sleep
 
-    def begin(self, desk: Desk, recorder: Recorder, emit: Event, say: Event) -> None:
-        """A run begins, anew perhaps. ``emit`` tells and records events, ``say`` only tells."""
-        self._desk, self._recorder, self._emit, self._say = desk, recorder, emit, say
+    def begin(
+        self, desk: Desk, recorder: Recorder, emit: Event, say: Event, tell: Callable[[Mapping[str, float]], None]
+    ) -> None:
+        """A run begins, anew perhaps. ``emit`` tells and records events, ``say`` only tells; ``tell`` the settings."""
+        self._desk, self._recorder, self._emit, self._say, self._tell = desk, recorder, emit, say, tell
         self._waiting = list(self._replay)
         self._stop_at: int | None = None
         self._paused = self.ended = False
+        self._tell_settings()
 
     def ready(self, tick: int) -> bool:
         """Carry out what is due or asked for before ``tick``, waiting there while paused; False ends the run.
@@ -500,6 +503,9 @@ class Director:
         """The run ends at ``t`` [s]: record what the faults were that went on until then."""
         self._recorder.faults(self._desk.conclude(t))
 
+    def _tell_settings(self) -> None:
+        self._tell(self._desk.values | ({"SIM_SPEEDUP": self.pacer.factor} if self.pacer is not None else {}))
+
     def _listen(self, tick: int) -> None:
         for source in self._sources:
             for request in source():
@@ -507,6 +513,7 @@ class Director:
                     self._heed(request, tick)
                 except Refused as reason:
                     self._say(tick / self._rate_hz, "warning", f"refused: {reason}")
+                    self._tell_settings()
 
     def _heed(self, request: Request, tick: int) -> None:
         t = tick / self._rate_hz
@@ -529,6 +536,7 @@ class Director:
                     raise Refused(f"speed {factor:g}: must be from {SMALLEST_SPEED:g} to {LARGEST_SPEED:g}")
                 self.pacer = self.pacer or Pacer()
                 self.pacer.restart(t, factor)
+                self._tell_settings()
                 self._say(t, "info", f"{factor:g} times the wall clock")
             case Restart():
                 if not self._repeatable:
@@ -559,6 +567,7 @@ class Director:
             self.ended = True
             self._emit(t, "info", "ended on request")
         elif isinstance(request, Change):
+            self._tell_settings()
             self._emit(t, "info", f"{request.setting} set to {request.value:g}")
 
 

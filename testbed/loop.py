@@ -99,6 +99,10 @@ class Publisher(Protocol):
         """
         ...
 
+    def settings(self, values: Mapping[str, float]) -> None:
+        """The values in force of what may change (`testbed.control.settings`): as the run begins and at each change."""
+        ...
+
     def event(self, t: float, severity: str, text: str) -> None:
         """Something happened at ``t``; severity is info, warning or error."""
         ...
@@ -382,12 +386,17 @@ def _fly(
             return sorted(set().union(*(range(-tick % one, n, one) for one in every if one)))
 
         pilot = Autopilot(source, scenario, filters, sense) if closed and isinstance(source, Steered) else None
+
+        def tell(values: Mapping[str, float]) -> None:
+            for link in links:
+                link.settings(values)
+
         watch = _EventWatch(emit, faults.truth)
         for name, config in scenario.sensors.items():
             if not isinstance(config, ImuConfig):
                 watch.heard[name] = config.offset_s + config.latency_s
                 watch.patience[name] = patience(config.rate_hz)
-        director.begin(Desk(scenario, Plant(faults, aiding, filters, source)), recorder, emit, say)
+        director.begin(Desk(scenario, Plant(faults, aiding, filters, source)), recorder, emit, say, tell)
         latest = _Latest()
         unshown: deque[UpdateReport] = deque()  # reports of that estimator that the links have not been given
         unread: dict[str, deque[UpdateReport]] = {name: deque() for name in filters}  # not looked at for events

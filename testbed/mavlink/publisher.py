@@ -68,7 +68,8 @@ class MavlinkPublisher:
         self._sent_us = 0
         self._identity = identity_of(identity)
         self._signing = Signing(key) if key is not None else None
-        self._own = settings(scenario)
+        self._parameters = Parameters(self._identity.facts, settings(scenario), self._identity.byte_wise)
+        self._in_force: Mapping[str, float] = {}
         self._items = mission.items(scenario, self._identity.home_first)
         self._legs = len(self._items) - (self._identity.home_first and len(self._items) > 0)
         self._silent_s = {
@@ -115,7 +116,7 @@ class MavlinkPublisher:
         self._told: frozenset[str] = frozenset()  # isolations
         self._main = Answers(
             self._identity,
-            Parameters(self._identity.facts, self._own, self._identity.byte_wise),
+            self._parameters,
             self._items,
             self._streams,
             scenario=self._scenario,
@@ -193,6 +194,16 @@ class MavlinkPublisher:
                 talk.flush(station, heartbeats)
         asked, self._main.asked = self._main.asked, []
         return asked
+
+    def settings(self, values: Mapping[str, float]) -> None:
+        """Keep the parameters in force, whoever has changed them, and tell every station of those that differ."""
+        for name, value in values.items():
+            self._parameters.put(name, value)
+            fields = self._parameters.in_force(name)
+            if fields and self._in_force and self._in_force.get(name) != value:
+                for talk in self._talks.values():
+                    talk.due.append(self._main.encoder.frame("PARAM_VALUE", fields))
+        self._in_force = dict(values)
 
     def event(self, t: float, severity: str, text: str) -> None:
         """Say ``text`` as STATUSTEXT; severity is info, warning or error."""

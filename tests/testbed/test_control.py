@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -66,6 +67,7 @@ class Station:
         self.t = -1.0
         self.rows: list[float] = []
         self.events: list[tuple[float, str, str]] = []
+        self.told_settings: list[dict[str, float]] = []
         self.calls = 0
 
     def publish(self, truth: Any, *rest: Any) -> None:
@@ -77,6 +79,9 @@ class Station:
         due = [request for t, request in self.script if t <= self.t]
         self.script = self.script[len(due) :]
         return due
+
+    def settings(self, values: Mapping[str, float]) -> None:
+        self.told_settings.append(dict(values))
 
     def event(self, t: float, severity: str, text: str) -> None:
         self.events.append((t, severity, text))
@@ -468,7 +473,8 @@ def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
     asked: list[Request] = [Speed(500.0), Restart()]
     director = Director(short, [lambda: [asked.pop(0)] if asked else []], (), 1000.0, 200.0)
     told: list[str] = []
-    director.begin(None, None, lambda *_: None, lambda *event: told.append(event[-1]))  # type: ignore[arg-type]
+    desk = SimpleNamespace(values={})
+    director.begin(desk, None, lambda *_: None, lambda *event: told.append(event[-1]), lambda _: None)  # type: ignore[arg-type]
     assert director.ready(0)
     assert director.pacer is not None
     for k in range(3):
@@ -495,3 +501,12 @@ def test_an_end_before_the_first_row_leaves_one() -> None:
     result = run(scenario(6), links=[Station([(-1.0, End())])])
     assert result.dataset["truth/time"].values.tolist() == [0.0]
     assert result.remarks == ("ended on request at 0 s of 6 s",)
+
+
+def test_links_are_told_the_settings_in_force() -> None:
+    """Whoever changes them: at the start, after a change, and anew after a restart."""
+    station = Station([(1.0, Change("SIM_WIND_SPD", 7.0)), (1.5, Speed(40.0)), (2.0, Restart())])
+    run(scenario(3), links=[station], realtime=50.0)
+    told = [(values["SIM_WIND_SPD"], values["SIM_SPEEDUP"]) for values in station.told_settings]
+    usual = told[0][0]
+    assert told == [(usual, 50.0), (7.0, 50.0), (7.0, 40.0), (usual, 40.0)]

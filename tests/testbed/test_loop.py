@@ -56,6 +56,9 @@ class Watcher:
     def requests(self) -> Sequence[Request]:
         return ()
 
+    def settings(self, values: Mapping[str, float]) -> None:
+        pass
+
     def event(self, t: float, severity: str, text: str) -> None:
         self.events.append((t, severity, text))
 

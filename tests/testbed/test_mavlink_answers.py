@@ -750,10 +750,19 @@ def test_restart_forgets_what_was_set(meet):
     peer = meet(calls=30)
     peer.mav.param_set_send(1, 1, b"SIM_GPS1_JAM", encoded(1), mav.MAV_PARAM_TYPE_INT32)
     assert decoded(peer.hear("PARAM_VALUE")) == 1
+    peer.publisher.settings({"SIM_GPS1_JAM": 0.0})  # as a run does when it begins
     publish(peer.publisher, range(1))
     peer.drain()
     peer.mav.param_request_read_send(1, 1, b"SIM_GPS1_JAM", -1)
     assert decoded(peer.hear("PARAM_VALUE")) == 0
+
+
+def test_stations_are_told_what_another_has_changed(meet):
+    peer = meet(calls=30)
+    peer.publisher.settings({"SIM_GPS1_JAM": 0.0})
+    peer.drain()
+    peer.publisher.settings({"SIM_GPS1_JAM": 1.0})
+    assert decoded(peer.hear("PARAM_VALUE")) == 1
 
 
 def test_asking_nothing_costs_next_to_nothing(meet):
