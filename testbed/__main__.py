@@ -115,8 +115,8 @@ def run(
         ),
     ] = None,
     mavlink_identity: Annotated[
-        str, typer.Option(metavar="NAME", help="Whose ways the vehicle has: px4 or ardupilot.")
-    ] = "px4",
+        str | None, typer.Option(metavar="NAME", help="Whose ways the vehicle has: px4, or ardupilot.")
+    ] = None,
     mavlink_vehicles: Annotated[
         bool, typer.Option("--mavlink-vehicles", help="Show truth and the other estimators as vehicles of their own.")
     ] = False,
@@ -453,6 +453,9 @@ def _connect(
     ``options`` are those of `testbed.mavlink.MavlinkPublisher`.
     """
     if not urls:
+        if any(options.values()):
+            given = ", ".join(f"--mavlink-{name}" for name, value in options.items() if value)
+            raise UserError(f"{given}: there is no link: add --mavlink URL, or leave it out")
         return []
     from testbed.loop import shown_estimator
     from testbed.mavlink import MavlinkPublisher, log_path
@@ -462,7 +465,7 @@ def _connect(
         path = log_path(url)
         if path is not None and path.resolve().parent == folder.resolve() and is_result(path.name):
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
-    return [MavlinkPublisher(urls, scenario, **options)]
+    return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
 
 def _fly(

@@ -23,6 +23,7 @@ import dataclasses
 import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, get_args
@@ -456,6 +457,7 @@ class Director:
         self.ended = False
         self.listens = bool(sources or replay) or factor is not None
         self._sources = sources
+        self._asked: deque[Request] = deque()
         self._replay = [(round(t * rate_hz), request) for t, request in replay]
         self._rate_hz, self._repeatable = rate_hz, repeatable
         self._sleep = sleep
@@ -508,12 +510,13 @@ class Director:
 
     def _listen(self, tick: int) -> None:
         for source in self._sources:
-            for request in source():
-                try:
-                    self._heed(request, tick)
-                except Refused as reason:
-                    self._say(tick / self._rate_hz, "warning", f"refused: {reason}")
-                    self._tell_settings()
+            self._asked.extend(source())
+        while self._asked:  # what is asked after a restart is left for the run that begins
+            try:
+                self._heed(self._asked.popleft(), tick)
+            except Refused as reason:
+                self._say(tick / self._rate_hz, "warning", f"refused: {reason}")
+                self._tell_settings()
 
     def _heed(self, request: Request, tick: int) -> None:
         t = tick / self._rate_hz

@@ -27,8 +27,8 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * ``flight.`` is how the aircraft flew, in truth, whatever it flew on: ``bank``; ``stall_margin`` and
   ``overspeed_margin``, equivalent airspeed above the stall at its bank and below the fastest that is flown;
   ``altitude_error`` from the altitude commanded; ``path_error``, across the circle of loiters that have a ``centre``,
-  from where it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the first `RETURN_S` after an
-  outage.
+  from `ON_CIRCLE_S` after it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the first
+  `RETURN_S` after an outage.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
 
@@ -66,6 +66,7 @@ SILENT = 2.5  # sample intervals without a sample, after which a receiver counts
 SUSTAINED_S = 2.0  # for how long an alarm has to go on to be a sustained one,
 SUSTAINED_SHARE = 0.8  # and at how many of the looks
 ON_CIRCLE_M = 5.0  # as near as guidance keeps to it in light turbulence
+ON_CIRCLE_S = 20.0  # until a capture of the circle has died away
 RETURN_S = 60.0  # after an outage, in which an aircraft that flew on its estimate flies back
 AXES = ("north", "east", "down")
 
@@ -325,7 +326,7 @@ def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]
 
 def _path_error(dataset: xarray.DataTree, plan: Sequence[guidance.Leg]) -> Array:
     """Distance (N,) [m] from the circle that is being flown, NaN where there is none."""
-    leg = column(dataset, "truth/leg")
+    t, leg = column(dataset, "truth/time"), column(dataset, "truth/leg")
     result = np.full(len(leg), np.nan)
     for index, one in enumerate(plan):
         rows = np.flatnonzero(leg == index)
@@ -335,8 +336,10 @@ def _path_error(dataset: xarray.DataTree, plan: Sequence[guidance.Leg]) -> Array
         centre = np.deg2rad([one.centre.lat_deg, one.centre.lon_deg])
         away = earth.position_difference_n(lat, lon, h, np.full(len(rows), centre[0]), np.full(len(rows), centre[1]), h)
         error = np.abs(np.hypot(away[:, 0], away[:, 1]) - one.radius_m)
-        reached = np.logical_or.accumulate(error <= ON_CIRCLE_M)
-        result[rows[reached]] = error[reached]
+        near = np.flatnonzero(error <= ON_CIRCLE_M)
+        if len(near):
+            counted = t[rows] >= t[rows[near[0]]] + ON_CIRCLE_S
+            result[rows[counted]] = error[counted]
     return result
 
 

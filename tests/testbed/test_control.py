@@ -487,6 +487,15 @@ def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
     assert told == ["500 times the wall clock", "begins anew"]
 
 
+def test_what_is_asked_with_a_restart_is_asked_of_the_run_that_begins() -> None:
+    short = scenario(6)
+    asked: list[Request] = [Restart(), Change("SIM_GPS1_JAM", 1.0)]
+    station = Station([(2.0, one) for one in asked])
+    requests = run(short, links=[station], realtime=50.0).dataset["requests"]
+    assert requests["kind"].values.tolist() == ["change"]
+    assert requests["time"].values.tolist() == [0.0]
+
+
 def test_a_motion_that_was_handed_over_is_not_begun_anew() -> None:
     from testbed import loop
 
