@@ -28,7 +28,7 @@ from nav._jit import njit
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import ImuModel
-from nav.kalman import predict, update
+from nav.kalman import update
 from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
 from nav.rotation import (
     quat_from_euler,
@@ -471,31 +471,24 @@ def _azimuth(x_n: Array) -> float:
     return math.atan2(x_n[1], x_n[0])
 
 
-@njit
 def transition(turned: Array, earth_n: Array, T: float) -> Array:
     """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
-    Phi = np.zeros((3, STATES))
-    for i in range(3):
-        Phi[i, PHI + i] = 1.0
-        for j in range(3):
-            Phi[i, BIAS + j] = turned[i, j]
-    Phi[0, PHI + 1], Phi[0, PHI + 2] = earth_n[2] * T, -earth_n[1] * T
-    Phi[1, PHI], Phi[1, PHI + 2] = -earth_n[2] * T, earth_n[0] * T
-    Phi[2, PHI], Phi[2, PHI + 1] = earth_n[1] * T, -earth_n[0] * T
-    return Phi
+    north, east, down = (earth_n * T).tolist()
+    return np.hstack([[[1.0, down, -east], [-down, 1.0, north], [east, -north, 1.0]], turned])
 
 
-@njit
 def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
-    """Take error states and covariance over the time in ``elapsed``, and empty the integral."""
-    T = elapsed[0]
-    Phi = transition(turned, earth_n, T)
-    before = x.copy()
-    for i in range(3):
-        x[PHI + i] = 0.0
-        for j in range(STATES):
-            x[PHI + i] += Phi[i, j] * before[j]
-    predict(P, Phi, np.ones(STATES), 0.5 * T * variance_rate, np.empty((3, STATES)))
+    """Take error states and covariance over the time in ``elapsed``, and empty the integral.
+
+    Half of the noise before and half after, as in `kalman.predict`.
+    """
+    T = float(elapsed[0])
+    whole = np.eye(STATES)
+    whole[PHI : PHI + 3] = transition(turned, earth_n, T)
+    half_noise = np.diag(0.5 * T * variance_rate)
+    x[:] = whole @ x
+    P[:] = whole @ (P + half_noise) @ whole.T + half_noise
+    P[:] = 0.5 * (P + P.T)
     turned[:] = 0.0
     elapsed[0] = 0.0
 
