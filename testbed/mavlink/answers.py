@@ -8,6 +8,7 @@ https://mavlink.io/en/messages/common.html#MAV_RESULT has it.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from typing import TypeAlias
@@ -77,15 +78,13 @@ class Talk:
         self._reader = Reader(signing)
         self._voice = Voice(signing)
         self.due: list[bytes] = []  # frames for the next `flush`
-        self.rates: dict[str, float] = {}  # of messages whose rate it has asked for [Hz]
+        self.rates: defaultdict[int, dict[str, float]] = defaultdict(dict)  # [Hz] asked for, by vehicle and message
         self.lists: dict[int, int] = {}  # the parameter that is next in the list under way, by vehicle
 
     def hear(self, station: Station, data: bytes) -> list[Message]:
-        """The messages in what it said; with the first it is one of ours."""
+        """The messages in what it said; with the first it is one of ours, and who isn't let in is not heard."""
         heard = list(self._reader.read(data, station.datagrams))
-        if heard:
-            station.admit()
-        return heard
+        return heard if heard and station.admit() else []
 
     def flush(self, station: Station, frames: Sequence[bytes] = ()) -> None:
         """Send what is due, and ``frames``."""
@@ -429,9 +428,9 @@ class Answers:
         if name is None or self._scenario is None or not (interval >= 0 or interval == -1):
             return int(mav.MAV_RESULT_DENIED)
         if interval == 0:
-            talk.rates.pop(name, None)
+            talk.rates[self._system].pop(name, None)
         else:
-            talk.rates[name] = min(1e6 / interval, PUBLISH_HZ) if interval > 0 else 0.0
+            talk.rates[self._system][name] = min(1e6 / interval, PUBLISH_HZ) if interval > 0 else 0.0
         return int(mav.MAV_RESULT_ACCEPTED)
 
     def _get_interval(self, params: Params, talk: Talk) -> int:
@@ -439,7 +438,8 @@ class Answers:
         if number is None or not 0 <= number < 2**16:
             return int(mav.MAV_RESULT_DENIED)
         name = self._numbers.get(number)
-        rate = talk.rates.get(name, self._streams[name][0].rate_hz) if name else math.nan  # NaN: no such stream
+        rates = talk.rates[self._system]
+        rate = rates.get(name, self._streams[name][0].rate_hz) if name else math.nan  # NaN: no such stream
         interval = 0 if name is None else 1e6 / rate if rate > 0 else -1
         self._say(talk, "MESSAGE_INTERVAL", {"message_id": number, "interval_us": interval})
         return int(mav.MAV_RESULT_ACCEPTED)
@@ -450,7 +450,7 @@ class Answers:
         rate = min(message["req_message_rate"], PUBLISH_HZ) if message["start_stop"] else 0
         for name, streams in self._streams.items():
             if streams[0].group and group in (mav.MAV_DATA_STREAM_ALL, streams[0].group):
-                talk.rates[name] = float(rate)
+                talk.rates[self._system][name] = float(rate)
 
     # Times, files, logs
 

@@ -139,7 +139,7 @@ class Encoder:
     """Frames of one vehicle, numbered as they are made."""
 
     def __init__(self, system: int = 1, component: int = 1) -> None:
-        self._system = system
+        self.system = system
         self._component = component
         self._sequence = 0
         self._layouts: dict[str, _Layout] = {}
@@ -161,7 +161,7 @@ class Encoder:
                 0,
                 0,
                 self._sequence,
-                self._system,
+                self.system,
                 self._component,
                 layout.id & 0xFFFF,
                 layout.id >> 16,

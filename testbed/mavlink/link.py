@@ -52,8 +52,9 @@ class Station:
         """Hand over frames; what can't be taken at once is lost."""
         raise NotImplementedError
 
-    def admit(self) -> None:
-        """It has spoken MAVLink: from now on it belongs to its link's `Link.stations`."""
+    def admit(self) -> bool:
+        """It has spoken MAVLink: whether it belongs to its link's `Link.stations` from now on."""
+        return True
 
 
 class Link(Protocol):
@@ -154,7 +155,7 @@ class _Udp(Station):
 
     datagrams = True
 
-    def __init__(self, send: Callable[[bytes], int], admit: Callable[[_Udp], None] = lambda station: None) -> None:
+    def __init__(self, send: Callable[[bytes], int], admit: Callable[[_Udp], bool] = lambda station: True) -> None:
         self._send = send
         self._admit = admit
         self.heard = time.monotonic()
@@ -165,8 +166,8 @@ class _Udp(Station):
             with contextlib.suppress(OSError):
                 self._send(frame)
 
-    def admit(self) -> None:
-        self._admit(self)
+    def admit(self) -> bool:
+        return self._admit(self)
 
 
 class UdpOut:
@@ -244,9 +245,10 @@ class UdpIn:
         return said
 
     def _stranger(self, address: tuple[str, int]) -> _Udp:
-        def admit(station: _Udp) -> None:
+        def admit(station: _Udp) -> bool:
             if len(self._by_address) < MOST_STATIONS:
                 self._by_address.setdefault(address, station)
+            return address in self._by_address
 
         return _Udp(lambda frame: self._socket.sendto(frame, address), admit)
 

@@ -248,8 +248,11 @@ class MavlinkPublisher:
 
         return frames
 
-    def _send(self, t: float, due: Callable[[Mapping[str, float]], list[bytes]]) -> None:
-        """Send to logs, which come first so that their numbers are the run's alone, and to stations."""
+    def _send(self, t: float, due: Callable[[Mapping[str, float]], list[bytes]], system: int = 1) -> None:
+        """Send what ``system`` says to logs, which come first so that their numbers are the run's alone, and stations.
+
+        ``due`` gives its frames at the rates [Hz] asked for, by message.
+        """
         self._sent_us = max(self._sent_us, self._start_us + microseconds(t))  # events tell of times before the last row
         if self._logs:
             frames = due({})
@@ -258,7 +261,8 @@ class MavlinkPublisher:
         for link in self._links:
             for station in link.stations:
                 talk = self._talk(station)
-                talk.flush(station, due({**talk.rates, **self._quiet} if self._quiet else talk.rates))
+                rates = talk.rates[system]
+                talk.flush(station, due({**rates, **self._quiet} if self._quiet else rates))
 
     def _beats(self) -> None:
         """See to it that no heartbeat follows one by the wall clock at once."""
@@ -293,7 +297,8 @@ class MavlinkPublisher:
                 home=home or messages.known_point(estimate),
                 legs=0,
             )
-            self._send(shown.t, self._due(encoder, vehicle, vehicle.snapshot, self._beside_schedule))
+            due = self._due(encoder, vehicle, vehicle.snapshot, self._beside_schedule)
+            self._send(shown.t, due, encoder.system)
 
     def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
         """Say which sensors the shown estimator has shut out since the last call, and which it has let in again."""

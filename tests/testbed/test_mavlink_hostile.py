@@ -346,4 +346,4 @@ class _Deaf:
         self.frames += len(frames)
 
     def admit(self):
-        pass
+        return True
