@@ -635,7 +635,7 @@ class Faults:
         self._sensors = sensors
         self._seed = seed
         self._running: dict[str, list[_Running]] = {}
-        self._all: list[_Running] = []  # as in ``truth``
+        self._open: dict[int, _Running] = {}  # that may be ended yet, by their places in ``truth``
         for fault in faults:
             self.add(fault)
 
@@ -643,14 +643,14 @@ class Faults:
         """One more fault, which acts on the samples that have yet to come; its place in ``truth``."""
         sensor = self._sensors[fault.sensor]
         rng = stream(self._seed, fault.sensor, f"fault {len(self.truth)}")
-        self._all.append(_Running(fault, sensor, rng))
-        self._running.setdefault(fault.sensor, []).append(self._all[-1])
+        running = self._open[len(self.truth)] = _Running(fault, sensor, rng)
+        self._running.setdefault(fault.sensor, []).append(running)
         self.truth.append(_truth(fault, sensor, [one.name for one in self.truth]))
         return len(self.truth) - 1
 
     def end(self, index: int, t: float) -> FaultTruth:
         """End one at ``t`` [s], before the samples of then have been seen; what it is now known to have been."""
-        self._all[index].end = t - ON_THE_EDGE_S
+        self._open.pop(index).end = t - ON_THE_EDGE_S
         self.truth[index] = replace(self.truth[index], end=t)
         return self.truth[index]
 
@@ -663,9 +663,13 @@ class Faults:
         running = self._running.get(sensor)
         if not running or not len(samples):
             return samples
+        first = float(samples.t[0]) if isinstance(samples, ImuSamples) else samples[0].t
+        running[:] = [one for one in running if first < one.end]  # the others are over for good
         if isinstance(samples, ImuSamples):
-            return self._apply_imu(running, samples)
-        first, last = samples[0].t, samples[-1].t
+            return self._apply_imu(running, samples) if running else samples
+        if not running:
+            return samples
+        last = samples[-1].t
         if not any(one.listens <= last and first < one.end for one in running):
             _act(running, samples[-1])  # which a fault that begins later may have to know
             return samples
