@@ -37,6 +37,7 @@ LOST_S = 3.5  # without a heartbeat; QGroundControl's figure
 POLL_S = 0.05
 TEXTS = 8
 STATUSTEXT_BYTES = 50  # a shorter one is the last of its text
+LONGEST_TEXT = 256 * STATUSTEXT_BYTES  # chunks are numbered by a byte
 _FORMS = "udpin:host:port (listens), tcp:host:port (connects) or a telemetry log, path.tlog"
 _STAMP = struct.Struct(">Q")
 _MAX_DATAGRAM = 65535
@@ -145,9 +146,12 @@ class Picture:
 
     def _read_text(self, message: Any) -> str | None:
         chunk = message._text_raw.partition(b"\0")[0]
-        text = self._chunks.pop(message.id, b"") + chunk
+        before = self._chunks.pop(message.id, b"")
+        text = (before + chunk if message.chunk_seq else chunk)[:LONGEST_TEXT]
         if message.id and len(chunk) == STATUSTEXT_BYTES:
             self._chunks[message.id] = text
+            if len(self._chunks) > TEXTS:  # the oldest has lost its end
+                del self._chunks[next(iter(self._chunks))]
             return None
         readable = text.decode(errors="replace")
         readable = "".join(character if character.isprintable() else " " for character in readable)
@@ -305,11 +309,30 @@ def _listen(connection: socket.socket) -> Turns:
             heard: list[Any] = []
             with contextlib.suppress(BlockingIOError):
                 while len(heard) < 1000:  # then it is time to look at the clock
-                    data = connection.recv(_MAX_DATAGRAM)
+                    try:
+                        data = connection.recv(_MAX_DATAGRAM)
+                    except ConnectionError:  # reset
+                        data = b""
                     if not data and not datagrams:
+                        yield time.monotonic(), heard
                         return
-                    heard += parser.parse_buffer(data) or ()
+                    heard += _messages(parser, data)
             yield time.monotonic(), heard
+
+
+def _messages(parser: Any, data: bytes) -> list[Any]:
+    """The messages that ``data`` completes; a frame that the parser fails at is passed over."""
+    found: list[Any] = []
+    while True:
+        try:
+            message = parser.parse_char(data)
+        except Exception:  # various ones at hostile bytes, once the frame has been taken from the buffer
+            message = mav.MAVLink_bad_data(b"", "")
+        if message is None:
+            return found
+        if message.get_type() != "BAD_DATA":
+            found.append(message)
+        data = b""
 
 
 def _replay(path: Path, speed: float) -> Turns:
@@ -348,7 +371,7 @@ def _frames(data: bytes) -> Iterator[Turn]:
             end = at + data[at + 1] + 8
         message = None
         if long or data[at] == mav.PROTOCOL_MARKER_V1:
-            with contextlib.suppress(mav.MAVError):
+            with contextlib.suppress(Exception):  # pymavlink raises various ones at hostile bytes
                 message = parser.decode(bytearray(data[at:end]))
         if message is None:
             at += 1

@@ -23,7 +23,7 @@ from rich.console import Console
 import testbed.__main__ as cli
 from testbed import record
 from testbed.errors import UserError
-from testbed.mavlink.watch import Picture, watch
+from testbed.mavlink.watch import LONGEST_TEXT, Picture, _messages, watch
 
 SECONDS = 16
 DENIED = (6, 12)
@@ -301,6 +301,46 @@ def test_a_connection_that_the_vehicle_closes_ends_it(capsys: pytest.CaptureFixt
         thread.join(5)
     assert "LOITER, armed" in picture
     assert "bye" in capsys.readouterr().out
+
+
+def test_a_reset_connection_ends_it_too() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            peer.sendall(Vehicle().bytes(heartbeat()))
+            time.sleep(0.2)
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            peer.close()
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        assert "LOITER, armed" in shown(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        thread.join(5)
+
+
+def test_a_frame_that_the_parser_fails_at_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle = Vehicle()
+    frames = [vehicle.bytes(heartbeat()) for _ in range(3)]
+    decode = mav.MAVLink.decode
+
+    def fails(self: mav.MAVLink, data: bytearray) -> mav.MAVLink_message:
+        if bytes(data) == frames[1]:
+            raise TypeError("as at hostile bytes")
+        return decode(self, data)
+
+    monkeypatch.setattr(mav.MAVLink, "decode", fails)
+    assert len(_messages(mav.MAVLink(None), b"".join(frames))) == 2
+
+
+def test_texts_without_an_end_stay_short() -> None:
+    picture, vehicle = Picture(""), Vehicle()
+    for i in range(2000):
+        said = picture.hear(vehicle.message(mav.MAVLink_statustext_message(6, b"x" * 50, 1 + i // 600, 1)), 0.0)
+        assert said is None
+    said = picture.hear(vehicle.message(mav.MAVLink_statustext_message(6, b"end", 1, 2)), 0.0)
+    assert said is not None
+    assert len(said) <= 10 + LONGEST_TEXT
 
 
 def test_live_until_interrupted() -> None:
