@@ -716,12 +716,12 @@ def test_rates_are_of_the_vehicle_that_was_asked(meet):
     attitude = mav.MAVLINK_MSG_ID_ATTITUDE
     assert peer.command(511, attitude, -1, system=1)[0] == [ACCEPTED]
     said = collections.Counter(m.get_srcSystem() for m in peer.fly(range(1, 26))["ATTITUDE"])
-    assert said[1] == 0 and said[2] == 10
+    assert (said[1], said[2]) == (0, 10)
     assert peer.command(510, attitude, system=2)[1]["MESSAGE_INTERVAL"][0].interval_us == 100_000
     peer.mav.request_data_stream_send(2, 1, mav.MAV_DATA_STREAM_ALL, 5, 1)
     peer.drain()
     said = collections.Counter(m.get_srcSystem() for m in peer.fly(range(26, 51))["ATTITUDE"])
-    assert said[1] == 0 and said[2] == 5
+    assert (said[1], said[2]) == (0, 5)
 
 
 def test_who_is_not_let_in_is_not_heard(meet, monkeypatch, port):
