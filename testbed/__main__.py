@@ -482,7 +482,7 @@ def _fly(
 
     with (
         _keeping(f"the record so far is {folder / 'run.nc'}"),
-        keyboard.keys(realtime) if realtime else nullcontext() as keys,
+        keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
         if keys is not None:

@@ -139,11 +139,18 @@ class Speed:
 
 
 @dataclass(frozen=True, slots=True)
+class Faster:
+    """Run ``times`` as fast as now, within what a speed may be."""
+
+    times: float
+
+
+@dataclass(frozen=True, slots=True)
 class Restart:
     """Begin the run anew, at its first tick."""
 
 
-Request: TypeAlias = Inject | Clear | Change | End | Pause | Resume | Toggle | Step | Speed | Restart
+Request: TypeAlias = Inject | Clear | Change | End | Pause | Resume | Toggle | Step | Speed | Faster | Restart
 Recorded: TypeAlias = Inject | Clear | Change | End  # those that change what is computed
 Event: TypeAlias = Callable[[float, str, str], None]  # time [s], severity, text
 _RECORDED: Mapping[str, type[Recorded]] = {one.__name__.lower(): one for one in get_args(Recorded)}
@@ -534,6 +541,9 @@ class Director:
                 elif self._paused:
                     self._say(t, "info", "goes on")
                 self._paused = False
+            case Faster(times):
+                factor = times * (1.0 if self.pacer is None else self.pacer.factor)
+                self._heed(Speed(min(max(factor, SMALLEST_SPEED), LARGEST_SPEED)), tick)
             case Speed(factor) | Change("SIM_SPEEDUP", factor):
                 if not SMALLEST_SPEED <= factor <= LARGEST_SPEED:
                     raise Refused(f"speed {factor:g}: must be from {SMALLEST_SPEED:g} to {LARGEST_SPEED:g}")

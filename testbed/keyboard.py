@@ -8,22 +8,29 @@ import signal
 import sys
 import termios
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import NoReturn
 
-from testbed.control import LARGEST_SPEED, SMALLEST_SPEED, End, Request, Restart, Speed, Step, Toggle
+from testbed.control import End, Faster, Request, Restart, Step, Toggle
 
 HELP = "keys: space pauses and resumes, s steps 1 s, + and - change the speed, r restarts, q ends"
-STEP_S = 1.0
+MEANT: Mapping[str, Request] = {
+    " ": Toggle(),
+    "s": Step(1.0),
+    "+": Faster(2.0),
+    "=": Faster(2.0),  # the same key without shift
+    "-": Faster(0.5),
+    "r": Restart(),
+    "q": End(),
+}
 
 
 class Keyboard:
-    """What the keys pressed on terminal ``fd`` ask for, at a speed of ``factor`` at first."""
+    """What the keys pressed on terminal ``fd`` ask for."""
 
-    def __init__(self, fd: int, factor: float) -> None:
+    def __init__(self, fd: int) -> None:
         self._fd = fd
-        self._factor = factor
 
     def requests(self) -> Sequence[Request]:
         """What has been asked for since the last call; never waits."""
@@ -36,28 +43,12 @@ class Keyboard:
             if not keys:
                 break
             if not keys.startswith(b"\x1b"):  # an arrow or the like, of several letters
-                asked += [request for key in keys.decode("ascii", "ignore") for request in self._meant(key)]
+                asked += [MEANT[key] for key in keys.decode("ascii", "ignore") if key in MEANT]
         return asked
-
-    def _meant(self, key: str) -> list[Request]:
-        match key:
-            case " ":
-                return [Toggle()]
-            case "s":
-                return [Step(STEP_S)]
-            case "+" | "=" | "-":
-                factor = self._factor * (0.5 if key == "-" else 2.0)
-                self._factor = min(max(factor, SMALLEST_SPEED), LARGEST_SPEED)
-                return [Speed(self._factor)]
-            case "r":
-                return [Restart()]
-            case "q":
-                return [End()]
-        return []
 
 
 @contextmanager
-def keys(factor: float, fd: int = 0) -> Iterator[Keyboard | None]:
+def keys(fd: int = 0) -> Iterator[Keyboard | None]:
     """The keyboard of terminal ``fd`` while the context lasts; None when it is no terminal, or another's.
 
     Keys then come one by one and unseen; however the context ends, by SIGTERM too, the terminal is as it was.
@@ -69,7 +60,7 @@ def keys(factor: float, fd: int = 0) -> Iterator[Keyboard | None]:
     on_terminate = signal.signal(signal.SIGTERM, _leave)
     try:
         tty.setcbreak(fd, termios.TCSANOW)
-        yield Keyboard(fd, factor)
+        yield Keyboard(fd)
     finally:
         if _in_front(fd):
             termios.tcsetattr(fd, termios.TCSANOW, before)

@@ -23,6 +23,7 @@ from testbed.control import (
     Clear,
     Director,
     End,
+    Faster,
     Inject,
     Pause,
     Refused,
@@ -438,7 +439,7 @@ def test_a_pause_ends_by_resume_and_by_end() -> None:
         assert bool(result.remarks and result.remarks[0].startswith("ended on request")) != finished
 
 
-@pytest.mark.parametrize("asked", [Speed(4.0), Change("SIM_SPEEDUP", 4.0)])
+@pytest.mark.parametrize("asked", [Speed(4.0), Change("SIM_SPEEDUP", 4.0), Faster(0.004)])
 def test_the_speed_changes_on_the_way_and_is_no_part_of_the_record(asked: Request) -> None:
     short = scenario(6)
     station = Station([(2.0, Speed(1000.0)), (3.0, asked)])
@@ -446,6 +447,19 @@ def test_the_speed_changes_on_the_way_and_is_no_part_of_the_record(asked: Reques
     assert same(result.dataset, healthy_run(6))
     assert result.metrics["run.wall_s"] > 0.7, "3 s at four times the clock"
     assert "4 times the wall clock" in station.told()
+
+
+def test_faster_is_meant_of_the_speed_in_force_and_ends_where_speeds_do() -> None:
+    asked: list[Request] = [Faster(2.0), Change("SIM_SPEEDUP", 8.0), Faster(0.5), Faster(1e6), Faster(1e-9)]
+    director = Director(scenario(6), [lambda: asked and [asked.pop(0)]], (), 3.0, 200.0)
+    desk = SimpleNamespace(values={})
+    director.begin(desk, None, lambda *_: None, lambda *_: None, lambda _: None)  # type: ignore[arg-type]
+    speeds = []
+    for tick in range(5):
+        director.ready(tick)
+        assert director.pacer is not None
+        speeds.append(director.pacer.factor)
+    assert speeds == [6.0, 8.0, 4.0, 1000.0, 0.01]
 
 
 def test_a_run_as_fast_as_it_can_is_slowed_down_on_request() -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from testbed import keyboard, record
-from testbed.control import End, Restart, Speed, Step, Toggle
+from testbed.control import End, Faster, Restart, Step, Toggle
 from testbed.keyboard import Keyboard, keys
 
 
@@ -32,18 +32,14 @@ def terminal() -> Iterator[tuple[int, int]]:
 def test_what_the_keys_mean(terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = terminal
     monkeypatch.setattr(keyboard, "_in_front", lambda fd: True)
-    with keys(2.0, theirs) as pressed:
+    with keys(theirs) as pressed:
         assert pressed is not None
         assert pressed.requests() == []
         os.write(ours, b" s+=-x\xffrq")
-        expected = [Toggle(), Step(1.0), Speed(4.0), Speed(8.0), Speed(4.0), Restart(), End()]
+        expected = [Toggle(), Step(1.0), Faster(2.0), Faster(2.0), Faster(0.5), Restart(), End()]
         assert pressed.requests() == expected
         os.write(ours, b"\x1b[s")
         assert pressed.requests() == [], "an arrow is no key of ours"
-        os.write(ours, b"+" * 20)
-        assert pressed.requests()[-1] == Speed(1000.0)
-        os.write(ours, b"-" * 40)
-        assert pressed.requests()[-1] == Speed(0.01)
 
 
 def test_the_terminal_is_restored_whatever_happens(terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,7 +48,7 @@ def test_the_terminal_is_restored_whatever_happens(terminal: tuple[int, int], mo
     before, heeded = termios.tcgetattr(theirs), signal.getsignal(signal.SIGTERM)
 
     def use_and(fail: type[BaseException]) -> None:
-        with keys(1.0, theirs):
+        with keys(theirs):
             assert termios.tcgetattr(theirs) != before
             raise fail
 
@@ -66,12 +62,12 @@ def test_the_terminal_is_restored_whatever_happens(terminal: tuple[int, int], mo
 def test_no_keys_without_a_terminal_of_ones_own(terminal: tuple[int, int], tmp_path: Path) -> None:
     _, theirs = terminal
     before = termios.tcgetattr(theirs)
-    with keys(1.0, theirs) as pressed:  # not the one that this process was started from
+    with keys(theirs) as pressed:  # not the one that this process was started from
         assert pressed is None
         assert termios.tcgetattr(theirs) == before
-    with (tmp_path / "file").open("w") as file, keys(1.0, file.fileno()) as pressed:
+    with (tmp_path / "file").open("w") as file, keys(file.fileno()) as pressed:
         assert pressed is None
-    assert list(Keyboard(theirs, 1.0).requests()) == []
+    assert list(Keyboard(theirs).requests()) == []
 
 
 # Makes the terminal on its standard input its own, as a shell would have done, and runs the command line.
