@@ -791,7 +791,10 @@ def test_stations_are_told_what_another_has_changed(meet):
 def test_asking_nothing_costs_next_to_nothing(meet):
     peer = meet()
     peer.publisher.requests()
-    start = time.perf_counter()
-    for _ in range(2000):
-        peer.publisher.requests()
-    assert (time.perf_counter() - start) / 2000 < 100e-6
+    costs = []
+    for _ in range(200):  # the quickest, as the machine may have other things to do
+        start = time.perf_counter()
+        for _ in range(10):
+            peer.publisher.requests()
+        costs.append((time.perf_counter() - start) / 10)
+    assert min(costs) < 100e-6
