@@ -25,6 +25,7 @@ import os
 import socket
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
@@ -43,14 +44,14 @@ _FORMS = (
 )
 
 
-class Station:
+class Station(ABC):
     """One other end of a link, as long as it is there."""
 
     datagrams = False  # whether what it says comes in datagrams, each with whole frames
 
+    @abstractmethod
     def send(self, frames: Sequence[bytes]) -> None:
         """Hand over frames; what can't be taken at once is lost."""
-        raise NotImplementedError
 
     def admit(self) -> bool:
         """It has spoken MAVLink: whether it belongs to its link's `Link.stations` from now on."""
