@@ -33,6 +33,7 @@ KAPPA = math.radians(2.0)
 AFTER_TURN_S = 10
 NOISIER_S, LEARNED_S = 400, 200  # when the receiver gets worse, and how many looks there are to find out
 NEARLY_ALL = 0.9973  # of a normal error that lies within three sigma
+NO_WORSE = 1.05  # than the filter that is told the variances, at most
 
 _MORE_NOISE = ", ".join(
     f'{{ sensor = "gnss", channel = "{channel}", kind = "noise", factor = 2, window = [{NOISIER_S}, {LONG_S}] }}'
@@ -148,12 +149,12 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-ALL = ("improved", "ungated", "no_course")
+ALL = ("improved", "ungated", "no_course", "told")
 
 
 def _jobs() -> list[Job]:
     return [
-        Job(road, (SEEDS[-1] + 1, LONG_S, ("improved",))),
+        Job(road, (SEEDS[-1] + 1, LONG_S, ("improved", "told"))),
         *(Job(road, (seed, SHORT_S, ALL)) for seed in SEEDS),
         *(Job(noisier, (seed,)) for seed in SEEDS),
         *(Job(straight, (seed,)) for seed in SEEDS),
@@ -173,11 +174,21 @@ def _conclude(results: Sequence[Any]) -> list[Claim]:
     def improved(key: str) -> list[float]:
         return of("improved", key)
 
+    def any_seed(quantity: str, unit: str, paper: str, key: str, wanted: float) -> Claim:
+        """The worst seed; where the filter that need not learn is not within ``wanted`` either, next to that filter."""
+        least = max(of("told", key))
+        bound, because = wanted, ""
+        if least > wanted:
+            bound, because = NO_WORSE * least, f"with the variances told instead of learned it is {least:.3g}"
+        return Claim(
+            f"{quantity}, any seed below {wanted:g}", unit, paper, improved(key), bound, worst=True, impossible=because
+        )
+
     return [
         Claim(
-            "heading on straights from 300 s, largest", "deg", "0.1", improved("heading_straight"), 0.1, worst=True,
-            target=0.08,
+            "heading on straights from 300 s, largest", "deg", "0.1", improved("heading_straight"), 0.1, worst=True
         ),
+        any_seed("heading on straights from 300 s, largest", "deg", "0.1", "heading_straight", 0.08),
         Claim("heading in turns and 10 s after, largest", "deg", "0.1", improved("heading_turn"), 0.3, worst=True),
         Claim(
             "the same without the turn rule", "deg", "large oscillation", of("ungated", "heading_turn"),
@@ -198,10 +209,12 @@ def _conclude(results: Sequence[Any]) -> list[Claim]:
         ),
         Claim("level after the first turn, RMS", "deg", "0.01", improved("level_rms"), 0.02, worst=True),
         Claim("level after the first turn, 99.7 % of the time", "deg", "0.01", improved("level_nearly_all"), 0.02),
+        any_seed("level after the first turn, 99.7 % of the time", "deg", "0.01", "level_nearly_all", 0.02),
         Claim("velocity, each axis, 99.7 % of the time", "m/s", "0.02", improved("velocity"), 0.02, worst=True),
         Claim(
             "position, each axis, RMS", "m", "1", improved("position_rms"), 0.6, target=0.6,
         ),
+        any_seed("position, each axis, RMS", "m", "1", "position_rms", 0.6),
         Claim("position, each axis, largest", "m", "1", improved("position_largest"), 1.5),
         Claim(
             "courses used in a turn or below 1 m/s", "", "0", improved("course_amiss"), 0, worst=True,
