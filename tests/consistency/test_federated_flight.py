@@ -46,7 +46,12 @@ def outage(seed: int) -> tuple[dict[str, float], dict[str, int]]:
 
 def healthy(seed: int) -> tuple[dict[str, float], dict[str, int]]:
     overrides = [*HEALTHY, f"duration_s={HEALTHY_S}", "record.imu=false"]
-    return fly(Scenario.load("loiter_fault_tolerant", overrides), seed)
+    scenario = Scenario.load("loiter_fault_tolerant", overrides)
+    return fly(scenario.model_copy(update={"estimator": scenario.estimator[-1:]}), seed)
+
+
+def faulty(seed: int) -> dict[str, float]:
+    return fly(Scenario.load("loiter_fault_tolerant", ["expect={}", "record.imu=false"]), 1 + seed)[0]
 
 
 def every(work: Any) -> list[Any]:
@@ -105,6 +110,21 @@ def test_healthy_federation_of_two_receivers_is_consistent(hours: list[Any]) -> 
         mean = np.mean([found[f"federated.{what}_nees_mean"] for found, _ in hours])
         print(f"{what} NEES per degree of freedom: {mean:.3f}")
         assert 0.6 <= mean <= 1.5
+
+
+@pytest.mark.slow
+def test_faults_of_every_sensor() -> None:
+    found = every(faulty)
+    for name, key in (("federated", "position_horizontal_max_m"), ("federated", "velocity_max_mps"),
+                      ("unprotected", "position_horizontal_max_m"), ("ins", "position_horizontal_max_m")):  # fmt: skip
+        print(f"{name}.{key}:", np.round([one[f"{name}.{key}"] for one in found], 2))
+    for one in found:
+        assert one["federated.position_horizontal_max_m"] < 10.0
+        assert one["federated.velocity_max_mps"] < 0.5
+        assert one["unprotected.position_horizontal_max_m"] > 50.0
+        right = {key: value for key, value in one.items() if key.startswith("federated.isolation_correct.")}
+        assert len(right) == 7
+        assert set(right.values()) == {1.0}, right
 
 
 def seconds(scenario: Scenario, patch: pytest.MonkeyPatch) -> dict[str, float]:
