@@ -52,7 +52,8 @@ from nav.samples import (
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
 KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
-MAGNETIC_HEADING = "magnetic_heading"  # what an update by the magnetometer is called: an angle, not a field
+# What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
+LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
@@ -153,10 +154,11 @@ class Ahrs:
         self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2] * 2 + [0.0])
         self._H_level = np.zeros((2, STATES))
         self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
-        self._H_heading = np.zeros((1, STATES))
+        H = np.zeros((1, STATES))
         if field_n is not None:
-            self._H_heading[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
-        self._H_heading[0, PHI + 2] = -1.0
+            H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
+        H[0, PHI + 2] = -1.0
+        self.heading_look = H, np.array([config.magnetometer_sigma**2])  # H (1, 6) and R (1,) of a heading
         self._last_bad = -math.inf
 
     @property
@@ -343,11 +345,15 @@ class Ahrs:
             s.mode_counter = s.correction_counter = 0
             return
         s.mode_counter += 1
-        variance = config.force_sigma**2
-        if compensated:
-            variance += config.airspeed_sigma**2 * float(omega_b @ omega_b)
-        reports.append(_fuse(s, self._H_level, np.full(2, variance), f_n[:2], t, "accelerometer", "level"))
+        reports.append(_fuse(s, *self.level_look(omega_b, compensated), f_n[:2], t, "accelerometer", LEVEL))
         self._feed_back(s)
+
+    def level_look(self, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
+        """H (2, 6) and R (2,) of a levelling, at the rate ``omega_b``, with the acceleration taken off or without."""
+        variance = self.config.force_sigma**2
+        if compensated:
+            variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b)
+        return self._H_level, np.full(2, variance)
 
     def _level_commanded(self, start: float, end: float) -> bool:
         """Whether nothing but level flight was commanded from ``start`` to ``end`` [s], as far as is known."""
@@ -389,8 +395,7 @@ class Ahrs:
             return []
         self._settle(s)
         z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
-        R = np.array([self.config.magnetometer_sigma**2])
-        return [_fuse(s, self._H_heading, R, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
+        return [_fuse(s, *self.heading_look, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
 
     def _settle(self, s: _State) -> None:
         """Bring error states and covariance up to the time of the attitude."""

@@ -217,7 +217,7 @@ class Federated:
     """
 
     def __init__(self, config: Config, field_n: FieldModel | None = None) -> None:
-        self.config = config
+        self.config, self.field_n = config, field_n
         self.t = math.nan
         self.events: list[Isolation] = []
         self.shares = config.shares

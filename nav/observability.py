@@ -22,7 +22,7 @@ discrete Phi where the continuous F belongs: e^Phi is no transition.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import expm
@@ -145,23 +145,24 @@ def state_names(model: ErrorModel) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Visibility:
-    """Which states can be seen, and when: after each of N segments, from all up to it."""
+    """Which states can be seen, and when: after each of N segments, from all up to it or from that one alone."""
 
     names: list[str]
-    t: Array  # (N,) end of each segment [s]
+    t: Array  # (N + 1,) edges of the segments [s]
     rank: Array  # (N,)
     degree: Array  # (N, n)
     share: Array  # (N, n)
+    alone: Array  # (N, n) share of each state that the segment shows by itself
 
     def seen_from(self) -> Array:
         """(n,) end of the first segment after which the state is seen [s], infinite for never."""
         seen = self.share >= SEEN_SHARE
-        return np.where(seen.any(axis=0), self.t[np.argmax(seen, axis=0)], np.inf)
+        return np.where(seen.any(axis=0), self.t[1:][np.argmax(seen, axis=0)], np.inf)
 
     def __str__(self) -> str:
         """A table: how the rank grows, then for each state since when it is seen, its share and its degree."""
         changes = np.flatnonzero(np.diff(self.rank, prepend=-1))
-        steps = ", ".join(f"{self.rank[k]:.0f} after {self.t[k]:.0f} s" for k in changes)
+        steps = ", ".join(f"{self.rank[k]:.0f} after {self.t[k + 1]:.0f} s" for k in changes)
         width = max(len(name) for name in self.names)
         lines = [f"rank {steps}, of {len(self.names)}", f"{'state':{width}}  seen from [s]  share    degree"]
         for name, first, share, degree in zip(
@@ -179,36 +180,50 @@ def along(names: list[str], segments: Sequence[Segment], start_s: float, toleran
     start, as in the total one, an hour of flight would be judged by how far errors grow in an hour.
     """
     R = np.zeros((0, len(names)))
-    rank, degree, share, ends = [], [], [], []
-    t = start_s
+    rank, degree, share, alone, edges = [], [], [], [], [start_s]
     for segment in segments:
-        R = np.linalg.qr(np.vstack([R, derivatives(segment)])).R  # same singular values and right vectors
+        own = np.linalg.qr(derivatives(segment)).R  # same singular values and right vectors
+        R = np.linalg.qr(np.vstack([R, own])).R
         found = analyse(R, tolerance)
-        t += segment.duration_s
-        ends.append(t)
+        edges.append(edges[-1] + segment.duration_s)
         rank.append(found.rank)
         degree.append(found.degree)
         share.append(found.share)
-    return Visibility(names, np.array(ends), np.array(rank), np.array(degree), np.array(share))
+        alone.append(analyse(own, tolerance).share)
+    return Visibility(names, *map(np.array, (edges, rank, degree, share, alone)))
+
+
+def looked_at(
+    names: list[str],
+    t: Array,
+    F: Array | Sequence[Array],
+    looks: Sequence[tuple[Array, Array]],
+    prior: Array,
+    look_s: float,
+) -> Visibility:
+    """Which states can be seen, and when, in N segments with edges ``t`` (N + 1,) [s].
+
+    Each has its ``F`` (n, n) and its look: H (m, n) and the 1-sigma of its noise (m,), m zero where nothing was looked
+    at. ``prior`` (n,) is the 1-sigma of the states, none of them zero; all set the units together with ``look_s`` [s],
+    the time that a derivative is given to show. A direction counts as seen when its singular value is more than 1: when
+    an error as large as the prior moves the measurements by their noise. Each segment counts as one look; like looks
+    add up with the root of their number.
+    """
+    segments = [
+        in_units(Segment(F_k, H, duration), prior, noise, look_s)
+        for F_k, (H, noise), duration in zip(F, looks, np.diff(t).tolist(), strict=True)
+    ]
+    return replace(along(names, segments, 0.0), t=t)
 
 
 def flown(
     model: ErrorModel, t: Array, q_nb: Array, v_n: Array, lla: Array, f_b: Array, omega_b: Array,
-    H: Array | Sequence[Array], noise: Array, prior: Array, look_s: float,
+    looks: Sequence[tuple[Array, Array]], prior: Array, look_s: float,
 ) -> Visibility:  # fmt: skip
-    """Which states can be seen, and when, along a flown trajectory.
+    """Which states of ``model`` can be seen, and when, along a flown trajectory: see `looked_at`.
 
-    ``t`` (N + 1,) are the edges of N segments, the other arrays their middles: attitude (N, 4), velocity (N, 3), place
-    (N, 3), specific force and rate in b (N, 3). ``H`` (m, n) is the measurement, one for all or one for each segment,
-    ``noise`` (m,) its 1-sigma, ``prior`` (n,) the 1-sigma of the states, none of them zero; both set the units together
-    with ``look_s`` [s], the time that a derivative is given to show. A direction counts as seen when its singular
-    value is more than 1: when an error as large as the prior moves the measurements by their noise. Each segment counts
-    as one look; like looks add up with the root of their number.
+    The arrays of motion are those of the segments' middles: attitude (N, 4), velocity (N, 3), place (N, 3), specific
+    force and rate in b (N, 3).
     """
-    segments = []
-    for k, duration in enumerate(np.diff(t)):
-        F = continuous(model, q_nb[k], v_n[k], lla[k], f_b[k], omega_b[k])
-        look = H if isinstance(H, np.ndarray) else H[k]
-        segments.append(in_units(Segment(F, look, float(duration)), prior, noise, look_s))
-    seen = along(state_names(model), segments, 0.0)
-    return Visibility(seen.names, t[0] + seen.t * look_s, seen.rank, seen.degree, seen.share)
+    F = [continuous(model, *here) for here in zip(q_nb, v_n, lla, f_b, omega_b, strict=True)]
+    return looked_at(state_names(model), t, F, looks, prior, look_s)

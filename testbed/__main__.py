@@ -513,7 +513,7 @@ def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: 
     if faults is not None:
         console.print(faults)
     if report:
-        seen = visibility.table(visibility.of_run(dataset))
+        seen = visibility.of_run(dataset)
         print(f"report: {reports.write_report(dataset, metrics, run_file.parent, seen)}")
     print(f"record: {run_file}")
 

@@ -226,7 +226,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         clear(task.folder)
         return outcome
     try:
-        seen = visibility.table(visibility.of_run(result.dataset))
+        seen = visibility.of_run(result.dataset)
         report.write_report(result.dataset, result.metrics, task.folder, seen)
     except Exception as error:
         return replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))

@@ -13,12 +13,14 @@ import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from nav import earth
+from nav.observability import Visibility
 from nav.samples import Array
 from testbed import metrics as scores
 from testbed.data import write_file
@@ -41,6 +43,7 @@ AXIS_COLOURS = ("#0072B2", "#E69F00", "#009E73")  # north-east-down, forward-rig
 BINS = 900  # a line is drawn through the lowest and highest point of each
 BIAS_MEAN_S = 60.0
 BROKEN = 1e3  # an increment [rad], [m/s] that no IMU measured
+PALE = 0.3  # of its colour: a state seen with the help of earlier measurements
 FAR = 4.0  # times: what is so much larger than the rest gets a view of its own
 
 ROWS: tuple[tuple[str, str], ...] = (
@@ -669,10 +672,59 @@ def wind(run: _Run) -> Figure | None:
     return figure
 
 
+def seen_table(seen: Mapping[str, Visibility]) -> list[list[str]]:
+    """Rows for all: head, ranks, then each state: seen from when [s], or the share of it that is, 0 to 1."""
+    rows = [["state", *seen], ["rank", *(f"{own.rank[-1]} of {len(own.names)}" for own in seen.values())]]
+    for state in _states(seen):
+        row = [state]
+        for own in seen.values():
+            if state not in own.names:
+                row.append("")
+                continue
+            k = own.names.index(state)
+            since = float(own.seen_from()[k])
+            row.append(f"from {since:.0f} s" if np.isfinite(since) else f"never ({own.share[-1, k]:.2f})")
+        rows.append(row)
+    return rows
+
+
+def _states(seen: Mapping[str, Visibility]) -> list[str]:
+    return list(dict.fromkeys(state for own in seen.values() for state in own.names))
+
+
+def visibility(run: _Run, seen: Mapping[str, Visibility]) -> Figure | None:
+    """Which states can be seen, and when: pale with the help of all before, full by what is measured at the time."""
+    if not seen:
+        return None
+    from matplotlib.colors import to_rgb
+
+    states = _states(seen)
+    figure, axes = _figure(1, len(seen), height=0.16 * len(states), head=0.6)
+    figure.subplots_adjust(left=0.16, wspace=0.06)
+    for ax, (name, own) in zip(axes[0], seen.items(), strict=True):
+        cells = np.zeros((len(states), len(own.rank), 4))
+        cells[..., :3] = to_rgb(run.colours[name])
+        rows = [states.index(state) for state in own.names]
+        cells[rows, :, 3] = (PALE * own.share + (1 - PALE) * own.alone).T
+        ax.imshow(
+            cells, extent=(own.t[0], own.t[-1], len(states) - 0.5, -0.5), aspect="auto", interpolation="nearest",
+            zorder=1,
+        )  # fmt: skip
+        missing = sorted(set(range(len(states))) - set(rows))
+        ax.hlines(missing, run.t[0], run.t[-1], color="#BBBBBB", lw=0.6)
+        ax.set_yticks(range(len(states)), states if ax is axes[0, 0] else [], fontsize=7)
+        ax.set_title(name, fontsize=10, loc="left")
+    _against_time(run, axes)
+    for ax in axes[0]:
+        ax.grid(axis="y", visible=False)
+    _head_legend(run, figure, [])
+    return figure
+
+
 # -- page -----------------------------------------------------------------------------------------------------------
 
 
-def _figures(run: _Run) -> Iterator[tuple[str, str, Figure | None]]:
+def _figures(run: _Run, seen: Mapping[str, Visibility]) -> Iterator[tuple[str, str, Figure | None]]:
     """File name, caption and figure, in reading order."""
     yield "ground_track", "Ground track.", ground_track(run)
     yield "flight", "Height and speed.", flight(run)
@@ -697,21 +749,31 @@ def _figures(run: _Run) -> Iterator[tuple[str, str, Figure | None]]:
             )
         yield f"{name}_biases", f"{name}: estimated IMU biases with ±3 sigma.", biases(run, name)
         yield f"{name}_innovations", f"{name}: what each aid said that was not expected.", innovations(run, name)
+    yield (
+        "visibility",
+        "Which states can be seen, and when. Full colour: by what was measured at that time; pale: only together with"
+        " what was measured before; blank: not at all, or not apart from others. A line: the estimator has no such"
+        " state.",
+        visibility(run, seen),
+    )
 
 
 def write_report(
-    dataset: xarray.DataTree, metrics: Mapping[str, float], folder: Path, seen: Sequence[Sequence[str]] = ()
+    dataset: xarray.DataTree,
+    metrics: Mapping[str, float],
+    folder: Path,
+    seen: Mapping[str, Visibility] = MappingProxyType({}),
 ) -> Path:
     """Write ``report.html`` and one PNG per figure into ``folder`` and return the page's path.
 
-    ``seen`` are the rows of a table of which states can be seen, and when, with its head. The page holds everything it
-    shows. Raises UserError when the folder can't be written.
+    ``seen`` tells which states of each estimator can be seen. The page holds everything it shows. Raises UserError when
+    the folder can't be written.
     """
     run = _Run(dataset)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         shown = []
-        for name, caption, figure in _figures(run):
+        for name, caption, figure in _figures(run, seen):
             if figure is not None:
                 png = io.BytesIO()
                 figure.savefig(png, pil_kwargs={"compress_level": 4})
@@ -737,7 +799,7 @@ figcaption{color:#444} pre{background:#f6f6f6;padding:1em;overflow:auto} .warnin
 
 
 def _page(
-    run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, bytes]], seen: Sequence[Sequence[str]]
+    run: _Run, metrics: Mapping[str, float], figures: Sequence[tuple[str, bytes]], seen: Mapping[str, Visibility]
 ) -> str:
     attributes = run.dataset.attrs
     title = html.escape(str(attributes.get("title", "Run")))
@@ -799,15 +861,17 @@ def _html_faults(run: _Run, metrics: Mapping[str, float]) -> str:
     return f"<table><tr>{head}</tr>{body}</table>"
 
 
-def _html_seen(rows: Sequence[Sequence[str]]) -> str:
-    """Which states can be seen, and when."""
-    if not rows or len(rows[0]) < 2:
+def _html_seen(seen: Mapping[str, Visibility]) -> str:
+    """Since when which states can be seen."""
+    if not seen:
         return ""
-    head, *body = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows]
+    head, *body = ["".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in seen_table(seen)]
     text = (
-        "Which states the aids can show along this way, and from when on: an error as large as it was once aligned"
-        " moves what is measured within five seconds by its noise. In brackets the share that shows of one that is"
-        " never seen alone."
+        "Since when the looks that were used can show the state: an error as large as it was once aligned moves what"
+        " is measured within five seconds by its noise. These are the units: of states their 1-sigma once aligned, of"
+        " looks their noise, of time 5 s. In brackets the share that shows of a state that is never seen alone. phi is"
+        " the error of attitude [rad], dv of velocity [m/s], dp of position [m]; x, y, z are the axes of the body. A"
+        " federated filter counts as one filter with the aids of all its locals."
     )
     lines = "".join(f"<tr>{row}</tr>" for row in body)
     return (

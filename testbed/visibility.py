@@ -1,22 +1,29 @@
-"""Which states of each INS can be seen, and when, along the way that a recorded run took.
+"""Which states of each estimator can be seen, and when, along the way that a recorded run took.
 
-The filters are built from the run's scenario as they were for it; truth gives the motion, the record what they could
-look at. See `nav.observability.flown`, whose prior is the estimator's own 1-sigma once aligned.
+The filters are built from the run's scenario as they were for it. Truth gives the motion; the record says which looks
+each of them used (`UpdateReport`), so that whatever kept one away, an outage, a fault, the range of a transponder or
+an isolation, keeps it away here: it shows nothing. See `nav.observability.looked_at`, whose prior is the estimator's
+own 1-sigma once aligned.
+
+A federated filter is judged as one filter with the common states and the aids of all its locals: by what can be seen
+at all. What one local filter sees of its own is less.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from nav.ahrs import LEVEL, MAGNETIC_HEADING, STATES, Ahrs, transition
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
-from nav.earth import isa_pressure
+from nav.earth import earth_rate_n, isa_pressure
 from nav.error_model import MOTION
-from nav.ins import Ins
+from nav.federated import Federated
+from nav.ins import AIDS, Ins
 from nav.local_filter import (
     Aid,
     AirspeedAid,
@@ -28,8 +35,9 @@ from nav.local_filter import (
     PositionFixAid,
     StarAid,
 )
-from nav.observability import Visibility, flown
+from nav.observability import Visibility, flown, looked_at
 from nav.reference import Reference
+from nav.rotation import dcm_from_quat
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -41,6 +49,7 @@ from nav.samples import (
     PositionSample,
     Sample,
     StarSample,
+    Status,
 )
 from testbed import estimators
 from testbed import metrics as scores
@@ -54,11 +63,25 @@ if TYPE_CHECKING:
 SEGMENTS = 60  # of a run at most
 SHORTEST_S = 5.0  # of a segment
 LOOK_S = 5.0  # given to a derivative to show
-KNOWN = 1e-9  # prior of a state that is told to have no error, of its unit
+KNOWN = 1e-9  # sigma of what is told to have no error, of its unit
+
+
+class _Way(NamedTuple):
+    """N segments with edges ``t`` (N + 1,), truth at their middles, and the 1-sigma of the motion at the start (9,)."""
+
+    t: Array
+    middle: Array  # (N,) [s]
+    q_nb: Array
+    v_n: Array
+    lla: Array
+    airspeed: Array
+    f_b: Array
+    omega_b: Array
+    sigma: Array
 
 
 def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
-    """Visibility of each INS of the run that was ever aligned; none of a record whose scenario is no longer read."""
+    """Visibility of each estimator that was ever aligned; none of a record whose scenario is no longer read."""
     try:
         overrides = json.loads(dataset.attrs.get("overrides", "[]"))
         scenario = Scenario.parse(str(dataset.attrs["scenario"]), overrides)
@@ -66,76 +89,125 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
         return {}
     found = {}
     for name, running in estimators.build(scenario, scenario.seed).items():
-        ins = running.horizon.estimator
-        if isinstance(ins, Ins) and name in scores.names(dataset):
-            receiver = next((one for one in running.sensors if scenario.sensors[one].kind == "gnss"), "")
-            seen = _of_ins(dataset, name, ins, receiver)
-            if seen is not None:
-                found[name] = seen
+        way = _way(dataset, name) if name in scores.names(dataset) else None
+        if way is None:
+            continue
+        match running.horizon.estimator:
+            case Ahrs() as ahrs:
+                found[name] = _of_ahrs(dataset, name, way, ahrs)
+            case Ins() as ins:
+                # An INS calls the one sensor of a kind by the kind, the record by its name.
+                named: dict[str, str] = {scenario.sensors[one].kind: one for one in running.sensors}
+                aids = {named[kind]: ins.config.aid_of(kind) for kind in AIDS if kind in ins.config.aids}
+                found[name] = _of_filter(dataset, name, way, ins, aids | {aid.sensor: aid for aid in ins.config.others})
+            case Federated() as federated:
+                watched = [watched.aid for local in federated.config.locals for watched in local.sensors]
+                found[name] = _of_filter(dataset, name, way, federated, {aid.sensor: aid for aid in watched})
     return found
 
 
-def _of_ins(dataset: xarray.DataTree, name: str, ins: Ins, receiver: str) -> Visibility | None:
-    e = scores.errors(dataset, name, 0.0)
-    t = column(dataset, "truth/time")
-    if e.aligned_s is None or t[-1] - e.aligned_s < 2 * SHORTEST_S:
+def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
+    """The way from where the estimator was aligned, None when it never was, or only at the end."""
+    own, t = f"estimators/{name}", column(dataset, "truth/time")
+    aligned = np.flatnonzero(column(dataset, f"{own}/status") & Status.ALIGNED)
+    start = float(column(dataset, f"{own}/time")[aligned[0]]) if len(aligned) else np.inf
+    if t[-1] - start < 2 * SHORTEST_S:
         return None
-    count = min(SEGMENTS, int((t[-1] - e.aligned_s) / SHORTEST_S))
-    edges = np.linspace(e.aligned_s, t[-1], count + 1)
-    middle = np.searchsorted(t, (edges[:-1] + edges[1:]) / 2)
-    true = {key: column(dataset, f"truth/{key}")[middle] for key in ("q_nb", "v_n", "lat", "lon", "h", "airspeed")}
-    interval = t[middle] - t[middle - 1]
-    f_b, omega_b = (column(dataset, f"truth/{key}")[middle] / interval[:, None] for key in ("dv", "dtheta"))
-    lla = np.column_stack([true["lat"], true["lon"], true["h"]])
+    edges = np.linspace(start, t[-1], min(SEGMENTS, int((t[-1] - start) / SHORTEST_S)) + 1)
+    row = np.searchsorted(t, (edges[:-1] + edges[1:]) / 2)
+    lla = np.column_stack([column(dataset, f"truth/{key}")[row] for key in ("lat", "lon", "h")])
+    q_nb, v_n, airspeed, dv, dtheta = (
+        column(dataset, f"truth/{key}")[row] for key in ("q_nb", "v_n", "airspeed", "dv", "dtheta")
+    )
+    interval = (t[row] - t[row - 1])[:, None]
+    sigma = np.concatenate(
+        [column(dataset, f"{own}/sigma_{what}_n")[aligned[0]] for what in ("attitude", "velocity", "position")]
+    )
+    return _Way(edges, t[row], q_nb, v_n, lla, airspeed, dv / interval, dtheta / interval, sigma)
 
-    config = ins.config
-    inner = LocalFilter(config.imu, config.used(), ChiSquareGate(0.0))
-    reference = Reference([inner.model], [1.0], 1, ins.field_n)
-    parts = [(aid, part, size) for aid in config.used() for part, size in aid.parts]
-    H = np.zeros((count, sum(size for *_, size in parts), inner.model.size))
-    variance = np.full(H.shape[1], np.nan)
-    denied = scores.inside(t[middle], scores.outages(dataset))
-    for k in range(count):
-        lat, lon, h = lla[k].tolist()
-        initial = InitialState(float(t[middle[k]]), lat, lon, h, true["v_n"][k], true["q_nb"][k], np.eye(MOTION))
+
+def _used(dataset: xarray.DataTree, name: str, edges: Array, part: str, sensor: str = "") -> Array:
+    """The largest weight (N,) of a look in each segment, 0 without any; of one ``sensor`` if several have the part."""
+    best = np.zeros(len(edges) - 1)
+    if part in scores.aids(dataset, name):
+        own = f"estimators/{name}/innovations/{part}"
+        t, weight = column(dataset, f"{own}/sample_time"), column(dataset, f"{own}/weight")
+        if sensor:
+            mine = column(dataset, f"{own}/sensor").astype(str) == sensor
+            t, weight = t[mine], weight[mine]
+        np.maximum.at(best, np.clip(np.searchsorted(edges, t) - 1, 0, len(best) - 1), weight)
+    return best
+
+
+def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visibility:
+    level, heading = (_used(dataset, name, way.t, part) for part in (LEVEL, MAGNETIC_HEADING))
+    compensated = "airspeed" in ahrs.config.aids
+    F, looks = np.zeros((len(level), STATES, STATES)), []
+    for k, q_nb in enumerate(way.q_nb):
+        F[k, :3] = transition(dcm_from_quat(q_nb), earth_rate_n(float(way.lla[k, 0])), 1.0) - np.eye(3, STATES)
+        levelling = (*ahrs.level_look(way.omega_b[k], compensated), level[k])
+        looks.append(_stacked([levelling, (*ahrs.heading_look, heading[k])], STATES))
+    names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
+    prior = np.concatenate([way.sigma[:3], np.full(3, ahrs.config.imu.gyro_bias_sigma)])
+    return looked_at(names, way.t, F, looks, np.maximum(prior, KNOWN), LOOK_S)
+
+
+def _of_filter(
+    dataset: xarray.DataTree, name: str, way: _Way, estimator: Ins | Federated, aids: Mapping[str, Aid]
+) -> Visibility:
+    """Of one filter with these aids, by the names of their sensors."""
+    inner = LocalFilter(estimator.config.imu, list(aids.values()), ChiSquareGate(0.0))
+    reference = Reference([inner.model], [1.0], 1, estimator.field_n)
+    parts = [
+        (sensor, aid, part, _used(dataset, name, way.t, part, sensor))
+        for sensor, aid in aids.items()
+        for part, _ in aid.parts
+    ]
+    accuracy = {
+        sensor: _accuracy(dataset, sensor) for sensor, aid, _, used in parts if isinstance(aid, GnssAid) and used.any()
+    }
+    looks = []
+    for k in range(len(way.middle)):
+        lat, lon, h = way.lla[k].tolist()
+        initial = InitialState(float(way.middle[k]), lat, lon, h, way.v_n[k], way.q_nb[k], np.eye(MOTION))
         state = reference.start(initial)
-        first = 0
-        for aid, part, size in parts:
-            rows = slice(first, first + size)
-            first += size
-            if isinstance(aid, GnssAid) and (denied[k] or _turns_too_fast(aid, part, omega_b[k])):
-                continue
-            sample = _sample(dataset, aid, initial, reference, float(true["airspeed"][k]), receiver)
-            look = inner.look(reference, state, aid, part, sample)
-            if look is not None and not look.withheld:
-                H[k, rows], variance[rows] = look.H, look.R
-    at = int(np.searchsorted(e.t, e.aligned_s))
-    prior = inner.model.sigma.copy()
-    prior[:MOTION] = np.concatenate([e.sigma_attitude[at], e.sigma_velocity[at], e.sigma_position[at]])
-    noise = np.sqrt(np.where(np.isfinite(variance), variance, 1.0))
+        found = []
+        for sensor, aid, part, used in parts:
+            if used[k] > 0:
+                sample = _sample(aid, initial, reference, float(way.airspeed[k]), accuracy.get(sensor))
+                look = inner.look(reference, state, aid, part, sample)
+                if look is not None:  # there is no course at rest
+                    found.append((look.H, look.R, used[k]))
+        looks.append(_stacked(found, inner.model.size))
+    prior = np.concatenate([way.sigma, inner.model.sigma[MOTION:]])
     return flown(
-        inner.model, edges, true["q_nb"], true["v_n"], lla, f_b, omega_b, list(H), noise,
-        np.maximum(prior, KNOWN), LOOK_S,
-    )  # fmt: skip
+        inner.model, way.t, way.q_nb, way.v_n, way.lla, way.f_b, way.omega_b, looks, np.maximum(prior, KNOWN), LOOK_S
+    )
 
 
-def _turns_too_fast(aid: GnssAid, part: str, omega_b: Array) -> bool:
-    return part == "gnss_course" and aid.course is not None and abs(float(omega_b[2])) > aid.course.max_turn_rate
+def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array]:
+    """Which 1-sigma of position and of velocity (3,) it usually reports."""
+    position, velocity = (column(dataset, f"sensors/{receiver}/sigma_{what}_n") for what in ("position", "velocity"))
+    return np.nanmedian(position, axis=0), np.nanmedian(velocity, axis=0)
+
+
+def _stacked(looks: Sequence[tuple[Array, Array, float]], n: int) -> tuple[Array, Array]:
+    """H (m, n) and 1-sigma of the noise (m,) of all ``looks`` (H, R, weight) that were used."""
+    used = [(H, np.sqrt(np.maximum(R, KNOWN**2) / weight)) for H, R, weight in looks if weight > 0]
+    H, noise = zip((np.zeros((0, n)), np.zeros(0)), *used, strict=True)
+    return np.vstack(H), np.concatenate(noise)
 
 
 def _sample(
-    dataset: xarray.DataTree, aid: Aid, here: InitialState, reference: Reference, airspeed: float, receiver: str
+    aid: Aid, here: InitialState, reference: Reference, airspeed: float, accuracy: tuple[Array, Array] | None
 ) -> Sample:
-    """What the aid's sensor would say here without error, with the accuracy that the ``receiver`` usually reports."""
+    """What the aid's sensor would say here without error; a receiver, with its usual ``accuracy``."""
     t = here.t
     match aid:
         case GnssAid():
-            position, velocity = (
-                np.nanmedian(column(dataset, f"sensors/{receiver}/sigma_{what}_n"), axis=0)
-                for what in ("position", "velocity")
-            )
+            assert accuracy is not None
             return GnssSample(
-                t, t, here.lat, here.lon, here.h, here.v_n, position, velocity, FixType.FIX_3D, 12, 0.9, 1.4, aid.sensor
+                t, t, here.lat, here.lon, here.h, here.v_n, *accuracy, FixType.FIX_3D, 12, 0.9, 1.4, aid.sensor
             )
         case BarometerAid():
             return BarometerSample(t, t, float(isa_pressure(here.h)), aid.sensor)
@@ -151,20 +223,3 @@ def _sample(
         case PositionFixAid():
             return PositionSample(t, t, here.lat, here.lon, here.h, aid.sensor)
     raise TypeError(f"no sample of {aid!r}")
-
-
-def table(found: dict[str, Visibility]) -> list[list[str]]:
-    """Rows for all: head, ranks, then each state: seen from when [s], or the share of it that is, 0 to 1."""
-    rows = [["state", *found], ["rank", *(f"{seen.rank[-1]} of {len(seen.names)}" for seen in found.values())]]
-    names = dict.fromkeys(name for seen in found.values() for name in seen.names)
-    for name in names:
-        row = [name]
-        for seen in found.values():
-            if name not in seen.names:
-                row.append("")
-                continue
-            k = seen.names.index(name)
-            since = float(seen.seen_from()[k])
-            row.append(f"from {since:.0f} s" if math.isfinite(since) else f"never ({seen.share[-1, k]:.2f})")
-        rows.append(row)
-    return rows

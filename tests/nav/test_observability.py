@@ -196,11 +196,11 @@ def test_flown_straight_then_turning():
     prior = np.concatenate([[0.02, 0.02, 0.1], [0.5] * 3, [5.0] * 3, [2e-4] * 3, [0.05] * 3])
     f_b, omega_b = truth.dv[middle] / dt, truth.dtheta[middle] / dt
     moving = flown(model, edges, truth.q_nb[middle], truth.v_n[middle], lla[middle], f_b, omega_b,
-                   [H] * 12, noise, prior, 5.0)  # fmt: skip
+                   [(H, noise)] * 12, prior, 5.0)  # fmt: skip
     still = np.zeros(12, dtype=int)
     level = Rotation.from_euler("z", 0.7).as_quat(scalar_first=True)
     straight = flown(model, edges, np.tile(level, (12, 1)), np.tile([20.0, 15.0, 0.0], (12, 1)), lla[still],
-                     np.tile([0, 0, -9.81], (12, 1)), np.zeros((12, 3)), H, noise, prior, 5.0)  # fmt: skip
+                     np.tile([0, 0, -9.81], (12, 1)), np.zeros((12, 3)), [(H, noise)] * 12, prior, 5.0)  # fmt: skip
     names = state_names(model)
     assert names[:3] == ["phi north", "phi east", "phi down"]
     assert names[9:13] == ["gyro_bias x", "gyro_bias y", "gyro_bias z", "accel_bias x"]
