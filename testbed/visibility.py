@@ -126,21 +126,35 @@ def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
     return _Way(edges, t[row], q_nb, v_n, lla, airspeed, dv / interval, dtheta / interval, sigma)
 
 
-def _used(dataset: xarray.DataTree, name: str, edges: Array, part: str, sensor: str = "") -> Array:
-    """The largest weight (N,) of a look in each segment, 0 without any; of one ``sensor`` if several have the part."""
-    best = np.zeros(len(edges) - 1)
-    if part in scores.aids(dataset, name):
-        own = f"estimators/{name}/innovations/{part}"
-        t, weight = column(dataset, f"{own}/sample_time"), column(dataset, f"{own}/weight")
-        if sensor:
-            mine = column(dataset, f"{own}/sensor").astype(str) == sensor
-            t, weight = t[mine], weight[mine]
-        np.maximum.at(best, np.clip(np.searchsorted(edges, t) - 1, 0, len(best) - 1), weight)
+def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, int], sensor: str = "") -> Array:
+    """The largest weight (N, m) of each axis of a look in each segment, 0 without any; of one ``sensor`` of several.
+
+    Where a look was used in part, the record says how many axes were left out but not which: they are taken for those
+    that were the furthest from what was expected.
+    """
+    aid, m = part
+    best = np.zeros((len(edges) - 1, m))
+    if aid not in scores.aids(dataset, name):
+        return best
+    own = f"estimators/{name}/innovations/{aid}"
+    total = column(dataset, f"{own}/weight")
+    mine = total > 0
+    if sensor:
+        mine &= column(dataset, f"{own}/sensor").astype(str) == sensor
+    total = total[mine]
+    weight = np.repeat(total[:, None], m, axis=1)
+    cut = scores.refused(total, column(dataset, f"{own}/reason")[mine].astype(str))
+    if cut.any():
+        nu, S = (column(dataset, f"{own}/{what}")[mine][cut] for what in ("innovation", "S"))
+        order = np.argsort(np.argsort(-np.abs(nu) / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), axis=1), axis=1)
+        weight[cut] = np.where(order < np.round(m * (1 - total[cut]))[:, None], 0.0, 1.0)
+    segment = np.searchsorted(edges, column(dataset, f"{own}/sample_time")[mine]) - 1
+    np.maximum.at(best, np.clip(segment, 0, len(best) - 1), weight)
     return best
 
 
 def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visibility:
-    level, heading = (_used(dataset, name, way.t, part) for part in (LEVEL, MAGNETIC_HEADING))
+    level, heading = (_used(dataset, name, way.t, part) for part in ((LEVEL, 2), (MAGNETIC_HEADING, 1)))
     compensated = "airspeed" in ahrs.config.aids
     F, looks = np.zeros((len(level), STATES, STATES)), []
     for k, q_nb in enumerate(way.q_nb):
@@ -159,9 +173,9 @@ def _of_filter(
     inner = LocalFilter(estimator.config.imu, list(aids.values()), ChiSquareGate(0.0))
     reference = Reference([inner.model], [1.0], 1, estimator.field_n)
     parts = [
-        (sensor, aid, part, _used(dataset, name, way.t, part, sensor))
+        (sensor, aid, part[0], _used(dataset, name, way.t, part, sensor))
         for sensor, aid in aids.items()
-        for part, _ in aid.parts
+        for part in aid.parts
     ]
     accuracy = {
         sensor: _accuracy(dataset, sensor) for sensor, aid, _, used in parts if isinstance(aid, GnssAid) and used.any()
@@ -173,7 +187,7 @@ def _of_filter(
         state = reference.start(initial)
         found = []
         for sensor, aid, part, used in parts:
-            if used[k] > 0:
+            if used[k].any():
                 sample = _sample(aid, initial, reference, float(way.airspeed[k]), accuracy.get(sensor))
                 look = inner.look(reference, state, aid, part, sample)
                 if look is not None:  # there is no course at rest
@@ -191,11 +205,12 @@ def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array]:
     return np.nanmedian(position, axis=0), np.nanmedian(velocity, axis=0)
 
 
-def _stacked(looks: Sequence[tuple[Array, Array, float]], n: int) -> tuple[Array, Array]:
-    """H (m, n) and 1-sigma of the noise (m,) of all ``looks`` (H, R, weight) that were used."""
-    used = [(H, np.sqrt(np.maximum(R, KNOWN**2) / weight)) for H, R, weight in looks if weight > 0]
-    H, noise = zip((np.zeros((0, n)), np.zeros(0)), *used, strict=True)
-    return np.vstack(H), np.concatenate(noise)
+def _stacked(looks: Sequence[tuple[Array, Array, Array]], n: int) -> tuple[Array, Array]:
+    """H (m, n) and 1-sigma of the noise (m,) of those axes of all ``looks`` (H, R, weight) that were used."""
+    H = np.vstack([np.zeros((0, n)), *(H for H, _, _ in looks)])
+    R, weight = (np.concatenate([[], *values]) for values in ([R for _, R, _ in looks], [w for *_, w in looks]))
+    used = weight > 0
+    return H[used], np.sqrt(np.maximum(R[used], KNOWN**2) / weight[used])
 
 
 def _sample(
