@@ -673,8 +673,9 @@ def wind(run: _Run) -> Figure | None:
 
 
 def seen_table(seen: Mapping[str, Visibility]) -> list[list[str]]:
-    """Rows for all: head, ranks, then each state: seen from when [s], or the share of it that is, 0 to 1."""
+    """Rows for all: head, ranks, steps, then each state: seen from when [s], or the share of it that is, 0 to 1."""
     rows = [["state", *seen], ["rank", *(f"{own.rank[-1]} of {len(own.names)}" for own in seen.values())]]
+    rows.append(["in steps of", *(f"{own.t[1] - own.t[0]:.0f} s" for own in seen.values())])
     for state in _states(seen):
         row = [state]
         for own in seen.values():
@@ -705,7 +706,7 @@ def visibility(run: _Run, seen: Mapping[str, Visibility]) -> Figure | None:
         cells = np.zeros((len(states), len(own.rank), 4))
         cells[..., :3] = to_rgb(run.colours[name])
         rows = [states.index(state) for state in own.names]
-        cells[rows, :, 3] = (PALE * own.share + (1 - PALE) * own.alone).T
+        cells[rows, :, 3] = np.minimum(PALE * own.share + (1 - PALE) * own.alone, 1.0).T  # rounding
         ax.imshow(
             cells, extent=(own.t[0], own.t[-1], len(states) - 0.5, -0.5), aspect="auto", interpolation="nearest",
             zorder=1,
