@@ -51,6 +51,7 @@ from nav.samples import (
 )
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
+BIAS_STAYS = np.eye(STATES)
 KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
 # What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
 LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
@@ -479,7 +480,8 @@ def _azimuth(x_n: Array) -> float:
 def transition(turned: Array, earth_n: Array, T: float) -> Array:
     """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
     north, east, down = (earth_n * T).tolist()
-    return np.hstack([[[1.0, down, -east], [-down, 1.0, north], [east, -north, 1.0]], turned])
+    c_n, c_e, c_d = turned.tolist()
+    return np.array([[1.0, down, -east, *c_n], [-down, 1.0, north, *c_e], [east, -north, 1.0, *c_d]])
 
 
 def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
@@ -488,12 +490,16 @@ def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n:
     Half of the noise before and half after, as in `kalman.predict`.
     """
     T = float(elapsed[0])
-    whole = np.eye(STATES)
+    whole = BIAS_STAYS.copy()
     whole[PHI : PHI + 3] = transition(turned, earth_n, T)
-    half_noise = np.diag(0.5 * T * variance_rate)
+    half_noise = 0.5 * T * variance_rate
+    variances = P.ravel()[:: STATES + 1]
     x[:] = whole @ x
-    P[:] = whole @ (P + half_noise) @ whole.T + half_noise
-    P[:] = 0.5 * (P + P.T)
+    variances += half_noise
+    P[:] = whole @ P @ whole.T
+    variances += half_noise
+    P += P.T.copy()
+    P *= 0.5
     turned[:] = 0.0
     elapsed[0] = 0.0
 
