@@ -30,17 +30,39 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
     for i in range(rows):
         for j in range(n):
             work[i, j] = 0.0
-        for k in range(columns):
-            a = Phi[i, k]
-            if a != 0.0:
-                for j in range(n):
-                    work[i, j] += a * P[k, j]
-    for i in range(rows):
-        for j in range(i, rows):
-            total = 0.0
+        for third in range(columns // 3):
+            k = 3 * third
+            a, b, c = Phi[i, k], Phi[i, k + 1], Phi[i, k + 2]
+            for j in range(n):
+                work[i, j] = work[i, j] + a * P[k, j] + b * P[k + 1, j] + c * P[k + 2, j]
+    for third in range(rows // 3):
+        i = 3 * third
+        for other in range(third, rows // 3):
+            j = 3 * other
+            xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
             for k in range(columns):
-                total += work[i, k] * Phi[j, k]
-            P[i, j] = P[j, i] = total
+                x, y, z = work[i, k], work[i + 1, k], work[i + 2, k]
+                a, b, c = Phi[j, k], Phi[j + 1, k], Phi[j + 2, k]
+                xx += x * a
+                xy += x * b
+                xz += x * c
+                yx += y * a
+                yy += y * b
+                yz += y * c
+                zx += z * a
+                zy += z * b
+                zz += z * c
+            # of a block on the diagonal, what is above it: the later of two equals is kept
+            P[i + 1, j] = P[j, i + 1] = yx
+            P[i + 2, j] = P[j, i + 2] = zx
+            P[i + 2, j + 1] = P[j + 1, i + 2] = zy
+            P[i, j] = P[j, i] = xx
+            P[i, j + 1] = P[j + 1, i] = xy
+            P[i, j + 2] = P[j + 2, i] = xz
+            P[i + 1, j + 1] = P[j + 1, i + 1] = yy
+            P[i + 1, j + 2] = P[j + 2, i + 1] = yz
+            P[i + 2, j + 2] = P[j + 2, i + 2] = zz
+    for i in range(rows):
         for j in range(rows, n):
             P[i, j] = P[j, i] = work[i, j] * decay[j]
     for i in range(rows, n):

@@ -43,7 +43,7 @@ from nav import kalman
 from nav._jit import njit
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
-from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, rotation_coefficients
+from nav.rotation import rotation_coefficients
 from nav.samples import Array
 
 CURVED = 3  # error states in which the equations are not linear: the attitude's, which are the first
@@ -105,9 +105,25 @@ def _cross(ux: float, uy: float, uz: float, vx: float, vy: float, vz: float) -> 
 
 
 @njit
-def _beyond_linear(even: Array, odd: Array, e: Array, Phi: Array, push_n: Array, T: float) -> None:
-    """What the error ``e`` (n,) becomes over ``T`` seconds beyond ``Phi @ e``, in its parts even and odd in e, (9,)."""
-    gx = gy = gz = dx = dy = dz = px = py = pz = 0.0
+def _add_products(P: Array, A: Array, B: Array) -> None:
+    """P <- P + A' B for a symmetric ``P`` (n, n) and symmetric ``A' B``, each (3 k, n); one triangle, then mirrored."""
+    for i in range(len(P)):
+        for third in range(len(A) // 3):
+            k = 3 * third
+            a, b, c = A[k, i], A[k + 1, i], A[k + 2, i]
+            for j in range(i, len(P)):
+                P[i, j] += a * B[k, j] + b * B[k + 1, j] + c * B[k + 2, j]
+        for j in range(i + 1, len(P)):
+            P[j, i] = P[i, j]
+
+
+@njit
+def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n: Array, T: float, s: float) -> None:
+    """What a column ``e`` of L becomes over ``T`` seconds, all (9,) or longer: ``linear`` is ``Phi @ e``.
+
+    ``odd`` and ``even`` are what the errors ``+-s e`` become beyond that, over s, in parts odd and even in e.
+    """
+    dx = dy = dz = gx = gy = gz = px = py = pz = 0.0
     for j in range(VEL, MOTION):  # the turn of n that errors of velocity and place add
         dx += Phi[PHI, j] * e[j]
         dy += Phi[PHI + 1, j] * e[j]
@@ -119,8 +135,17 @@ def _beyond_linear(even: Array, odd: Array, e: Array, Phi: Array, push_n: Array,
         px += Phi[VEL, j] * e[j]
         py += Phi[VEL + 1, j] * e[j]
         pz += Phi[VEL + 2, j] * e[j]
-    x, y, z = e[PHI], e[PHI + 1], e[PHI + 2]
-    fx, fy, fz = push_n[0], push_n[1], push_n[2]
+    linear[PHI], linear[PHI + 1], linear[PHI + 2] = dx + gx, dy + gy, dz + gz
+    linear[VEL], linear[VEL + 1], linear[VEL + 2] = px, py, pz
+    for i in range(MOTION):
+        known = PHI + 3 if i < VEL else MOTION if i < POS else Phi.shape[1]
+        total = linear[i] if i < POS else 0.0
+        for j in range(known):
+            total += Phi[i, j] * e[j]
+        linear[i] = total
+
+    x, y, z = s * e[PHI], s * e[PHI + 1], s * e[PHI + 2]
+    fx, fy, fz = push_n[0] / s, push_n[1] / s, push_n[2] / s
     angle2 = x * x + y * y + z * z
     a, b, _ = rotation_coefficients(angle2)
     k = 1 / 12  # of the Jacobian's inverse, which has no meaning beyond half a turn
@@ -157,63 +182,63 @@ def predict(
     The first five arguments as in `kalman.predict`, with the Phi (9, columns) of `error_model.transition`; ``push_n``
     (3,) is the integral of the specific force in n [m/s], the row sums of the integral of C_nb diag(f_b); ``spread``
     and ``excess`` are of `Scaling`. The mean must be subtracted from the estimate.
+
+    With l_j what the linear step makes of a column, o_j and b_j / s the parts of what it becomes beyond that,
+
+        a_j a_j' = (l_j + o_j) (l_j + o_j)' = l_j l_j' + m_j o_j' + o_j m_j',  m_j = l_j + o_j / 2
+
+    and the linear step of the whole P has the l_j l_j' and all that is not of these columns.
     """
     n = len(P)
-    rows, columns = Phi.shape
-    A, B = np.zeros((CURVED, n)), np.zeros((CURVED, MOTION))
-    mean, point, odd = np.zeros(n), np.empty(n), np.empty(MOTION)
-    C = factor(P, CURVED)
-    # What these columns leave of P goes the linear way
-    for i in range(n):
-        for j in range(CURVED):
-            P[i, j] = P[j, i] = 0.0
-    for i in range(CURVED, n):
-        a, b, c = C[0, i], C[1, i], C[2, i]
-        for j in range(CURVED, n):
-            P[i, j] -= a * C[0, j] + b * C[1, j] + c * C[2, j]
+    root, mean = factor(P, CURVED), np.zeros(n)
     kalman.predict(P, Phi, decay, half_noise, work)
-
+    A, B = np.zeros((4 * CURVED, n)), np.zeros((4 * CURVED, n))
     for k in range(CURVED):
-        for i in range(n):
-            point[i] = spread * C[k, i]
-        _beyond_linear(B[k], odd, point, Phi, push_n, T)
+        middle, odd, even = A[k], A[CURVED + k], A[2 * CURVED + k]
+        _carry(middle, odd, even, root[k], Phi, push_n, T, spread)
+        for i in range(MOTION, n):
+            middle[i] = decay[i] * root[k, i]
         for i in range(MOTION):
-            A[k, i] = odd[i] / spread
-            B[k, i] /= spread
-            mean[i] += B[k, i] / spread
-        for i in range(rows, n):
-            A[k, i] = decay[i] * C[k, i]
-    for i in range(rows):
-        for j in range(columns):
-            step = Phi[i, j]
-            if step != 0.0:
-                for k in range(CURVED):
-                    A[k, i] += step * C[k, j]
-    for i in range(n):
-        a, b, c = A[0, i], A[1, i], A[2, i]
-        for j in range(n):
-            P[i, j] += a * A[0, j] + b * A[1, j] + c * A[2, j]
+            middle[i] += 0.5 * odd[i]
+            mean[i] += even[i] / spread
+            B[k, i], B[2 * CURVED + k, i] = odd[i], even[i]
+        for i in range(n):
+            B[CURVED + k, i] = middle[i]
     for i in range(MOTION):
-        a, b, c, shift = B[0, i], B[1, i], B[2, i], excess * mean[i]
-        for j in range(MOTION):
-            P[i, j] += a * B[0, j] + b * B[1, j] + c * B[2, j] + shift * mean[j]
+        A[3 * CURVED, i], B[3 * CURVED, i] = mean[i], excess * mean[i]
+    _add_products(P, A, B)
     return mean
+
+
+@njit
+def _less(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array, scale: float, per_north: float, per_east: float
+) -> None:  # fmt: skip
+    """Take ``scale`` times an ``error`` (n,) out of an estimate in place; ``per_north`` and ``per_east`` [rad/m]."""
+    ax, ay, az = scale * error[PHI], scale * error[PHI + 1], scale * error[PHI + 2]
+    quarter = 0.25 * (ax * ax + ay * ay + az * az)
+    sinc, versine, _ = rotation_coefficients(quarter)
+    ew, half = 1 - quarter * versine, 0.5 * sinc
+    ex, ey, ez = half * ax, half * ay, half * az
+    w, i, j, k = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
+    q0, q1 = ew * w - ex * i - ey * j - ez * k, ew * i + ex * w + ey * k - ez * j
+    q2, q3 = ew * j - ex * k + ey * w + ez * i, ew * k + ex * j - ey * i + ez * w
+    unit = 1 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
+    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = unit * q0, unit * q1, unit * q2, unit * q3
+    for axis in range(3):
+        v_n[axis] -= scale * error[VEL + axis]
+    lla[0] -= scale * error[POS] * per_north
+    lla[1] = wrap_longitude(lla[1] - scale * error[POS + 1] * per_east)
+    lla[2] += scale * error[POS + 2]
+    for state in range(MOTION, len(x)):
+        x[state] -= scale * error[state]
 
 
 @njit
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
     """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size."""
-    turned = quat_normalise(quat_multiply(quat_from_rotvec(error[PHI : PHI + 3]), q_nb))
     R_M, R_N = radii(lla[0])
-    for i in range(4):
-        q_nb[i] = turned[i]
-    for i in range(3):
-        v_n[i] -= error[VEL + i]
-    lla[1] = wrap_longitude(lla[1] - error[POS + 1] / ((R_N + lla[2]) * math.cos(lla[0])))
-    lla[0] -= error[POS] / (R_M + lla[2])
-    lla[2] += error[POS + 2]
-    for i in range(MOTION, len(x)):
-        x[i] -= error[i]
+    _less(q_nb, v_n, lla, x, error, 1.0, 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0])))
 
 
 @njit
@@ -223,7 +248,8 @@ def _points(
     columns, n = root.shape
     size = 2 * columns + 1
     q, v, place, further = np.empty((size, 4)), np.empty((size, 3)), np.empty((size, 3)), np.empty((size, n))
-    error = np.zeros(n)
+    R_M, R_N = radii(lla[0])
+    per_north, per_east = 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0]))
     for k in range(size):
         for i in range(4):
             q[k, i] = q_nb[i]
@@ -231,10 +257,9 @@ def _points(
             v[k, i], place[k, i] = v_n[i], lla[i]
         for i in range(n):
             further[k, i] = x[i]
-            if k > 0:
-                error[i] = spread * root[k - 1, i] if k <= columns else -spread * root[k - 1 - columns, i]
         if k > 0:
-            remove(q[k], v[k], place[k], further[k], error)
+            column, s = (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
+            _less(q[k], v[k], place[k], further[k], root[column], s, per_north, per_east)
     return q, v, place, further
 
 
@@ -245,132 +270,149 @@ def points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: f
 
 @njit
 def innovate(
-    Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
-) -> tuple[Array, Array, Array, Array, float]:
-    """(nu, S, A, R_curved, nis) of a measurement ``z`` (m,) with variances ``R`` from ``Z`` (2 k + 1, m) at the points.
+    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
+) -> tuple[Array, Array, Array, Array, Array, float]:
+    """(nu, S, H_z, H_z P, R_curved, nis) of a measurement ``z`` (m,) from ``Z`` (2 k + 1, m) at the points.
 
-    The points lie along the first k columns of L (``root`` (n, n) by `factor`); along the others the measurement is
-    linear, with ``H`` (m, n) as in `kalman.innovate`: not used when k = n.
+    The points lie along the first k columns of L (``root`` (k, n) by `factor`, ``P`` (n, n) = L L'); along the others
+    the measurement is linear, with ``H`` (m, n) as in `kalman.innovate`, whose first k columns are not used.
 
-    nu = z - mean; A (m, n) is the measurement's slope along the columns of L; R_curved (m, m) what the curvature adds
-    to R; S = A A' + R_curved + diag(R); nis = nu' S^-1 nu, NaN when rounding has left S not positive definite.
+    nu = z - mean; H_z (m, n) is the Jacobian that has the slopes which the points found along their columns,
+    H_z L_j = -a_j, and beyond its first k columns is H; R_curved (m, m) what the curvature adds to R;
+    S = H_z P H_z' + R_curved + diag(R); nis = nu' S^-1 nu, NaN when rounding has left S not positive definite.
     """
-    curved, n, m = len(Z) // 2, len(root), len(z)
-    A, R_curved, S, nu, shift = np.zeros((m, n)), np.zeros((m, m)), np.empty((m, m)), np.empty(m), np.zeros(m)
-    bend = np.empty(m)
-    for j in range(curved):
-        for i in range(m):
-            A[i, j] = 0.5 * (Z[1 + j, i] - Z[1 + curved + j, i]) / spread
-            bend[i] = (0.5 * (Z[1 + j, i] + Z[1 + curved + j, i]) - Z[0, i]) / spread
-            shift[i] += bend[i] / spread
-        for i in range(m):
-            for k in range(m):
-                R_curved[i, k] += bend[i] * bend[k]
+    curved, n, m = len(root), len(P), len(z)
+    nu, S, H_z, HP = np.empty(m), np.empty((m, m)), np.empty((m, n)), np.zeros((m, n))
+    R_curved, A, bend = np.empty((m, m)), np.empty((m, curved)), np.empty((m, curved))
     for i in range(m):
+        shift = 0.0
+        for j in range(curved):
+            ahead, behind = Z[1 + j, i], Z[1 + curved + j, i]
+            A[i, j] = H_z[i, j] = 0.5 * (ahead - behind) / spread
+            bend[i, j] = (0.5 * (ahead + behind) - Z[0, i]) / spread
+            shift += bend[i, j] / spread
+        nu[i] = shift
+        # H P in two parts: the rows of P, less in their place what the slopes say of the columns
         for j in range(curved, n):
-            for k in range(j, n):
-                A[i, j] -= H[i, k] * root[j, k]  # truth = estimate - error
+            h = H_z[i, j] = H[i, j]
+            if h != 0.0:
+                for k in range(n):
+                    HP[i, k] += h * P[j, k]
+                for k in range(curved):
+                    H_z[i, k] += h * root[k, j]
+        for k in range(curved):
+            a = H_z[i, k]
+            for j in range(k, n):
+                HP[i, j] -= a * root[k, j]
     for i in range(m):
-        nu[i] = z[i] - Z[0, i] - shift[i]
         for k in range(i + 1):
-            R_curved[i, k] += excess * shift[i] * shift[k]
-            R_curved[k, i] = R_curved[i, k]
-            total = R_curved[i, k]
-            for j in range(n):
-                total += A[i, j] * A[k, j]
+            total = excess * nu[i] * nu[k]
+            for j in range(curved):
+                total += bend[i, j] * bend[k, j]
+            R_curved[i, k] = R_curved[k, i] = total
+            for j in range(curved):
+                total += A[i, j] * H_z[k, j]
+            for j in range(curved, n):
+                total += HP[i, j] * H[k, j]
             S[i, k] = S[k, i] = total
         S[i, i] += R[i]
-    S_inverse, definite = kalman.invert(S)
-    nis = 0.0 if definite else math.nan
+    nis = 0.0
+    D, y = factor(S, m), np.empty(m)
     for i in range(m):
-        for k in range(m):
-            nis += nu[i] * S_inverse[i, k] * nu[k]
-    return nu, S, A, R_curved, nis
+        nu[i] = z[i] - Z[0, i] - nu[i]
+        y[i] = nu[i]
+        for k in range(i):
+            y[i] -= D[k, i] * y[k]
+        y[i] /= D[i, i]
+        nis += y[i] * y[i] if D[i, i] > math.sqrt(GUARD * S[i, i]) else math.nan
+        # what the columns of L have of H_z is known: now H_z itself, L being triangular
+        for k in range(curved - 1, -1, -1):
+            a = H_z[i, k]
+            for j in range(k + 1, curved):
+                a += H_z[i, j] * root[k, j]
+            H_z[i, k] = -a / root[k, k] if root[k, k] > 0.0 else 0.0
+    return nu, S, H_z, HP, R_curved, nis
 
 
 @njit
-def correct(P: Array, root: Array, A: Array, R_curved: Array, R: Array, nu: Array) -> Array:
+def correct(P: Array, nu: Array, S: Array, H: Array, HP: Array, R_curved: Array, R: Array) -> Array:
     """Update ``P`` in place and return the mean error (n,) found, for `remove`; the arguments as from `innovate`.
 
-    An infinite variance in ``R`` leaves its axis out. Potter's square root, one decorrelated axis after the other:
+    An infinite variance in ``R`` leaves its axis out. With D D' = S, W = D^-1 H P and K' = D'^-1 W, in Joseph's form:
 
-    L <- L (I - a a' / (r^2 + r)),  r^2 = 1 + a' a
+    left = P - W' W,  P <- left + (K (R_curved + diag(R)) - left H') K'
 
-    so P = L L' is positive whatever rounding did; then the attitude's part is turned into the axes of the corrected
-    estimate, phi <- J_l(mean phi) (phi - mean phi). ``root`` is used up.
+    then the attitude's part is turned into the axes of the corrected estimate, phi <- J_l(mean phi) (phi - mean phi).
     """
-    n, m = len(P), len(nu)
-    kept = np.empty(m, dtype=np.int64)
-    used = 0
+    m, n = H.shape
+    thirds = 3 * ((m + 2) // 3)
+    D, y, found = factor(S, m), np.empty(m), np.zeros(n)
+    W, minus, K = np.zeros((thirds, n)), np.zeros((thirds, n)), np.zeros((thirds, n))
     for i in range(m):
-        if R[i] < math.inf:
-            kept[used] = i
-            used += 1
-    # Rows with independent unit noise: D^-1 A, D^-1 nu, with D D' = R_curved + diag(R)
-    noise, a, y = np.empty((used, used)), np.empty((used, n)), np.empty(used)
-    for i in range(used):
-        y[i] = nu[kept[i]]
+        y[i] = nu[i]
         for j in range(n):
-            a[i, j] = A[kept[i], j]
-        for k in range(used):
-            noise[i, k] = R_curved[kept[i], kept[k]]
-        noise[i, i] += R[kept[i]]
-    D = factor(noise, used)
-    for i in range(used):
+            W[i, j] = HP[i, j]
         for k in range(i):
-            y[i] -= D[k, i] * y[k]
+            c = D[k, i]
+            y[i] -= c * y[k]
             for j in range(n):
-                a[i, j] -= D[k, i] * a[k, j]
-        y[i] /= D[i, i]
+                W[i, j] -= c * W[k, j]
+        c = 1 / D[i, i]
+        y[i] *= c
         for j in range(n):
-            a[i, j] /= D[i, i]
-    found, gain = np.zeros(n), np.empty(n)
-    for i in range(used):
-        total = 1.0
+            W[i, j] *= c
+            minus[i, j] = -W[i, j]
+            found[j] -= y[i] * W[i, j]
+    _add_products(P, minus, W)
+    for i in range(m - 1, -1, -1):
         for j in range(n):
-            gain[j] = 0.0
+            K[i, j] = W[i, j]
+        for k in range(i + 1, m):
+            c = D[i, k]
+            for j in range(n):
+                K[i, j] -= c * K[k, j]
+        c = 1 / D[i, i]
+        for j in range(n):
+            K[i, j] *= c
+    rest = minus
+    for i in range(m):
+        for j in range(n):
+            rest[i, j] = 0.0
+        if R[i] == math.inf:
+            continue
+        for k in range(m):
+            c = R_curved[i, k] + R[i] if k == i else R_curved[i, k]
+            if c != 0.0:
+                for j in range(n):
+                    rest[i, j] += c * K[k, j]
         for k in range(n):
-            total += a[i, k] * a[i, k]
-            c = a[i, k]
-            for j in range(n):
-                gain[j] += c * root[k, j]  # L a
-        shrink = 1.0 / (total + math.sqrt(total))
-        for j in range(n):
-            found[j] += gain[j] * y[i] / total
-        for k in range(n):
-            c = shrink * a[i, k]
-            for j in range(n):
-                root[k, j] -= c * gain[j]
-        # what is left of the later axes: their innovation, and their slope along the new columns
-        for k in range(i + 1, used):
-            product = 0.0
-            for j in range(n):
-                product += a[k, j] * a[i, j]
-            y[k] -= product * y[i] / total
-            for j in range(n):
-                a[k, j] -= shrink * product * a[i, j]
-    _turn(root, found)
-    for i in range(n):
-        for j in range(n):
-            P[i, j] = 0.0
-        for k in range(n):
-            c = root[k, i]
-            for j in range(n):
-                P[i, j] += c * root[k, j]
+            c = H[i, k]
+            if c != 0.0:
+                for j in range(n):
+                    rest[i, j] -= c * P[k, j]
+    _add_products(P, rest, K)
+    _turn(P, found)
     return found
 
 
 @njit
-def _turn(root: Array, error: Array) -> None:
-    """J_l(phi) = I + b [phi x] + c [phi x]^2 on the attitude's part of every column of L, phi of ``error``."""
+def _turn(P: Array, error: Array) -> None:
+    """J_l(phi) = I + b [phi x] + c [phi x]^2 on the attitude's rows and columns of ``P``, phi of ``error``."""
     x, y, z = error[PHI], error[PHI + 1], error[PHI + 2]
     _, b, c = rotation_coefficients(x * x + y * y + z * z)
-    for k in range(len(root)):
-        ux, uy, uz = _cross(x, y, z, root[k, PHI], root[k, PHI + 1], root[k, PHI + 2])
-        wx, wy, wz = _cross(x, y, z, ux, uy, uz)
-        root[k, PHI] += b * ux + c * wx
-        root[k, PHI + 1] += b * uy + c * wy
-        root[k, PHI + 2] += b * uz + c * wz
+    for turn in range(2):  # the rows, all along; then the columns, which beyond the attitude's are the rows
+        for j in range(len(P) if turn == 0 else 3):
+            px, py, pz = (P[0, j], P[1, j], P[2, j]) if turn == 0 else (P[j, 0], P[j, 1], P[j, 2])
+            ux, uy, uz = _cross(x, y, z, px, py, pz)
+            wx, wy, wz = _cross(x, y, z, ux, uy, uz)
+            px, py, pz = px + b * ux + c * wx, py + b * uy + c * wy, pz + b * uz + c * wz
+            if turn == 0:
+                P[0, j], P[1, j], P[2, j] = px, py, pz
+            else:
+                P[j, 0], P[j, 1], P[j, 2] = px, py, pz
+    for i in range(3):
+        for j in range(i + 1, len(P)):
+            P[j, i] = P[i, j]
 
 
 def update(
@@ -385,10 +427,10 @@ def update(
     are not used, and h is asked for 7 points instead of 2n + 1.
     """
     scaling = scaling or Scaling()
-    root = factor(P, len(P))
-    Z = h(points(q_nb, v_n, lla, x, root if H is None else root[:CURVED], scaling.spread))
+    root = factor(P, len(P) if H is None else CURVED)
+    Z = h(points(q_nb, v_n, lla, x, root, scaling.spread))
     slope = np.zeros((len(z), len(P))) if H is None else H
-    nu, S, A, R_curved, nis = innovate(Z, z, R, root, slope, scaling.spread, scaling.excess)
+    nu, S, H_z, HP, R_curved, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
     if nis <= threshold:
-        remove(q_nb, v_n, lla, x, correct(P, root, A, R_curved, R, nu))
+        remove(q_nb, v_n, lla, x, correct(P, nu, S, H_z, HP, R_curved, R))
     return nu, S, nis

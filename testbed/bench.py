@@ -327,10 +327,10 @@ def _unscented_seconds(
         P = P0.copy()
         transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, 1.0)
         unscented.remove(q_nb, v_n, lla, x, unscented.predict(P, Phi, decay, half, work, push, 1.0, spread, excess))
-        root = unscented.factor(P, n)
-        unscented._points(q_nb, v_n, lla, x, root[:3], spread)
-        nu, _, A, curved, _ = unscented.innovate(Z, z, R, root, H, spread, excess)
-        unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, root, A, curved, R, nu))
+        root = unscented.factor(P, unscented.CURVED)
+        unscented._points(q_nb, v_n, lla, x, root, spread)
+        nu, S, H_z, HP, curved, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+        unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, nu, S, H_z, HP, curved, R))
 
 
 def live() -> list[Row]:

@@ -78,16 +78,16 @@ def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     scaling = Scaling(alpha=alpha)
     P = positive(rng, n)
     H, R, z = rng.normal(size=(m, n)), rng.uniform(0.1, 1, m), rng.normal(size=m)
-    root = unscented.factor(P, n)
-    Z = -ONE.spread * alpha * np.vstack([np.zeros(n), root[:k], -root[:k]]) @ H.T  # truth = estimate - error
-    nu, S, A, bend, nis = unscented.innovate(Z, z, R, root, H, scaling.spread, scaling.excess)
+    root = unscented.factor(P, k)
+    Z = -ONE.spread * alpha * np.vstack([np.zeros(n), root, -root]) @ H.T  # truth = estimate - error
+    nu, S, H_z, H_zP, bend, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
     S_linear, S_inverse, HP, nis_linear = kalman.innovate(P, H, R, z)
     np.testing.assert_allclose(nu, z, atol=1e-10)
     np.testing.assert_allclose(S, S_linear, rtol=1e-10)
     np.testing.assert_allclose(nis, nis_linear, rtol=1e-9)
     P_linear = P.copy()
     correction = kalman.correct(P_linear, H, R, HP, S_inverse, z)
-    found = unscented.correct(P, root, A, bend, R, nu)
+    found = unscented.correct(P, nu, S, H_z, H_zP, bend, R)
     np.testing.assert_allclose(found, -correction, atol=1e-10)
     # the attitude's covariance is turned into the corrected axes: undo that with scipy's left Jacobian
     G = np.eye(n)
@@ -107,15 +107,19 @@ def left_jacobian(phi):
 def test_an_infinite_variance_leaves_its_axis_out():
     rng = np.random.default_rng(3)
     n, P = 15, positive(rng, 15)
-    root = unscented.factor(P, n)
-    A, bend, R, nu = rng.normal(size=(3, n)), positive(rng, 3), np.array([1.0, np.inf, 2.0]), rng.normal(size=3)
-    P_two, keep = P.copy(), [0, 2]
-    found = unscented.correct(P, root.copy(), A, bend, R, nu)
-    again = unscented.correct(P_two, root.copy(), A[keep], bend[np.ix_(keep, keep)], R[keep], nu[keep])
+    H, bend, R, nu = rng.normal(size=(3, n)), positive(rng, 3), np.array([1.0, np.inf, 2.0]), rng.normal(size=3)
+    P_two, keep, HP = P.copy(), [0, 2], H @ P
+    S = HP @ H.T + bend
+    both = np.ix_(keep, keep)
+    found = unscented.correct(P, nu, S + np.diag(R), H, HP, bend, R)
+    again = unscented.correct(
+        P_two, nu[keep], S[both] + np.diag(R[keep]), H[keep], HP[keep], bend[both].copy(), R[keep]
+    )
     np.testing.assert_array_equal(found, again)
     np.testing.assert_array_equal(P, P_two)
     before = P.copy()
-    assert not unscented.correct(P, unscented.factor(P, n), A, bend, np.full(3, np.inf), nu).any()
+    never = np.full(3, np.inf)
+    assert not unscented.correct(P, nu, S + np.diag(never), H, HP, bend, never).any()
     np.testing.assert_allclose(P, before, rtol=1e-10, atol=1e-12)
 
 
@@ -135,7 +139,7 @@ def test_curved_measurement_is_the_weighted_sum():
     z, R = np.array([0.3, 0.4, 0.5]), np.array([0.01, 0.02, 0.03])
     root = unscented.factor(P, n)
     Z = h(unscented.points(q, v, lla, x, root, scaling.spread))
-    nu, S, A, bend, _ = unscented.innovate(Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    nu, S, H_z, H_zP, bend, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
 
     c = scaling.spread**2
     W = np.full(2 * n + 1, 0.5 / c)
@@ -147,7 +151,7 @@ def test_curved_measurement_is_the_weighted_sum():
     Pez = np.einsum("k,ki,kj->ij", Wc, scaling.spread * np.vstack([np.zeros(n), root, -root]), Z - mean)
     np.testing.assert_allclose(nu, z - mean, atol=1e-12)
     np.testing.assert_allclose(S, Pzz + np.diag(R), atol=1e-12)
-    np.testing.assert_allclose(root.T @ A.T, Pez, atol=1e-12)
+    np.testing.assert_allclose(-H_zP.T, Pez, atol=1e-12)
     assert np.linalg.eigvalsh(bend).min() > -1e-15
 
     K = Pez @ np.linalg.inv(S)
@@ -377,10 +381,10 @@ def hostile(updates):
     for k in range(updates):
         i = k % 100
         mean = unscented.predict(P, Phi, decay, half, work, pushes[i], 1.0, ONE.spread, ONE.excess)
-        root = unscented.factor(P, n)
+        root = unscented.factor(P, 3)
         Z = numbers[i] if i % 10 == 0 else numbers[i] * 1e-6
-        nu, _, A, bend, nis = unscented.innovate(Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
-        found = unscented.correct(P, root, A, bend, R, nu)
+        nu, *parts, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
+        found = unscented.correct(P, nu, *parts, R)
         if i == 0:
             assert np.isfinite(nis)
             assert np.isfinite(mean).all()
@@ -414,10 +418,10 @@ def _cycles(
         shift = unscented.predict(P, Phi, decay, half, work, push, T, spread, excess)
         unscented.remove(q, v, lla, x, shift)
         if sigma_update:
-            root = unscented.factor(P, n)
-            unscented._points(q, v, lla, x, root[:3], spread)
-            nu, _, A, bend, _ = unscented.innovate(Z, z, R, root, H, spread, excess)
-            unscented.correct(P, root, A, bend, R, nu)
+            root = unscented.factor(P, 3)
+            unscented._points(q, v, lla, x, root, spread)
+            nu, S, H_z, HP, bend, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+            unscented.correct(P, nu, S, H_z, HP, bend, R)
         else:
             _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
             kalman.correct(P, H, R, HP, S_inverse, z)
