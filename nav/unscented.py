@@ -40,7 +40,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nav import kalman
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
 from nav.rotation import rotation_coefficients
@@ -106,18 +106,18 @@ def _cross(ux: float, uy: float, uz: float, vx: float, vy: float, vz: float) -> 
 
 @njit
 def _add_products(P: Array, A: Array, B: Array) -> None:
-    """P <- P + A' B for a symmetric ``P`` (n, n) and symmetric ``A' B``, each (3 k, n); one triangle, then mirrored."""
-    for i in range(len(P)):
-        for third in range(len(A) // 3):
-            k = 3 * third
-            a, b, c = A[k, i], A[k + 1, i], A[k + 2, i]
-            for j in range(i, len(P)):
-                P[i, j] += a * B[k, j] + b * B[k + 1, j] + c * B[k + 2, j]
-        for j in range(i + 1, len(P)):
-            P[j, i] = P[i, j]
+    """P <- P + A' B for a symmetric ``P`` (n, n); ``A`` and ``B`` (6 k, n)."""
+    n = len(P)
+    for sixth in range(len(A) // 6):
+        k = 6 * sixth
+        for i in range(n):
+            a, b, c, d, e, f = A[k, i], A[k + 1, i], A[k + 2, i], A[k + 3, i], A[k + 4, i], A[k + 5, i]
+            for j in range(n):
+                first = (a * B[k, j] + b * B[k + 1, j]) + (c * B[k + 2, j] + d * B[k + 3, j])
+                P[i, j] += first + (e * B[k + 4, j] + f * B[k + 5, j])
 
 
-@njit
+@inlined
 def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n: Array, T: float, s: float) -> None:
     """What a column ``e`` of L becomes over ``T`` seconds, all (9,) or longer: ``linear`` is ``Phi @ e``.
 
@@ -192,29 +192,34 @@ def predict(
     n = len(P)
     root, mean = factor(P, CURVED), np.zeros(n)
     kalman.predict(P, Phi, decay, half_noise, work)
-    A, B = np.zeros((4 * CURVED, n)), np.zeros((4 * CURVED, n))
-    for k in range(CURVED):
-        middle, odd, even = A[k], A[CURVED + k], A[2 * CURVED + k]
+    for k in range(CURVED):  # work has been used
+        middle, odd, even = work[k], work[CURVED + k], work[2 * CURVED + k]
         _carry(middle, odd, even, root[k], Phi, push_n, T, spread)
-        for i in range(MOTION, n):
-            middle[i] = decay[i] * root[k, i]
         for i in range(MOTION):
             middle[i] += 0.5 * odd[i]
             mean[i] += even[i] / spread
-            B[k, i], B[2 * CURVED + k, i] = odd[i], even[i]
-        for i in range(n):
-            B[CURVED + k, i] = middle[i]
+        for i in range(MOTION, n):
+            middle[i] = decay[i] * root[k, i]
+            odd[i] = 0.0
     for i in range(MOTION):
-        A[3 * CURVED, i], B[3 * CURVED, i] = mean[i], excess * mean[i]
-    _add_products(P, A, B)
+        a, b, c, shift = work[6, i], work[7, i], work[8, i], excess * mean[i]
+        for j in range(MOTION):
+            P[i, j] += (a * work[6, j] + b * work[7, j]) + (c * work[8, j] + shift * mean[j])
+        a, b, c, d, e, f = work[0, i], work[1, i], work[2, i], work[3, i], work[4, i], work[5, i]
+        for j in range(n):
+            first = (a * work[3, j] + d * work[0, j]) + (b * work[4, j] + e * work[1, j])
+            P[i, j] += first + (c * work[5, j] + f * work[2, j])
+        for j in range(MOTION, n):
+            P[j, i] = P[i, j]
     return mean
 
 
-@njit
+@inlined
 def _less(
-    q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array, scale: float, per_north: float, per_east: float
+    q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array, scale: float, per_north: float, per_east: float,
+    q: Array, v: Array, place: Array, further: Array,
 ) -> None:  # fmt: skip
-    """Take ``scale`` times an ``error`` (n,) out of an estimate in place; ``per_north`` and ``per_east`` [rad/m]."""
+    """`remove` of ``scale`` times an error with its results in the last four; ``per_north``, ``per_east`` [rad/m]."""
     ax, ay, az = scale * error[PHI], scale * error[PHI + 1], scale * error[PHI + 2]
     quarter = 0.25 * (ax * ax + ay * ay + az * az)
     sinc, versine, _ = rotation_coefficients(quarter)
@@ -224,21 +229,21 @@ def _less(
     q0, q1 = ew * w - ex * i - ey * j - ez * k, ew * i + ex * w + ey * k - ez * j
     q2, q3 = ew * j - ex * k + ey * w + ez * i, ew * k + ex * j - ey * i + ez * w
     unit = 1 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = unit * q0, unit * q1, unit * q2, unit * q3
-    for axis in range(3):
-        v_n[axis] -= scale * error[VEL + axis]
-    lla[0] -= scale * error[POS] * per_north
-    lla[1] = wrap_longitude(lla[1] - scale * error[POS + 1] * per_east)
-    lla[2] += scale * error[POS + 2]
+    q[0], q[1], q[2], q[3] = unit * q0, unit * q1, unit * q2, unit * q3
+    v[0], v[1], v[2] = v_n[0] - scale * error[VEL], v_n[1] - scale * error[VEL + 1], v_n[2] - scale * error[VEL + 2]
+    place[0] = lla[0] - scale * error[POS] * per_north
+    place[1] = wrap_longitude(lla[1] - scale * error[POS + 1] * per_east)
+    place[2] = lla[2] + scale * error[POS + 2]
     for state in range(MOTION, len(x)):
-        x[state] -= scale * error[state]
+        further[state] = x[state] - scale * error[state]
 
 
 @njit
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
     """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size."""
     R_M, R_N = radii(lla[0])
-    _less(q_nb, v_n, lla, x, error, 1.0, 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0])))
+    per_north, per_east = 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0]))
+    _less(q_nb, v_n, lla, x, error, 1.0, per_north, per_east, q_nb, v_n, lla, x)
 
 
 @njit
@@ -251,15 +256,12 @@ def _points(
     R_M, R_N = radii(lla[0])
     per_north, per_east = 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0]))
     for k in range(size):
-        for i in range(4):
-            q[k, i] = q_nb[i]
-        for i in range(3):
-            v[k, i], place[k, i] = v_n[i], lla[i]
-        for i in range(n):
+        column, scale = (0, 0.0) if k == 0 else (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
+        for i in range(MOTION):
             further[k, i] = x[i]
-        if k > 0:
-            column, s = (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
-            _less(q[k], v[k], place[k], further[k], root[column], s, per_north, per_east)
+        _less(
+            q_nb, v_n, lla, x, root[column], scale, per_north, per_east, q[k], v[k], place[k], further[k]
+        )  # fmt: skip
     return q, v, place, further
 
 
@@ -271,27 +273,30 @@ def points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: f
 @njit
 def innovate(
     P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
-) -> tuple[Array, Array, Array, Array, Array, float]:
-    """(nu, S, H_z, H_z P, R_curved, nis) of a measurement ``z`` (m,) from ``Z`` (2 k + 1, m) at the points.
+) -> tuple[Array, Array, Array, Array, Array, Array, float]:
+    """(nu, S, D, H_z, H_z P, R_curved, nis) of a measurement ``z`` (m,) from ``Z`` (2 k + 1, m) at the points.
 
     The points lie along the first k columns of L (``root`` (k, n) by `factor`, ``P`` (n, n) = L L'); along the others
     the measurement is linear, with ``H`` (m, n) as in `kalman.innovate`, whose first k columns are not used.
 
     nu = z - mean; H_z (m, n) is the Jacobian that has the slopes which the points found along their columns,
     H_z L_j = -a_j, and beyond its first k columns is H; R_curved (m, m) what the curvature adds to R;
-    S = H_z P H_z' + R_curved + diag(R); nis = nu' S^-1 nu, NaN when rounding has left S not positive definite.
+    S = H_z P H_z' + R_curved + diag(R) = D D', D by `factor`; nis = nu' S^-1 nu, NaN when rounding has left S not
+    positive definite.
     """
     curved, n, m = len(root), len(P), len(z)
-    nu, S, H_z, HP = np.empty(m), np.empty((m, m)), np.empty((m, n)), np.zeros((m, n))
-    R_curved, A, bend = np.empty((m, m)), np.empty((m, curved)), np.empty((m, curved))
+    nu, S, H_z, HP, R_curved = np.empty(m), np.empty((m, m)), np.empty((m, n)), np.zeros((m, n)), np.empty((m, m))
+    A, bend, y = np.empty((m, curved)), np.empty((m, curved)), np.empty(m)
+    per_spread = 1 / spread
+    half = 0.5 * per_spread
     for i in range(m):
         shift = 0.0
         for j in range(curved):
-            ahead, behind = Z[1 + j, i], Z[1 + curved + j, i]
-            A[i, j] = H_z[i, j] = 0.5 * (ahead - behind) / spread
-            bend[i, j] = (0.5 * (ahead + behind) - Z[0, i]) / spread
-            shift += bend[i, j] / spread
-        nu[i] = shift
+            ahead, behind = Z[1 + j, i] - Z[0, i], Z[1 + curved + j, i] - Z[0, i]
+            A[i, j] = H_z[i, j] = half * (ahead - behind)
+            bend[i, j] = half * (ahead + behind)
+            shift += per_spread * bend[i, j]
+        y[i] = shift
         # H P in two parts: the rows of P, less in their place what the slopes say of the columns
         for j in range(curved, n):
             h = H_z[i, j] = H[i, j]
@@ -302,52 +307,54 @@ def innovate(
                     H_z[i, k] += h * root[k, j]
         for k in range(curved):
             a = H_z[i, k]
-            for j in range(k, n):
+            for j in range(n):
                 HP[i, j] -= a * root[k, j]
     for i in range(m):
         for k in range(i + 1):
-            total = excess * nu[i] * nu[k]
+            total = excess * y[i] * y[k]
             for j in range(curved):
                 total += bend[i, j] * bend[k, j]
             R_curved[i, k] = R_curved[k, i] = total
             for j in range(curved):
                 total += A[i, j] * H_z[k, j]
             for j in range(curved, n):
-                total += HP[i, j] * H[k, j]
+                if H[k, j] != 0.0:
+                    total += HP[i, j] * H[k, j]
             S[i, k] = S[k, i] = total
         S[i, i] += R[i]
-    nis = 0.0
-    D, y = factor(S, m), np.empty(m)
+    D, nis = factor(S, m), 0.0
     for i in range(m):
-        nu[i] = z[i] - Z[0, i] - nu[i]
+        nu[i] = z[i] - Z[0, i] - y[i]
         y[i] = nu[i]
         for k in range(i):
             y[i] -= D[k, i] * y[k]
         y[i] /= D[i, i]
         nis += y[i] * y[i] if D[i, i] > math.sqrt(GUARD * S[i, i]) else math.nan
-        # what the columns of L have of H_z is known: now H_z itself, L being triangular
-        for k in range(curved - 1, -1, -1):
+    # Of the columns of L, which are a triangle there, the first columns of H_z know the slopes: now they themselves
+    for k in range(curved - 1, -1, -1):
+        c = -1 / root[k, k] if root[k, k] > 0.0 else 0.0
+        for i in range(m):
             a = H_z[i, k]
             for j in range(k + 1, curved):
                 a += H_z[i, j] * root[k, j]
-            H_z[i, k] = -a / root[k, k] if root[k, k] > 0.0 else 0.0
-    return nu, S, H_z, HP, R_curved, nis
+            H_z[i, k] = c * a
+    return nu, S, D, H_z, HP, R_curved, nis
 
 
 @njit
-def correct(P: Array, nu: Array, S: Array, H: Array, HP: Array, R_curved: Array, R: Array) -> Array:
+def correct(P: Array, nu: Array, D: Array, H: Array, HP: Array, R_curved: Array, R: Array) -> Array:
     """Update ``P`` in place and return the mean error (n,) found, for `remove`; the arguments as from `innovate`.
 
-    An infinite variance in ``R`` leaves its axis out. With D D' = S, W = D^-1 H P and K' = D'^-1 W, in Joseph's form:
+    An infinite variance in ``R`` leaves its axis out. With S = D D', W = D^-1 H P and K' = D'^-1 W, in Joseph's form:
 
     left = P - W' W,  P <- left + (K (R_curved + diag(R)) - left H') K'
 
     then the attitude's part is turned into the axes of the corrected estimate, phi <- J_l(mean phi) (phi - mean phi).
     """
     m, n = H.shape
-    thirds = 3 * ((m + 2) // 3)
-    D, y, found = factor(S, m), np.empty(m), np.zeros(n)
-    W, minus, K = np.zeros((thirds, n)), np.zeros((thirds, n)), np.zeros((thirds, n))
+    sixths = 6 * ((m + 5) // 6)
+    y, found = np.empty(m), np.zeros(n)
+    W, rest, K = np.zeros((sixths, n)), np.zeros((sixths, n)), np.zeros((sixths, n))
     for i in range(m):
         y[i] = nu[i]
         for j in range(n):
@@ -361,9 +368,9 @@ def correct(P: Array, nu: Array, S: Array, H: Array, HP: Array, R_curved: Array,
         y[i] *= c
         for j in range(n):
             W[i, j] *= c
-            minus[i, j] = -W[i, j]
+            rest[i, j] = -W[i, j]
             found[j] -= y[i] * W[i, j]
-    _add_products(P, minus, W)
+    _add_products(P, rest, W)
     for i in range(m - 1, -1, -1):
         for j in range(n):
             K[i, j] = W[i, j]
@@ -374,28 +381,26 @@ def correct(P: Array, nu: Array, S: Array, H: Array, HP: Array, R_curved: Array,
         c = 1 / D[i, i]
         for j in range(n):
             K[i, j] *= c
-    rest = minus
     for i in range(m):
         for j in range(n):
             rest[i, j] = 0.0
-        if R[i] == math.inf:
-            continue
-        for k in range(m):
-            c = R_curved[i, k] + R[i] if k == i else R_curved[i, k]
-            if c != 0.0:
-                for j in range(n):
-                    rest[i, j] += c * K[k, j]
-        for k in range(n):
-            c = H[i, k]
-            if c != 0.0:
-                for j in range(n):
-                    rest[i, j] -= c * P[k, j]
+        if R[i] < math.inf:
+            for k in range(m):
+                c = R_curved[i, k] + R[i] if k == i else R_curved[i, k]
+                if c != 0.0:
+                    for j in range(n):
+                        rest[i, j] += c * K[k, j]
+            for k in range(n):
+                c = H[i, k]
+                if c != 0.0:
+                    for j in range(n):
+                        rest[i, j] -= c * P[k, j]
     _add_products(P, rest, K)
     _turn(P, found)
     return found
 
 
-@njit
+@inlined
 def _turn(P: Array, error: Array) -> None:
     """J_l(phi) = I + b [phi x] + c [phi x]^2 on the attitude's rows and columns of ``P``, phi of ``error``."""
     x, y, z = error[PHI], error[PHI + 1], error[PHI + 2]
@@ -410,7 +415,7 @@ def _turn(P: Array, error: Array) -> None:
                 P[0, j], P[1, j], P[2, j] = px, py, pz
             else:
                 P[j, 0], P[j, 1], P[j, 2] = px, py, pz
-    for i in range(3):
+    for i in range(len(P)):
         for j in range(i + 1, len(P)):
             P[j, i] = P[i, j]
 
@@ -430,7 +435,7 @@ def update(
     root = factor(P, len(P) if H is None else CURVED)
     Z = h(points(q_nb, v_n, lla, x, root, scaling.spread))
     slope = np.zeros((len(z), len(P))) if H is None else H
-    nu, S, H_z, HP, R_curved, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
+    nu, S, D, H_z, HP, R_curved, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
     if nis <= threshold:
-        remove(q_nb, v_n, lla, x, correct(P, nu, S, H_z, HP, R_curved, R))
+        remove(q_nb, v_n, lla, x, correct(P, nu, D, H_z, HP, R_curved, R))
     return nu, S, nis
