@@ -607,10 +607,10 @@ class LocalFilter:
         s, P, scaling = state, state.P[self.row], self.scaling
         assert scaling is not None
         root, z = unscented.factor(P, CURVED), np.zeros(len(R))
-        nu, S, D, H_z, HP, bend, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
+        nu, S, D, HP, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
         if nis <= threshold:
             x, common = self._whole(s), len(s.imu)
-            unscented.remove(s.q_nb, s.v_n, s.lla, x, unscented.correct(P, nu, D, H_z, HP, bend, R))
+            unscented.remove(s.q_nb, s.v_n, s.lla, x, unscented.correct(P, nu, D, HP))
             s.imu[MOTION:], s.x[self.row, common:] = x[MOTION:common], x[common:]
             sensor_errors(s.errors, s.imu, reference.driven)
         return S, nis

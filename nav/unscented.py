@@ -49,6 +49,7 @@ from nav.samples import Array
 CURVED = 3  # error states in which the equations are not linear: the attitude's, which are the first
 HALF_TURN2 = math.pi**2
 GUARD = 1e-14  # of a variance, what rounding may have left of it at least
+TAKEN = 1 - GUARD  # of what a measurement takes from the covariance
 
 
 class Scaling(NamedTuple):
@@ -102,19 +103,6 @@ def factor(P: Array, columns: int) -> Array:
 @njit
 def _cross(ux: float, uy: float, uz: float, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-
-
-@njit
-def _add_products(P: Array, A: Array, B: Array) -> None:
-    """P <- P + A' B for a symmetric ``P`` (n, n); ``A`` and ``B`` (6 k, n)."""
-    n = len(P)
-    for sixth in range(len(A) // 6):
-        k = 6 * sixth
-        for i in range(n):
-            a, b, c, d, e, f = A[k, i], A[k + 1, i], A[k + 2, i], A[k + 3, i], A[k + 4, i], A[k + 5, i]
-            for j in range(n):
-                first = (a * B[k, j] + b * B[k + 1, j]) + (c * B[k + 2, j] + d * B[k + 3, j])
-                P[i, j] += first + (e * B[k + 4, j] + f * B[k + 5, j])
 
 
 @inlined
@@ -273,149 +261,114 @@ def points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: f
 @njit
 def innovate(
     P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
-) -> tuple[Array, Array, Array, Array, Array, Array, float]:
-    """(nu, S, D, H_z, H_z P, R_curved, nis) of a measurement ``z`` (m,) from ``Z`` (2 k + 1, m) at the points.
+) -> tuple[Array, Array, Array, Array, float]:
+    """(nu, S, D, H P, nis) of a measurement ``z`` (m,) with variances ``R`` from ``Z`` (2 k + 1, m) at the points.
 
     The points lie along the first k columns of L (``root`` (k, n) by `factor`, ``P`` (n, n) = L L'); along the others
-    the measurement is linear, with ``H`` (m, n) as in `kalman.innovate`, whose first k columns are not used.
+    the measurement is linear, with ``H`` (m, n) as in `kalman.innovate`, whose first k columns are not used: in its
+    ``H P`` there are those that have the slopes which the points found, H L_j = -a_j.
 
-    nu = z - mean; H_z (m, n) is the Jacobian that has the slopes which the points found along their columns,
-    H_z L_j = -a_j, and beyond its first k columns is H; R_curved (m, m) what the curvature adds to R;
-    S = H_z P H_z' + R_curved + diag(R) = D D', D by `factor`; nis = nu' S^-1 nu, NaN when rounding has left S not
-    positive definite.
+    nu = z - mean; S = H P H' + diag(R) and what the curvature adds to R; S = D D', D by `factor`; nis = nu' S^-1 nu,
+    NaN when rounding has left S not positive definite.
     """
     curved, n, m = len(root), len(P), len(z)
-    nu, S, H_z, HP, R_curved = np.empty(m), np.empty((m, m)), np.empty((m, n)), np.zeros((m, n)), np.empty((m, m))
-    A, bend, y = np.empty((m, curved)), np.empty((m, curved)), np.empty(m)
+    nu, S, HP = np.empty(m), np.empty((m, m)), np.zeros((m, n))
+    slope, bend, part = np.empty((m, curved)), np.empty((m, curved)), np.empty((m, curved))
     per_spread = 1 / spread
     half = 0.5 * per_spread
     for i in range(m):
         shift = 0.0
         for j in range(curved):
             ahead, behind = Z[1 + j, i] - Z[0, i], Z[1 + curved + j, i] - Z[0, i]
-            A[i, j] = H_z[i, j] = half * (ahead - behind)
+            slope[i, j] = part[i, j] = half * (ahead - behind)
             bend[i, j] = half * (ahead + behind)
             shift += per_spread * bend[i, j]
-        y[i] = shift
-        # H P in two parts: the rows of P, less in their place what the slopes say of the columns
+        nu[i] = shift
+        # of the rows of P, what lies along the first columns is replaced: ``part`` is the slope less the linear share
         for j in range(curved, n):
-            h = H_z[i, j] = H[i, j]
+            h = H[i, j]
             if h != 0.0:
                 for k in range(n):
                     HP[i, k] += h * P[j, k]
                 for k in range(curved):
-                    H_z[i, k] += h * root[k, j]
+                    part[i, k] += h * root[k, j]
         for k in range(curved):
-            a = H_z[i, k]
+            a = part[i, k]
             for j in range(n):
                 HP[i, j] -= a * root[k, j]
     for i in range(m):
         for k in range(i + 1):
-            total = excess * y[i] * y[k]
+            total = excess * nu[i] * nu[k]
             for j in range(curved):
-                total += bend[i, j] * bend[k, j]
-            R_curved[i, k] = R_curved[k, i] = total
-            for j in range(curved):
-                total += A[i, j] * H_z[k, j]
+                total += bend[i, j] * bend[k, j] + slope[i, j] * part[k, j]
             for j in range(curved, n):
-                if H[k, j] != 0.0:
-                    total += HP[i, j] * H[k, j]
+                total += HP[i, j] * H[k, j]
             S[i, k] = S[k, i] = total
         S[i, i] += R[i]
     D, nis = factor(S, m), 0.0
     for i in range(m):
-        nu[i] = z[i] - Z[0, i] - y[i]
-        y[i] = nu[i]
-        for k in range(i):
-            y[i] -= D[k, i] * y[k]
-        y[i] /= D[i, i]
-        nis += y[i] * y[i] if D[i, i] > math.sqrt(GUARD * S[i, i]) else math.nan
-    # Of the columns of L, which are a triangle there, the first columns of H_z know the slopes: now they themselves
-    for k in range(curved - 1, -1, -1):
-        c = -1 / root[k, k] if root[k, k] > 0.0 else 0.0
-        for i in range(m):
-            a = H_z[i, k]
-            for j in range(k + 1, curved):
-                a += H_z[i, j] * root[k, j]
-            H_z[i, k] = c * a
-    return nu, S, D, H_z, HP, R_curved, nis
+        nu[i] = z[i] - Z[0, i] - nu[i]
+    y = nu.copy()
+    for i in range(m):
+        y[i] *= 1 / D[i, i] if D[i, i] > math.sqrt(GUARD * S[i, i]) else math.nan
+        nis += y[i] * y[i]
+        for k in range(i + 1, m):
+            y[k] -= D[i, k] * y[i]
+    return nu, S, D, HP, nis
 
 
 @njit
-def correct(P: Array, nu: Array, D: Array, H: Array, HP: Array, R_curved: Array, R: Array) -> Array:
+def correct(P: Array, nu: Array, D: Array, HP: Array) -> Array:
     """Update ``P`` in place and return the mean error (n,) found, for `remove`; the arguments as from `innovate`.
 
-    An infinite variance in ``R`` leaves its axis out. With S = D D', W = D^-1 H P and K' = D'^-1 W, in Joseph's form:
+    An axis of infinite variance is left out. With W = D^-1 H P and y = D^-1 nu
 
-    left = P - W' W,  P <- left + (K (R_curved + diag(R)) - left H') K'
+    mean = -W' y,  P <- P - TAKEN W' W
 
-    then the attitude's part is turned into the axes of the corrected estimate, phi <- J_l(mean phi) (phi - mean phi).
+    which leaves as much as rounding may have taken too much; then the
+    attitude's part is turned into the axes of the corrected estimate, phi <- J_l(mean phi) (phi - mean phi). ``HP`` is
+    used up.
     """
-    m, n = H.shape
-    sixths = 6 * ((m + 5) // 6)
-    y, found = np.empty(m), np.zeros(n)
-    W, rest, K = np.zeros((sixths, n)), np.zeros((sixths, n)), np.zeros((sixths, n))
+    m, n = HP.shape
+    y, mean = nu.copy(), np.zeros(n)
+    W = np.zeros((6 * ((m + 5) // 6), n))
     for i in range(m):
-        y[i] = nu[i]
-        for j in range(n):
-            W[i, j] = HP[i, j]
-        for k in range(i):
-            c = D[k, i]
-            y[i] -= c * y[k]
-            for j in range(n):
-                W[i, j] -= c * W[k, j]
         c = 1 / D[i, i]
         y[i] *= c
         for j in range(n):
-            W[i, j] *= c
-            rest[i, j] = -W[i, j]
-            found[j] -= y[i] * W[i, j]
-    _add_products(P, rest, W)
-    for i in range(m - 1, -1, -1):
-        for j in range(n):
-            K[i, j] = W[i, j]
+            W[i, j] = c * HP[i, j]
+            mean[j] -= y[i] * W[i, j]
         for k in range(i + 1, m):
             c = D[i, k]
+            y[k] -= c * y[i]
             for j in range(n):
-                K[i, j] -= c * K[k, j]
-        c = 1 / D[i, i]
-        for j in range(n):
-            K[i, j] *= c
-    for i in range(m):
-        for j in range(n):
-            rest[i, j] = 0.0
-        if R[i] < math.inf:
-            for k in range(m):
-                c = R_curved[i, k] + R[i] if k == i else R_curved[i, k]
-                if c != 0.0:
-                    for j in range(n):
-                        rest[i, j] += c * K[k, j]
-            for k in range(n):
-                c = H[i, k]
-                if c != 0.0:
-                    for j in range(n):
-                        rest[i, j] -= c * P[k, j]
-    _add_products(P, rest, K)
-    _turn(P, found)
-    return found
+                HP[k, j] -= c * W[i, j]
+    for sixth in range(len(W) // 6):
+        k = 6 * sixth
+        for i in range(n):
+            a, b, c, d, e, f = W[k, i], W[k + 1, i], W[k + 2, i], W[k + 3, i], W[k + 4, i], W[k + 5, i]
+            for j in range(n):
+                first = a * W[k, j] + b * W[k + 1, j] + c * W[k + 2, j]
+                P[i, j] -= TAKEN * (first + d * W[k + 3, j] + e * W[k + 4, j] + f * W[k + 5, j])
+    _turn(P, mean)
+    return mean
 
 
 @inlined
 def _turn(P: Array, error: Array) -> None:
-    """J_l(phi) = I + b [phi x] + c [phi x]^2 on the attitude's rows and columns of ``P``, phi of ``error``."""
+    """J P J' for the attitude's part of ``P``, with J = J_l(phi) = I + b [phi x] + c [phi x]^2 and phi of ``error``."""
     x, y, z = error[PHI], error[PHI + 1], error[PHI + 2]
     _, b, c = rotation_coefficients(x * x + y * y + z * z)
-    for turn in range(2):  # the rows, all along; then the columns, which beyond the attitude's are the rows
-        for j in range(len(P) if turn == 0 else 3):
-            px, py, pz = (P[0, j], P[1, j], P[2, j]) if turn == 0 else (P[j, 0], P[j, 1], P[j, 2])
-            ux, uy, uz = _cross(x, y, z, px, py, pz)
-            wx, wy, wz = _cross(x, y, z, ux, uy, uz)
-            px, py, pz = px + b * ux + c * wx, py + b * uy + c * wy, pz + b * uz + c * wz
-            if turn == 0:
-                P[0, j], P[1, j], P[2, j] = px, py, pz
-            else:
-                P[j, 0], P[j, 1], P[j, 2] = px, py, pz
-    for i in range(len(P)):
+    xx, xy, xz = 1 - c * (y * y + z * z), c * x * y - b * z, c * x * z + b * y
+    yx, yy, yz = c * x * y + b * z, 1 - c * (x * x + z * z), c * y * z - b * x
+    zx, zy, zz = c * x * z - b * y, c * y * z + b * x, 1 - c * (x * x + y * y)
+    for j in range(len(P)):
+        u, v, w = P[0, j], P[1, j], P[2, j]
+        P[0, j], P[1, j], P[2, j] = xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w
+    for i in range(3):
+        u, v, w = P[i, 0], P[i, 1], P[i, 2]
+        P[i, 0], P[i, 1], P[i, 2] = xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w
+    for i in range(3):
         for j in range(i + 1, len(P)):
             P[j, i] = P[i, j]
 
@@ -435,7 +388,7 @@ def update(
     root = factor(P, len(P) if H is None else CURVED)
     Z = h(points(q_nb, v_n, lla, x, root, scaling.spread))
     slope = np.zeros((len(z), len(P))) if H is None else H
-    nu, S, D, H_z, HP, R_curved, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
+    nu, S, D, HP, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
     if nis <= threshold:
-        remove(q_nb, v_n, lla, x, correct(P, nu, D, H_z, HP, R_curved, R))
+        remove(q_nb, v_n, lla, x, correct(P, nu, D, HP))
     return nu, S, nis

@@ -329,8 +329,8 @@ def _unscented_seconds(
         unscented.remove(q_nb, v_n, lla, x, unscented.predict(P, Phi, decay, half, work, push, 1.0, spread, excess))
         root = unscented.factor(P, unscented.CURVED)
         unscented._points(q_nb, v_n, lla, x, root, spread)
-        nu, S, D, H_z, HP, curved, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
-        unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, nu, D, H_z, HP, curved, R))
+        nu, _, D, HP, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+        unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, nu, D, HP))
 
 
 def live() -> list[Row]:

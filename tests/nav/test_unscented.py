@@ -80,14 +80,14 @@ def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     H, R, z = rng.normal(size=(m, n)), rng.uniform(0.1, 1, m), rng.normal(size=m)
     root = unscented.factor(P, k)
     Z = -ONE.spread * alpha * np.vstack([np.zeros(n), root, -root]) @ H.T  # truth = estimate - error
-    nu, S, D, H_z, H_zP, bend, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
+    nu, S, D, H_zP, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
     S_linear, S_inverse, HP, nis_linear = kalman.innovate(P, H, R, z)
     np.testing.assert_allclose(nu, z, atol=1e-10)
     np.testing.assert_allclose(S, S_linear, rtol=1e-10)
     np.testing.assert_allclose(nis, nis_linear, rtol=1e-9)
     P_linear = P.copy()
     correction = kalman.correct(P_linear, H, R, HP, S_inverse, z)
-    found = unscented.correct(P, nu, D, H_z, H_zP, bend, R)
+    found = unscented.correct(P, nu, D, H_zP)
     np.testing.assert_allclose(found, -correction, atol=1e-10)
     # the attitude's covariance is turned into the corrected axes: undo that with scipy's left Jacobian
     G = np.eye(n)
@@ -111,15 +111,13 @@ def test_an_infinite_variance_leaves_its_axis_out():
     P_two, keep, HP = P.copy(), [0, 2], H @ P
     S = HP @ H.T + bend
     both = np.ix_(keep, keep)
-    found = unscented.correct(P, nu, unscented.factor(S + np.diag(R), 3), H, HP, bend, R)
-    again = unscented.correct(
-        P_two, nu[keep], unscented.factor(S[both] + np.diag(R[keep]), 2), H[keep], HP[keep], bend[both].copy(), R[keep]
-    )
+    found = unscented.correct(P, nu, unscented.factor(S + np.diag(R), 3), HP.copy())
+    again = unscented.correct(P_two, nu[keep], unscented.factor(S[both] + np.diag(R[keep]), 2), HP[keep])
     np.testing.assert_array_equal(found, again)
     np.testing.assert_array_equal(P, P_two)
     before = P.copy()
     never = np.full(3, np.inf)
-    assert not unscented.correct(P, nu, unscented.factor(S + np.diag(never), 3), H, HP, bend, never).any()
+    assert not unscented.correct(P, nu, unscented.factor(S + np.diag(never), 3), HP).any()
     np.testing.assert_allclose(P, before, rtol=1e-10, atol=1e-12)
 
 
@@ -139,7 +137,7 @@ def test_curved_measurement_is_the_weighted_sum():
     z, R = np.array([0.3, 0.4, 0.5]), np.array([0.01, 0.02, 0.03])
     root = unscented.factor(P, n)
     Z = h(unscented.points(q, v, lla, x, root, scaling.spread))
-    nu, S, D, H_z, H_zP, bend, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    nu, S, D, HP, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
 
     c = scaling.spread**2
     W = np.full(2 * n + 1, 0.5 / c)
@@ -151,7 +149,9 @@ def test_curved_measurement_is_the_weighted_sum():
     Pez = np.einsum("k,ki,kj->ij", Wc, scaling.spread * np.vstack([np.zeros(n), root, -root]), Z - mean)
     np.testing.assert_allclose(nu, z - mean, atol=1e-12)
     np.testing.assert_allclose(S, Pzz + np.diag(R), atol=1e-12)
-    np.testing.assert_allclose(-H_zP.T, Pez, atol=1e-12)
+    np.testing.assert_allclose(-HP.T, Pez, atol=1e-12)
+    A = -np.linalg.solve(root.T, HP.T).T
+    bend = S - np.diag(R) - A @ A.T
     assert np.linalg.eigvalsh(bend).min() > -1e-15
 
     K = Pez @ np.linalg.inv(S)
@@ -383,8 +383,8 @@ def hostile(updates):
         mean = unscented.predict(P, Phi, decay, half, work, pushes[i], 1.0, ONE.spread, ONE.excess)
         root = unscented.factor(P, 3)
         Z = numbers[i] if i % 10 == 0 else numbers[i] * 1e-6
-        nu, _, *parts, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
-        found = unscented.correct(P, nu, *parts, R)
+        nu, _, D, HP, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
+        found = unscented.correct(P, nu, D, HP)
         if i == 0:
             assert np.isfinite(nis)
             assert np.isfinite(mean).all()
@@ -420,8 +420,8 @@ def _cycles(
         if sigma_update:
             root = unscented.factor(P, 3)
             unscented._points(q, v, lla, x, root, spread)
-            nu, S, D, H_z, HP, bend, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
-            unscented.correct(P, nu, D, H_z, HP, bend, R)
+            nu, S, D, HP, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+            unscented.correct(P, nu, D, HP)
         else:
             _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
             kalman.correct(P, H, R, HP, S_inverse, z)
