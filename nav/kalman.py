@@ -64,8 +64,10 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
             P[i + 2, j + 2] = P[j + 2, i + 2] = zz
     for i in range(rows):
         for j in range(rows, n):
-            P[i, j] = P[j, i] = work[i, j] * decay[j]
+            P[i, j] = work[i, j] * decay[j]
     for i in range(rows, n):
+        for j in range(rows):
+            P[i, j] = P[j, i]
         if decay[i] != 1.0:
             for j in range(rows, n):
                 P[i, j] *= decay[i]

@@ -95,8 +95,9 @@ def factor(P: Array, columns: int) -> Array:
                 root[j, i] -= c * root[k, i]
         pivot = math.sqrt(max(root[j, j], GUARD * P[j, j], 0.0))
         root[j, j] = pivot
+        c = 1 / pivot if pivot > 0.0 else 0.0
         for i in range(j + 1, n):
-            root[j, i] = root[j, i] / pivot if pivot > 0.0 else 0.0
+            root[j, i] *= c
     return root
 
 
@@ -125,12 +126,15 @@ def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n:
         pz += Phi[VEL + 2, j] * e[j]
     linear[PHI], linear[PHI + 1], linear[PHI + 2] = dx + gx, dy + gy, dz + gz
     linear[VEL], linear[VEL + 1], linear[VEL + 2] = px, py, pz
-    for i in range(MOTION):
-        known = PHI + 3 if i < VEL else MOTION if i < POS else Phi.shape[1]
-        total = linear[i] if i < POS else 0.0
+    linear[POS], linear[POS + 1], linear[POS + 2] = 0.0, 0.0, 0.0
+    for third in range(3):
+        i, known = 3 * third, (PHI + 3, MOTION, Phi.shape[1])[third]
+        hx, hy, hz = linear[i], linear[i + 1], linear[i + 2]
         for j in range(known):
-            total += Phi[i, j] * e[j]
-        linear[i] = total
+            hx += Phi[i, j] * e[j]
+            hy += Phi[i + 1, j] * e[j]
+            hz += Phi[i + 2, j] * e[j]
+        linear[i], linear[i + 1], linear[i + 2] = hx, hy, hz
 
     x, y, z = s * e[PHI], s * e[PHI + 1], s * e[PHI + 2]
     fx, fy, fz = push_n[0] / s, push_n[1] / s, push_n[2] / s
@@ -188,17 +192,17 @@ def predict(
             mean[i] += even[i] / spread
         for i in range(MOTION, n):
             middle[i] = decay[i] * root[k, i]
-            odd[i] = 0.0
+            odd[i] = even[i] = 0.0
     for i in range(MOTION):
-        a, b, c, shift = work[6, i], work[7, i], work[8, i], excess * mean[i]
-        for j in range(MOTION):
-            P[i, j] += (a * work[6, j] + b * work[7, j]) + (c * work[8, j] + shift * mean[j])
         a, b, c, d, e, f = work[0, i], work[1, i], work[2, i], work[3, i], work[4, i], work[5, i]
-        for j in range(n):
+        g, h, k, shift = work[6, i], work[7, i], work[8, i], excess * mean[i]
+        for j in range(n):  # in pairs of the same bits for (i, j) and (j, i)
             first = (a * work[3, j] + d * work[0, j]) + (b * work[4, j] + e * work[1, j])
-            P[i, j] += first + (c * work[5, j] + f * work[2, j])
-        for j in range(MOTION, n):
-            P[j, i] = P[i, j]
+            second = (c * work[5, j] + f * work[2, j]) + (g * work[6, j] + h * work[7, j])
+            P[i, j] += first + second + (k * work[8, j] + shift * mean[j])
+    for i in range(MOTION, n):
+        for j in range(MOTION):
+            P[i, j] = P[j, i]
     return mean
 
 
@@ -368,9 +372,9 @@ def _turn(P: Array, error: Array) -> None:
     for i in range(3):
         u, v, w = P[i, 0], P[i, 1], P[i, 2]
         P[i, 0], P[i, 1], P[i, 2] = xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w
-    for i in range(3):
-        for j in range(i + 1, len(P)):
-            P[j, i] = P[i, j]
+    for i in range(1, len(P)):
+        for j in range(min(i, 3)):
+            P[i, j] = P[j, i]
 
 
 def update(
