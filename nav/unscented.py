@@ -206,54 +206,61 @@ def predict(
     return mean
 
 
-@inlined
-def _less(
-    q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array, scale: float, per_north: float, per_east: float,
-    q: Array, v: Array, place: Array, further: Array,
-) -> None:  # fmt: skip
-    """`remove` of ``scale`` times an error with its results in the last four; ``per_north``, ``per_east`` [rad/m]."""
-    ax, ay, az = scale * error[PHI], scale * error[PHI + 1], scale * error[PHI + 2]
-    quarter = 0.25 * (ax * ax + ay * ay + az * az)
+@njit
+def _turned(q: Array, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """The unit quaternion of exp([phi x]) times ``q`` (4,), phi = (x, y, z)."""
+    quarter = 0.25 * (x * x + y * y + z * z)
     sinc, versine, _ = rotation_coefficients(quarter)
-    ew, half = 1 - quarter * versine, 0.5 * sinc
-    ex, ey, ez = half * ax, half * ay, half * az
-    w, i, j, k = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
-    q0, q1 = ew * w - ex * i - ey * j - ez * k, ew * i + ex * w + ey * k - ez * j
-    q2, q3 = ew * j - ex * k + ey * w + ez * i, ew * k + ex * j - ey * i + ez * w
-    unit = 1 / math.sqrt(q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3)
-    q[0], q[1], q[2], q[3] = unit * q0, unit * q1, unit * q2, unit * q3
-    v[0], v[1], v[2] = v_n[0] - scale * error[VEL], v_n[1] - scale * error[VEL + 1], v_n[2] - scale * error[VEL + 2]
-    place[0] = lla[0] - scale * error[POS] * per_north
-    place[1] = wrap_longitude(lla[1] - scale * error[POS + 1] * per_east)
-    place[2] = lla[2] + scale * error[POS + 2]
-    for state in range(MOTION, len(x)):
-        further[state] = x[state] - scale * error[state]
+    w, half = 1 - quarter * versine, 0.5 * sinc
+    x, y, z = half * x, half * y, half * z
+    a, b = w * q[0] - x * q[1] - y * q[2] - z * q[3], w * q[1] + x * q[0] + y * q[3] - z * q[2]
+    c, d = w * q[2] - x * q[3] + y * q[0] + z * q[1], w * q[3] + x * q[2] - y * q[1] + z * q[0]
+    unit = 1 / math.sqrt(a * a + b * b + c * c + d * d)
+    return unit * a, unit * b, unit * c, unit * d
+
+
+@njit
+def _per_metre(lat: float, h: float) -> tuple[float, float]:
+    """What a metre north is of latitude, and a metre east of longitude [rad/m]."""
+    R_M, R_N = radii(lat)
+    return 1 / (R_M + h), 1 / ((R_N + h) * math.cos(lat))
 
 
 @njit
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
     """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size."""
-    R_M, R_N = radii(lla[0])
-    per_north, per_east = 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0]))
-    _less(q_nb, v_n, lla, x, error, 1.0, per_north, per_east, q_nb, v_n, lla, x)
+    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = _turned(q_nb, error[PHI], error[PHI + 1], error[PHI + 2])
+    per_north, per_east = _per_metre(lla[0], lla[2])
+    for i in range(3):
+        v_n[i] -= error[VEL + i]
+    lla[0] -= error[POS] * per_north
+    lla[1] = wrap_longitude(lla[1] - error[POS + 1] * per_east)
+    lla[2] += error[POS + 2]
+    for i in range(MOTION, len(x)):
+        x[i] -= error[i]
 
 
 @njit
 def _points(
     q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float
 ) -> tuple[Array, Array, Array, Array]:
+    """`remove` of 0, of + and of - ``spread`` times each row of ``root``."""
     columns, n = root.shape
     size = 2 * columns + 1
     q, v, place, further = np.empty((size, 4)), np.empty((size, 3)), np.empty((size, 3)), np.empty((size, n))
-    R_M, R_N = radii(lla[0])
-    per_north, per_east = 1 / (R_M + lla[2]), 1 / ((R_N + lla[2]) * math.cos(lla[0]))
+    per_north, per_east = _per_metre(lla[0], lla[2])
     for k in range(size):
-        column, scale = (0, 0.0) if k == 0 else (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
-        for i in range(MOTION):
-            further[k, i] = x[i]
-        _less(
-            q_nb, v_n, lla, x, root[column], scale, per_north, per_east, q[k], v[k], place[k], further[k]
-        )  # fmt: skip
+        row, s = (0, 0.0) if k == 0 else (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
+        q[k, 0], q[k, 1], q[k, 2], q[k, 3] = _turned(
+            q_nb, s * root[row, PHI], s * root[row, PHI + 1], s * root[row, PHI + 2]
+        )
+        for i in range(3):
+            v[k, i] = v_n[i] - s * root[row, VEL + i]
+        place[k, 0] = lla[0] - s * root[row, POS] * per_north
+        place[k, 1] = wrap_longitude(lla[1] - s * root[row, POS + 1] * per_east)
+        place[k, 2] = lla[2] + s * root[row, POS + 2]
+        for i in range(n):
+            further[k, i] = x[i] - s * root[row, i] if i >= MOTION else x[i]
     return q, v, place, further
 
 
@@ -300,15 +307,19 @@ def innovate(
             a = part[i, k]
             for j in range(n):
                 HP[i, j] -= a * root[k, j]
-    for i in range(m):
-        for k in range(i + 1):
-            total = excess * nu[i] * nu[k]
+    for k in range(m):
+        for i in range(k, m):
+            S[i, k] = excess * nu[i] * nu[k]
             for j in range(curved):
-                total += bend[i, j] * bend[k, j] + slope[i, j] * part[k, j]
-            for j in range(curved, n):
-                total += HP[i, j] * H[k, j]
-            S[i, k] = S[k, i] = total
-        S[i, i] += R[i]
+                S[i, k] += bend[i, j] * bend[k, j] + slope[i, j] * part[k, j]
+        S[k, k] += R[k]
+        for j in range(curved, n):
+            h = H[k, j]
+            if h != 0.0:
+                for i in range(k, m):
+                    S[i, k] += h * HP[i, j]
+        for i in range(k + 1, m):
+            S[k, i] = S[i, k]
     D, nis = factor(S, m), 0.0
     for i in range(m):
         nu[i] = z[i] - Z[0, i] - nu[i]
