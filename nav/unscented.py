@@ -284,7 +284,7 @@ def innovate(
     """
     curved, n, m = len(root), len(P), len(z)
     nu, S, HP = np.empty(m), np.empty((m, m)), np.zeros((m, n))
-    slope, bend, part = np.empty((m, curved)), np.empty((m, curved)), np.empty((m, curved))
+    slope, bend, part = np.empty((3, m, curved))
     per_spread = 1 / spread
     half = 0.5 * per_spread
     for i in range(m):
