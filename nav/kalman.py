@@ -18,7 +18,7 @@ from nav.samples import Array
 def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
     """P <- T P T' + Q, where T = [Phi 0; 0 diag(decay)] in place on ``P`` (n, n).
 
-    ``Phi`` (r, c) holds the first r rows, zero beyond column c; ``decay`` (n,) the diagonal of the others (its first r
+    ``Phi`` (r, c) holds the first r rows, zero beyond column c, a multiple of three; ``decay`` (n,) the diagonal of the others (its first r
     entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise adds over the step.
     Adding one half before and one half after is the trapezoid of the integral that defines Q; ``work`` (r, n) is
     scratch.
@@ -35,34 +35,12 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
             a, b, c = Phi[i, k], Phi[i, k + 1], Phi[i, k + 2]
             for j in range(n):
                 work[i, j] = work[i, j] + a * P[k, j] + b * P[k + 1, j] + c * P[k + 2, j]
-    for third in range(rows // 3):
-        i = 3 * third
-        for other in range(third, rows // 3):
-            j = 3 * other
-            xx = xy = xz = yx = yy = yz = zx = zy = zz = 0.0
-            for k in range(columns):
-                x, y, z = work[i, k], work[i + 1, k], work[i + 2, k]
-                a, b, c = Phi[j, k], Phi[j + 1, k], Phi[j + 2, k]
-                xx += x * a
-                xy += x * b
-                xz += x * c
-                yx += y * a
-                yy += y * b
-                yz += y * c
-                zx += z * a
-                zy += z * b
-                zz += z * c
-            # of a block on the diagonal, what is above it: the later of two equals is kept
-            P[i + 1, j] = P[j, i + 1] = yx
-            P[i + 2, j] = P[j, i + 2] = zx
-            P[i + 2, j + 1] = P[j + 1, i + 2] = zy
-            P[i, j] = P[j, i] = xx
-            P[i, j + 1] = P[j + 1, i] = xy
-            P[i, j + 2] = P[j + 2, i] = xz
-            P[i + 1, j + 1] = P[j + 1, i + 1] = yy
-            P[i + 1, j + 2] = P[j + 2, i + 1] = yz
-            P[i + 2, j + 2] = P[j + 2, i + 2] = zz
     for i in range(rows):
+        for j in range(i, rows):
+            total = 0.0
+            for k in range(columns):
+                total += work[i, k] * Phi[j, k]
+            P[i, j] = P[j, i] = total
         for j in range(rows, n):
             P[i, j] = work[i, j] * decay[j]
     for i in range(rows, n):

@@ -19,8 +19,11 @@ which are the weighted sums of Julier and Uhlmann (Proc. IEEE 92, 2004, 401) rea
 it is positive for alpha^2 <= beta whatever the function. A function that curves in more directions than three gets the
 transform with n + kappa = 3.
 
-Time update. Only the attitude is bent by the motion, so only the three columns of L that move it need a function: P is
-split into those and the rest, which the linear step carries. Their function is the error model for large misalignment
+Measurement. Along all directions but those three it is linear, so that neither the rest of L nor a Jacobian in the
+attitude is needed: P, less what the three columns have of it, gives the covariance with the measurement there.
+
+Time update. Only the attitude is bent by the motion, so only the three columns of L that move it need a function; all
+else the linear step carries. Their function is the error model for large misalignment
 (Cheng et al. 2020, Eq 1, with the accelerometers' term that its print leaves out); E = exp(-[phi x]), and the
 quantities with a hat are those of the strapdown:
 
@@ -195,11 +198,11 @@ def predict(
             odd[i] = even[i] = 0.0
     for i in range(MOTION):
         a, b, c, d, e, f = work[0, i], work[1, i], work[2, i], work[3, i], work[4, i], work[5, i]
-        g, h, k, shift = work[6, i], work[7, i], work[8, i], excess * mean[i]
+        g, h, p, shift = work[6, i], work[7, i], work[8, i], mean[i]
         for j in range(n):  # in pairs of the same bits for (i, j) and (j, i)
             first = (a * work[3, j] + d * work[0, j]) + (b * work[4, j] + e * work[1, j])
             second = (c * work[5, j] + f * work[2, j]) + (g * work[6, j] + h * work[7, j])
-            P[i, j] += first + second + (k * work[8, j] + shift * mean[j])
+            P[i, j] += first + second + (p * work[8, j] + excess * (shift * mean[j]))
     for i in range(MOTION, n):
         for j in range(MOTION):
             P[i, j] = P[j, i]

@@ -137,7 +137,7 @@ def test_curved_measurement_is_the_weighted_sum():
     z, R = np.array([0.3, 0.4, 0.5]), np.array([0.01, 0.02, 0.03])
     root = unscented.factor(P, n)
     Z = h(unscented.points(q, v, lla, x, root, scaling.spread))
-    nu, S, D, HP, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    nu, S, _, HP, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
 
     c = scaling.spread**2
     W = np.full(2 * n + 1, 0.5 / c)
@@ -420,7 +420,7 @@ def _cycles(
         if sigma_update:
             root = unscented.factor(P, 3)
             unscented._points(q, v, lla, x, root, spread)
-            nu, S, D, HP, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+            nu, _, D, HP, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
             unscented.correct(P, nu, D, HP)
         else:
             _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
