@@ -18,8 +18,9 @@ from nav.samples import Array
 def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
     """P <- T P T' + Q, where T = [Phi 0; 0 diag(decay)] in place on ``P`` (n, n).
 
-    ``Phi`` (r, c) holds the first r rows, zero beyond column c, a multiple of three; ``decay`` (n,) the diagonal of the others (its first r
-    entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise adds over the step.
+    ``Phi`` (r, c) holds the first r rows, zero beyond column c, a multiple of three; ``decay`` (n,) the diagonal of the
+    others (its first r entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise
+    adds over the step.
     Adding one half before and one half after is the trapezoid of the integral that defines Q; ``work`` (r, n) is
     scratch.
     """
