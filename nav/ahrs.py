@@ -27,7 +27,7 @@ from nav import aiding
 from nav._jit import njit
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
-from nav.error_model import ImuModel
+from nav.error_model import PAPERS, ErrorModel, ImuModel
 from nav.kalman import update
 from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
 from nav.rotation import (
@@ -150,7 +150,8 @@ class Ahrs:
         self._g = float(gravity(config.lat, config.h))
         self._earth_n = earth_rate_n(config.lat)
         imu = config.imu
-        self._variance_rate = np.repeat([imu.gyro_noise, imu.gyro_bias_walk], 3) ** 2
+        model = ErrorModel(imu)
+        self._variance_rate = model.density[model.places(PAPERS["jiang2021"])] ** 2
         self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
         self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2] * 2 + [0.0])
         self._H_level = np.zeros((2, STATES))

@@ -20,6 +20,11 @@ The motion obeys (f and omega of the sensors, b their errors, nominal C = C_nb):
 where dp'/dp is the convergence of meridians and the curvature, and dg/dp the gravity gradient 2 g / R. Latitude
 derivatives of the radii and of gravity are left out: they are a thousand times smaller than what is kept.
 
+A paper whose filter has fewer states, or has them in another order, is a list of axes of blocks (`PAPERS`): where they
+lie, `ErrorModel.places`, picks its rows and columns out of any matrix of the model, and its F by
+F[np.ix_(places, places)] (`nav.observability.continuous`). What is left out counts as known: 13 states on the road and
+on the river know height and vertical velocity, 6 of attitude alone know that the body rests, so that w_in = w_ie.
+
 Source: Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed., section 14.2.4,
 with position in metres; Titterton and Weston, 2nd ed., chapter 12. Verified in the tests by finite differences.
 """
@@ -27,7 +32,7 @@ with position in metres; Titterton and Weston, 2nd ed., chapter 12. Verified in 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeAlias
@@ -43,6 +48,32 @@ Indices: TypeAlias = npt.NDArray[np.int64]
 
 # Where the blocks of motion begin, and how many states they have together.
 PHI, VEL, POS, MOTION = 0, 3, 6, 9
+
+
+StateList: TypeAlias = Mapping[str, Sequence[int]]  # axes of blocks, in their order
+_LEVEL, _ALL = (0, 1), (0, 1, 2)
+_INS: StateList = {"phi": _ALL, "dv": _ALL, "dp": _ALL, "gyro_bias": _ALL, "accel_bias": _ALL}
+
+# The states of the papers' filters, in the papers' order of blocks; axes NED where theirs are ENU or NUE. `_INS`, 15,
+# is that of the main job too.
+PAPERS: Mapping[str, StateList] = {
+    # Equation 12.
+    "cui2022_a": _INS,
+    # Equation 36, 24: bias and Markov drift of the gyros, bias of the accelerometers, scale factors. The errors of a
+    # receiver (Markov, 6) and of a Doppler radar (Markov and scale, 6) come after, under the names of these sensors:
+    # `nav.local_filter.GnssAid` and `BodyVelocityAid`.
+    "cui2022_b": dict.fromkeys(
+        ("dp", "dv", "phi", "gyro_bias", "gyro_drift", "accel_bias", "gyro_scale", "accel_scale"), _ALL
+    ),
+    # "15-dimensional", no more is said.
+    "zhou2025": _INS,
+    # Equation 2, 13.
+    "cheng2020": {"dv": _LEVEL, "dp": _LEVEL, "phi": _ALL, "accel_bias": _ALL, "gyro_bias": _ALL},
+    # Equation 1, 13: height is the pressure gauge's.
+    "zhu2020": {"dp": _LEVEL, "dv": _LEVEL, "phi": _ALL, "gyro_bias": _ALL, "accel_bias": _ALL},
+    # Equation 5, 6: at rest relative to the Earth, as far as such gyros feel. Flown by `nav.ahrs`.
+    "jiang2021": {"phi": _ALL, "gyro_bias": _ALL},
+}
 
 
 class Drive(IntEnum):
@@ -158,6 +189,13 @@ class ErrorModel:
     def start(self, name: str) -> int:
         """Index of the first state of block ``name``, -1 when the model has no such block."""
         return self.slices[name].start if name in self.slices else -1
+
+    def places(self, states: StateList) -> Indices:
+        """Indices (m,) of the listed axes, block by block as they are listed."""
+        missing = [name for name in states if name not in self.slices]
+        if missing:
+            raise ValueError(f"there is no block {missing[0]} among {', '.join(self.slices)}")
+        return np.array([self.slices[name].start + axis for name, axes in states.items() for axis in axes])
 
 
 @njit

@@ -54,8 +54,29 @@ def test_more_noise_is_found() -> None:
 def test_table_1() -> None:
     table = cheng2020.table_1()
     assert table["ranks"] == [7, 9, 10, 12]
-    assert table["phi"] == pytest.approx([9.86, 9.86], abs=0.005)
-    assert table["eps_down"] == pytest.approx(5.06e-4, rel=1e-2)
+    for column in ("velocity", "position", "both"):
+        found = table[column]
+        assert found["phi"] == pytest.approx([9.86, 9.86], abs=0.005)
+        assert found["eps"] == pytest.approx([9.806, 9.806], abs=0.005)
+        assert found["dv"] == pytest.approx([1, 1], abs=1e-6)
+        assert found["dp"] == pytest.approx([] if column == "velocity" else [1, 1], abs=1e-6)
+        assert found["eps_down"] == pytest.approx(5.06e-4, rel=1e-2)
+        assert found["unseen"] < 1e-9
+    # 1 / (R_N cos L R_M), where the paper has 3.14e-14; and sqrt(5) g w_ie, 1.79e-3
+    assert table["radians"] == pytest.approx([1 / (6.388838e6 * 0.7071068 * 6.367382e6), 1.599e-3], rel=1e-3)
+
+
+def test_table_1_has_a_row_for_each_column(first_turn: dict[str, Any]) -> None:
+    claims = [one for one in cheng2020.PAPER.conclude(results(first_turn)) if one.quantity.startswith("Table 1")]
+    for column in ("velocity", "position", "velocity and position"):
+        own = [one for one in claims if one.quantity.startswith(f"Table 1, {column}:")]
+        assert {one.verdict for one in own} == {"met", "impossible"}
+        assert all(
+            "5.06e-4" in one.impossible or "velocity" in one.impossible for one in own if "eps_U" in one.quantity
+        )
+    (other,) = (one for one in claims if "3.14e-14" in one.paper)
+    assert "3.5e-14" in other.impossible
+    assert "1.6e-03" in other.impossible
 
 
 def results(road: dict[str, Any]) -> list[Any]:
@@ -87,6 +108,15 @@ def test_claims_can_fail(first_turn: dict[str, Any]) -> None:
     turned = {quantity for quantity in sound if sound[quantity] != "missed" and failed[quantity] == "missed"}
     assert len(turned) >= 11, turned
     assert sum("any seed" in quantity for quantity in turned) == 3, turned
+    wrong = copy.deepcopy(results(first_turn))
+    for column in ("velocity", "position", "both"):
+        wrong[-1][column] |= {
+            "phi": [9.88, 9.88],
+            "unseen": 1e-3,
+            "eps_down": 9e-9 if column == "position" else 5.66e-4,
+        }
+    failed = verdicts(wrong)
+    assert len({quantity for quantity in failed if "Table 1" in quantity and failed[quantity] == "missed"}) == 10
 
 
 @pytest.mark.slow
