@@ -279,25 +279,48 @@ def _air_velocity(axis_n: Array, v_n: Array, x: Array, wind: int, gust: int) -> 
 
 @njit
 def body_velocity(
-    q_nb: Array, v_n: Array, x: Array, axes: Indices, scale: int, error: int, v_b: Array
+    q_nb: Array,
+    v_n: Array,
+    lla: Array,
+    x: Array,
+    omega_measured_b: Array,
+    errors: Array,
+    driven: Indices,
+    arm_b: Array,
+    axes: Indices,
+    scale: int,
+    error: int,
+    v_b: Array,
 ) -> tuple[Array, Array]:
-    """Velocity over ground along the m body ``axes`` [m/s]: (1 + scale) e . C_nb' v + error, one row for each axis.
+    """Velocity over ground along the m body ``axes`` [m/s], one row for each: (1 + scale) e . C_nb' v_s + error.
 
-    ``v_b`` (3,) is what was measured. The blocks ``scale`` and ``error`` have a state for each row, in the same order.
-    By an odometer, axes = [0]: forward speed. Cui et al. 2022, equations 50-52, with the difference taken in body axes.
+    v_s = v + C_nb (omega_ib x arm) - omega_ie x (C_nb arm) is the sensor's, see `gnss_velocity`. ``v_b`` (3,) is what
+    was measured. The blocks ``scale`` and ``error`` have a state for each row, in the same order. By an odometer,
+    axes = [0]: forward speed. Cui et al. 2022, equations 50-52, with the difference taken in body axes.
     """
     C_nb = dcm_from_quat(q_nb)
     nu = np.empty(len(axes))
     H = np.zeros((len(axes), len(x)))
+    point_n, swing = v_n, H  # velocity of the sensor, and its Jacobian where it isn't that of the IMU's
+    swings = arm_b[0] != 0.0 or arm_b[1] != 0.0 or arm_b[2] != 0.0
+    if swings:
+        behind, swing = gnss_velocity(q_nb, v_n, lla, x, omega_measured_b, errors, driven, arm_b, -1, np.zeros(3))
+        point_n = -behind
+        for i in range(3):
+            swing[i, VEL + i] = 0.0
     for row in range(len(axes)):
         axis = axes[row]
         along_n = np.array([C_nb[0, axis], C_nb[1, axis], C_nb[2, axis]])
-        speed = along_n[0] * v_n[0] + along_n[1] * v_n[1] + along_n[2] * v_n[2]
+        speed = along_n[0] * point_n[0] + along_n[1] * point_n[1] + along_n[2] * point_n[2]
         gain = 1 + x[scale + row] if scale >= 0 else 1.0
-        turned = cross(v_n, along_n)
+        turned = cross(point_n, along_n)
         nu[row] = v_b[axis] - gain * speed
         for i in range(3):
             H[row, PHI + i], H[row, VEL + i] = gain * turned[i], gain * along_n[i]
+        if swings:
+            for i in range(3):
+                for j in range(len(x)):
+                    H[row, j] += gain * along_n[i] * swing[i, j]
         if scale >= 0:
             H[row, scale + row] = speed
         if error >= 0:
@@ -306,9 +329,16 @@ def body_velocity(
     return nu, H
 
 
-def nonholonomic(q_nb: Array, v_n: Array, x: Array) -> tuple[Array, Array]:
-    """The constraint of wheels, neither sideways nor off the ground: 0 = (e_y, e_z) . C_nb' v [m/s]."""
-    return body_velocity(q_nb, v_n, x, SIDEWAYS, -1, -1, np.zeros(3))
+def nonholonomic(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, omega_measured_b: Array, errors: Array, driven: Indices, arm_b: Array
+) -> tuple[Array, Array]:
+    """The constraint of wheels, neither sideways nor off the ground: 0 = (e_y, e_z) . C_nb' v_s [m/s].
+
+    It acts where the sensor of the wheels does, v_s as of `body_velocity`.
+    """
+    return body_velocity(
+        q_nb, v_n, lla, x, omega_measured_b, errors, driven, arm_b, SIDEWAYS, -1, -1, np.zeros(3)
+    )  # fmt: skip
 
 
 @njit
@@ -334,14 +364,13 @@ def star_attitude(q_nb: Array, lla: Array, x: Array, t: float, q_ib: Array) -> t
 
 
 @njit
-def position_fix(lla: Array, x: Array, lat: float, lon: float, h: float) -> tuple[Array, Array]:
-    """Position [m], north, east and, unless ``h`` is NaN, down."""
+def position_fix(
+    q_nb: Array, lla: Array, x: Array, arm_b: Array, lat: float, lon: float, h: float
+) -> tuple[Array, Array]:
+    """The sensor's position [m], north, east and, unless ``h`` is NaN, down: p + C_nb arm_b."""
     rows = 2 if math.isnan(h) else 3
-    nu = displacement_n(lat, lon, lla[2] if rows == 2 else h, lla[0], lla[1], lla[2])[:rows]
-    H = np.zeros((rows, len(x)))
-    for i in range(rows):
-        H[i, POS + i] = 1.0
-    return nu, H
+    nu, H = gnss_position(q_nb, lla, x, arm_b, -1, lat, lon, lla[2] if rows == 2 else h)
+    return nu[:rows], H[:rows]
 
 
 @njit

@@ -44,6 +44,7 @@ Axes: TypeAlias = tuple[float, float, float]
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Watch`
 OUTSIDE, ISOLATED, LEFT_OUT = "outside the gate", "isolated", "left out by the measurement policy"
+NO_RATES = "how fast the sensor swings about the IMU isn't known before the first increment"
 
 
 class Policy(Protocol):
@@ -314,7 +315,8 @@ class AirspeedAid:
 class BodyVelocityAid:
     """Velocity over ground along some body ``axes`` (indices), each with a scale factor error and a Markov error.
 
-    ``nonholonomic_sigma`` adds the constraint of wheels, which neither slip sideways nor leave the ground.
+    ``nonholonomic_sigma`` adds the constraint of wheels, which neither slip sideways nor leave the ground where the
+    sensor is.
     """
 
     sensor: str = "body_velocity"
@@ -324,6 +326,7 @@ class BodyVelocityAid:
     error_sigma: float = 0.0  # [m/s]
     error_correlation_s: float = 300.0
     nonholonomic_sigma: float | None = None  # [m/s]
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to the sensor's point [m]
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
@@ -345,22 +348,25 @@ class BodyVelocityAid:
         ]
 
     @cached_property
-    def _told(self) -> tuple[Indices, Array, Array]:
-        """Axes, and the variances of the two parts."""
+    def _told(self) -> tuple[Indices, Array, Array, Array]:
+        """Axes, the variances of the two parts, and the lever arm."""
         nonholonomic = np.full(2, (self.nonholonomic_sigma or 0.0) ** 2)
-        return np.array(self.axes), np.full(len(self.axes), self.sigma**2), nonholonomic
+        arm = np.array(self.arm_b, dtype=float)
+        return np.array(self.axes), np.full(len(self.axes), self.sigma**2), nonholonomic, arm
 
     def look(self, part: str, sample: Sample, seat: Seat) -> Look | None:
         """See `Aid`."""
         assert isinstance(sample, BodyVelocitySample)
-        axes, R, nonholonomic = self._told
+        axes, R, nonholonomic, arm = self._told
         state, (scale, error) = seat.state, seat.starts
+        there = state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven, arm
+        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else ""
         if part == "nonholonomic":
-            return Look(*aiding.nonholonomic(state.q_nb, state.v_n, seat.x), nonholonomic)
+            return Look(*aiding.nonholonomic(*there), nonholonomic, unknown)
         if not aiding.measures(sample, axes):
             return None
-        nu, H = aiding.body_velocity(state.q_nb, state.v_n, seat.x, axes, scale, error, sample.v_b)
-        return Look(nu, H, R)
+        nu, H = aiding.body_velocity(*there, axes, scale, error, sample.v_b)
+        return Look(nu, H, R, unknown)
 
 
 @dataclass(frozen=True)
@@ -395,6 +401,7 @@ class PositionFixAid:
     sensor: str = "position_fix"
     sigma: Axes = (10.0, 10.0, 10.0)
     height: bool = True
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to the sensor's point [m]
 
     states = ()
 
@@ -408,6 +415,10 @@ class PositionFixAid:
         return []
 
     @cached_property
+    def _arm(self) -> Array:
+        return np.array(self.arm_b, dtype=float)
+
+    @cached_property
     def _R(self) -> Array:
         return np.array(self.sigma)[: 3 if self.height else 2] ** 2
 
@@ -415,7 +426,8 @@ class PositionFixAid:
         """See `Aid`."""
         assert isinstance(sample, PositionSample)
         h = sample.h if self.height else math.nan
-        nu, H = aiding.position_fix(seat.state.lla, seat.x, sample.lat, sample.lon, h)
+        state = seat.state
+        nu, H = aiding.position_fix(state.q_nb, state.lla, seat.x, self._arm, sample.lat, sample.lon, h)
         return Look(nu, H, self._R) if len(nu) == len(self._R) else None
 
 

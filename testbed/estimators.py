@@ -277,7 +277,7 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         # With the wind, course says what the constraint of no sideslip says: both would count it twice.
         slip = told.pop("sideslip_sigma", 0.0) if "airspeed" in aids else 0.0
         told |= {"course": _course(config.course, slip), "sideslip_sigma": None}
-    others = {name: _other(name, scenario.sensors[name], config) for name in config.aids}
+    others = {name: _other(name, scenario.sensors[name], config, errors) for name in config.aids}
     learning = config.sage_husa
     fading = config.fading
     ins = Ins(
@@ -318,19 +318,21 @@ def _lag_s(scenario: Scenario, names: Iterable[str]) -> float:
     return max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)
 
 
-def _other(name: str, section: SensorConfig, config: EstimatorConfig) -> Aid | None:
-    """An aid of which a filter may have several, None for a sensor of any other kind."""
+def _other(name: str, section: SensorConfig, config: EstimatorConfig, imu: ImuErrors) -> Aid | None:
+    """An aid of which a filter may have several, None for a sensor of any other kind.
+
+    What they measure is of the centre of gravity.
+    """
+    arm_b: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
         case BodyVelocityConfig():
             v = section.errors()
-            return BodyVelocityAid(
-                name, v.axes, v.noise, v.scale, v.correlated, v.tau, nonholonomic_sigma=config.nonholonomic_mps
-            )
+            return BodyVelocityAid(name, v.axes, v.noise, v.scale, v.correlated, v.tau, config.nonholonomic_mps, arm_b)
         case StarTrackerConfig():
             return StarAid(name, tuple(section.errors().noise_b))
         case PositionFixConfig():
             p = section.errors()
-            return PositionFixAid(name, tuple(p.position_n), p.height)
+            return PositionFixAid(name, tuple(p.position_n), p.height, arm_b)
     return None
 
 
@@ -385,7 +387,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
 
     def aid(name: str) -> Aid:
         section = scenario.sensors[name]
-        other = _other(name, section, config)
+        other = _other(name, section, config, errors)
         if other is not None:
             return other
         told = _told({section.kind: section}, errors, config.gust_mps)

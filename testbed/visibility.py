@@ -185,6 +185,7 @@ def _of_filter(
         lat, lon, h = way.lla[k].tolist()
         initial = InitialState(float(way.middle[k]), lat, lon, h, way.v_n[k], way.q_nb[k], np.eye(MOTION))
         state = reference.start(initial)
+        state.rates[0] = way.omega_b[k]
         found = []
         for sensor, aid, part, used in parts:
             if used[k].any():

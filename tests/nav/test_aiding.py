@@ -99,30 +99,48 @@ def sideslip(at):
     return aiding.sideslip(at[0], at[1], at[3], MODEL.start("wind"), MODEL.start("gust"))
 
 
-def body_velocity(at):
-    q, v_n, _, x, _ = at
+def body_velocity(at, arm=ARM):
     starts = [MODEL.start(f"body_velocity_{name}") for name in ("scale", "error")]
-    return aiding.body_velocity(q, v_n, x, np.array([0, 2]), *starts, np.array([20.0, np.nan, 1.0]))
+    return moving_point(at, arm, np.array([0, 2]), *starts, np.array([20.0, np.nan, 1.0]))
 
 
-def odometer(at):
-    return aiding.body_velocity(at[0], at[1], at[3], np.array([0]), -1, -1, np.array([5.0, np.nan, np.nan]))
+def odometer(at, arm=ARM):
+    return moving_point(at, arm, np.array([0]), -1, -1, np.array([5.0, np.nan, np.nan]))
 
 
-def nonholonomic(at):
-    return aiding.nonholonomic(at[0], at[1], at[3])
+def moving_point(at, arm, *measured):
+    q, v_n, lla, x, omega = at
+    errors = np.zeros((4, 3))
+    sensor_errors(errors, x, MODEL.driven)
+    return aiding.body_velocity(q, v_n, lla, x, omega, errors, MODEL.driven, arm, *measured)
+
+
+def nonholonomic(at, arm=ARM):
+    q, v_n, lla, x, omega = at
+    errors = np.zeros((4, 3))
+    sensor_errors(errors, x, MODEL.driven)
+    return aiding.nonholonomic(q, v_n, lla, x, omega, errors, MODEL.driven, arm)
+
+
+def at_the_imu(aid):
+    """The same without a lever arm."""
+
+    def look(at):
+        return aid(at, np.zeros(3))
+
+    return look
 
 
 def star_attitude(at):
     return aiding.star_attitude(at[0], at[2], at[3], STAR_TIME, FIX["q_ib"])
 
 
-def position_fix(at):
-    return aiding.position_fix(at[2], at[3], FIX["lat"], FIX["lon"], FIX["h"])
+def position_fix(at, arm=ARM):
+    return aiding.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], FIX["h"])
 
 
-def flat_position_fix(at):
-    return aiding.position_fix(at[2], at[3], FIX["lat"], FIX["lon"], math.nan)
+def flat_position_fix(at, arm=ARM):
+    return aiding.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], math.nan)
 
 
 def gnss_course(at):
@@ -139,6 +157,7 @@ FIX = {}
 STAR_TIME = 3000.0
 AIDS = [
     gnss_position, gnss_velocity, barometer, magnetometer, airspeed, sideslip, body_velocity, odometer, nonholonomic,
+    *map(at_the_imu, (body_velocity, odometer, nonholonomic, position_fix)),
     star_attitude, position_fix, flat_position_fix, gnss_course, gnss_course_as_heading,
 ]  # fmt: skip
 
@@ -182,14 +201,29 @@ def scipy_rotation(q):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_body_velocity_is_what_scipy_says(seed):
-    q, v_n, lla, x, _ = state(seed)
-    v_b = scipy_rotation(q).inv().apply(v_n)
+    at = q, v_n, lla, x, omega = state(seed)
+    gyro, errors = MODEL.slices, np.zeros((4, 3))
+    for name in ("gyro_bias", "gyro_drift"):
+        errors[0] += x[gyro[name]]
+    omega_b = (omega - errors[0]) / (1 + x[gyro["gyro_scale"]])
+    earth_b = scipy_rotation(q).inv().apply(OMEGA_IE * np.array([np.cos(lla[0]), 0, -np.sin(lla[0])]))
     scale, error = (x[MODEL.slices[f"body_velocity_{name}"]] for name in ("scale", "error"))
-    measured = (1 + scale) * v_b[[0, 2]] + error
-    nu, _ = body_velocity((q, v_n, lla, x, None))
-    np.testing.assert_allclose(nu, [20.0, 1.0] - measured, atol=1e-12)
-    assert odometer((q, v_n, lla, x, None))[0] == pytest.approx([5.0 - v_b[0]], abs=1e-12)
-    np.testing.assert_allclose(nonholonomic((q, v_n, lla, x, None))[0], -v_b[1:], atol=1e-12)
+    for arm in (np.zeros(3), ARM):
+        v_b = scipy_rotation(q).inv().apply(v_n) + np.cross(omega_b - earth_b, arm)
+        measured = (1 + scale) * v_b[[0, 2]] + error
+        np.testing.assert_allclose(body_velocity(at, arm)[0], [20.0, 1.0] - measured, atol=1e-12)
+        assert odometer(at, arm)[0] == pytest.approx([5.0 - v_b[0]], abs=1e-12)
+        np.testing.assert_allclose(nonholonomic(at, arm)[0], -v_b[1:], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_position_fix_is_of_the_sensor_not_of_the_imu(seed):
+    """At the sensor's place, found by pymap3d, nothing is left to correct."""
+    q, _, lla, x, _ = state(seed)
+    north, east, down = scipy_rotation(q).apply(ARM)
+    lat, lon, h = pymap3d.enu2geodetic(east, north, -down, *np.degrees(lla[:2]), lla[2])
+    nu, _ = aiding.position_fix(q, lla, x, ARM, np.radians(lat), np.radians(lon), h)
+    np.testing.assert_allclose(nu, 0.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))

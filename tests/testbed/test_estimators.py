@@ -14,7 +14,7 @@ from nav.earth import position_difference_n
 from nav.federated import Federated
 from nav.ins import Ins
 from nav.local_filter import AirspeedAid, GnssAid
-from testbed import Scenario, estimators, metrics, run
+from testbed import Scenario, estimators, metrics, papers, run
 from testbed.errors import UserError
 from testbed.kinematic import Kinematic
 from testbed.scenario import KinematicStart
@@ -63,6 +63,30 @@ def test_alignment_knows_the_lever_arm_of_a_receiver_that_is_no_aid() -> None:
     place = [float(truth[name].values[0]) for name in ("lat", "lon", "h")]
     error = position_difference_n(float(lat[first]), float(lon[first]), float(h[first]), *place)
     assert np.linalg.norm(error) < 2.0  # 20 m of arm, turned by a heading that is known to a degree or two
+
+
+RIVER = [
+    "duration_s=200",
+    "truth.segments=[{leg='weave', swing_deg=120, period_s=200, swings=2, to_mps=6}]",
+    "sensors.ast={kind='position_fix', grade='perfect', horizontal_m=0.1, vertical_m=0.1}",
+    "fault=[]",
+    "expect={}",
+]
+
+
+def test_fixes_and_body_velocities_are_of_the_centre_of_gravity_wherever_the_imu_sits() -> None:
+    """With the IMU 10 m ahead and 3 m above, of a ship that turns, rolls and pitches, all is as without."""
+
+    def rms(arm: str) -> Any:
+        dataset = run(papers.scenario("zhu2020", [*RIVER, f"sensors.imu.lever_arm_m={arm}"])).dataset
+        found = [metrics.errors(dataset, name, 60.0) for name in ("frkf", "tfkf")]
+        nis = metrics.column(dataset, "estimators/frkf/innovations/body_velocity/nis")
+        values = [np.sqrt(np.mean(values**2, axis=0)) for e in found for values in (e.position, e.velocity, e.attitude)]
+        return np.concatenate([*values, [np.median(nis)]])
+
+    at_the_centre, ahead = rms("[0.0, 0.0, 0.0]"), rms("[10.0, 2.0, -3.0]")
+    least = [*[0.02] * 3, *[0.001] * 3, *[1e-4] * 3]
+    assert (ahead < 1.1 * at_the_centre + [*least, *least, 0.0]).all(), ahead / at_the_centre
 
 
 THREE_IMUS = [
