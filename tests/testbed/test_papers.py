@@ -11,9 +11,24 @@ from typing import Any
 
 import pytest
 
-from testbed import papers
+from testbed import papers, run
+from testbed.check import judge
+from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.papers import Claim, Job, Paper
+
+SCENARIOS = sorted(path.stem for path in (data_dir("scenarios") / "papers").glob("*.toml"))
+LONG = {"cheng2020", "zhu2020", "zhu2020_outage"}  # to run: more than 5 s
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LONG else []) for n in SCENARIOS])
+def test_the_scenario_keeps_its_promises(name: str) -> None:
+    shipped = papers.scenario(name)
+    assert shipped.expect, "a scenario without [expect] can't fail"
+    result = run(shipped)
+    assert not result.failure
+    rows = judge(shipped.expect, result.metrics)
+    assert all(row.sound for row in rows), [str(row) for row in rows if not row.sound]
 
 
 def claim(ours: Sequence[float], bound: float, **keys: Any) -> Claim:

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from testbed import papers, run
-from testbed.check import judge
+from testbed import papers
 from testbed.papers import jiang2021
 from testbed.papers.jiang2021 import AHRS, CALIBRATED, CASES, FLIGHTS, GYROS, SLOW, TILTED, TILTED_GYROS, Case, Flown
 
@@ -84,14 +83,6 @@ def test_claims_can_fail(flown: dict[Case, Flown]) -> None:
     assert missed(gyros=AHRS) == 1
     assert missed(tilted=TILTED_GYROS) >= 2
     assert missed(slow=AHRS) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("flight", FLIGHTS)
-def test_scenarios_keep_their_promises(flight: str) -> None:
-    loaded = papers.scenario(flight)
-    rows = judge(loaded.expect, run(loaded).metrics)
-    assert all(row.sound for row in rows), [str(row) for row in rows if not row.sound]
 
 
 @pytest.mark.slow
