@@ -315,7 +315,7 @@ class Federated:
         common = self._common
         for row, share in enumerate(self._told_shares()):
             reset(state.x[row], state.P[row], np.zeros(common), state.P[row, :common, :common] / share)
-        self._state = state
+        self._state, self._draft = state, state.copy()
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
 
     def propagate(self, imu: ImuSamples) -> None:
@@ -376,15 +376,22 @@ class Federated:
 
     def estimate(self) -> Estimate:
         """The fused state at the estimator's own time."""
-        return self._estimate(self._state.copy() if self._state is not None else None, self.t, self._last_bad)
+        return self._estimate(self._drafted(), self.t, self._last_bad)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The fused state after further increments, the estimator itself staying where it is."""
-        state = self._state.copy() if self._state is not None else None
+        state = self._drafted()
         last_bad = self._last_bad
         if state is not None and len(imu):
             last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
+
+    def _drafted(self) -> State | None:
+        """The state in arrays of its own, which are the same ones each time."""
+        if self._state is None:
+            return None
+        self._draft.take(self._state)
+        return self._draft
 
     def local(self, name: str) -> tuple[Array, Array]:
         """(x, P) of one local filter now: what it would add to the nominal state, its aids' errors; covariance."""
@@ -607,7 +614,7 @@ class Federated:
         self._reference.correct(state, master.x)
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
-        """The estimate at ``t`` from a ``state`` of its own."""
+        """The estimate at ``t`` from a ``state`` that may be changed."""
         status = Status.ALIGNING if state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE

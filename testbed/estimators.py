@@ -1,7 +1,7 @@
 """From scenario sections to estimators: what each filter is told of the sensors it is given.
 
 A filter knows the datasheets, never the errors that were drawn from them. Terms that it has no state for
-(g-sensitivity, temperature, misalignment) widen the bias that it does estimate.
+(g-sensitivity, temperature, misalignment, mostly scale factors too) widen the bias that it does estimate.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
 from nav.unscented import Scaling
 from nav.voting import Voter
 from nav.weighting import Fading, MahalanobisInflation, SageHusa
-from testbed.scenario import CourseConfig, DetectorConfig, EstimatorConfig, PolicyConfig, Scenario
+from testbed.scenario import CourseConfig, DetectorConfig, EstimatorConfig, ImuStates, PolicyConfig, Scenario
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -222,38 +222,50 @@ def build(scenario: Scenario, seed: int) -> dict[str, Running]:
     return {config.name: kinds[config.kind](config, scenario, seed) for config in scenario.estimator}
 
 
-def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE) -> ImuModel:
-    """The datasheet as the filter's error model.
+def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE, states: ImuStates = "biases") -> ImuModel:
+    """The datasheet as the filter's error model; ``turn_rate`` [rad/s] is the usual one.
 
-    In-run instability (Gauss-Markov, sigma and tau) becomes a random walk of the same driving noise,
-    q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two cannot be told apart. Scale factor,
-    misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk too, that of the
-    gyros as large as the usual ``turn_rate`` [rad/s] makes it.
+    Misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk. Of the gyros it is as
+    large as a turn makes it; of the accelerometers as a change of load does, `LOAD_CHANGE`. In turns slower than
+    `TURN_RATE` the load changes by less, with the square of their rate: n^2 = 1 + (v turn_rate / g)^2.
+
+    With ``states`` "biases" scale factors do so too, and in-run instability (Gauss-Markov, sigma and tau) becomes a
+    random walk of the same driving noise, q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two
+    cannot be told apart. With "full" both are states of their own (Cui et al. 2022, Eq 36).
     """
-    level = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, errors.accel_scale)
-    turn = math.hypot(errors.gyro_misalignment, errors.gyro_nonorthogonality, errors.gyro_scale)
-    pull = errors.gyro_g_sensitivity * STANDARD_GRAVITY
+    full = states == "full"
+    beside = replace(errors, gyro_in_run=0.0, accel_in_run=0.0, gyro_scale=0.0, accel_scale=0.0) if full else errors
+    level = math.hypot(beside.accel_misalignment, beside.accel_nonorthogonality, beside.accel_scale)
+    turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
+    pull = beside.gyro_g_sensitivity * STANDARD_GRAVITY
     changes = math.sqrt(1 / MANOEUVRE_S)
+    load_change = LOAD_CHANGE * min(1.0, turn_rate / TURN_RATE) ** 2
     return ImuModel(
-        gyro_noise=errors.gyro_noise,
-        accel_noise=errors.accel_noise,
+        gyro_noise=beside.gyro_noise,
+        accel_noise=beside.accel_noise,
         gyro_bias_sigma=math.hypot(
-            errors.gyro_turn_on, errors.gyro_in_run, errors.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
+            beside.gyro_turn_on, beside.gyro_in_run, beside.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
         ),
         accel_bias_sigma=math.hypot(
-            errors.accel_turn_on, errors.accel_in_run, errors.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
+            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
         ),
         gyro_bias_walk=math.hypot(
-            errors.gyro_random_walk,
-            _drive(errors.gyro_in_run, errors.gyro_in_run_tau),
+            beside.gyro_random_walk,
+            _drive(beside.gyro_in_run, beside.gyro_in_run_tau),
             turn * turn_rate * changes,
-            pull * LOAD_CHANGE * changes,
+            pull * load_change * changes,
         ),
         accel_bias_walk=math.hypot(
-            errors.accel_random_walk,
-            _drive(errors.accel_in_run, errors.accel_in_run_tau),
-            level * STANDARD_GRAVITY * LOAD_CHANGE * changes,
+            beside.accel_random_walk,
+            _drive(beside.accel_in_run, beside.accel_in_run_tau),
+            level * STANDARD_GRAVITY * load_change * changes,
         ),
+        gyro_drift_sigma=errors.gyro_in_run if full else 0.0,
+        accel_drift_sigma=errors.accel_in_run if full else 0.0,
+        gyro_drift_correlation_s=errors.gyro_in_run_tau,
+        accel_drift_correlation_s=errors.accel_in_run_tau,
+        gyro_scale_sigma=errors.gyro_scale if full else 0.0,
+        accel_scale_sigma=errors.accel_scale if full else 0.0,
     )
 
 
@@ -282,7 +294,7 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
     fading = config.fading
     ins = Ins(
         InsConfig(
-            imu_model(errors, math.radians(config.turn_degps)),
+            imu_model(errors, math.radians(config.turn_degps), config.states),
             aids,
             tuple(aid for aid in others.values() if aid is not None),
             mounting_sigma=errors.accel_misalignment,
@@ -411,7 +423,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
     )
     federated = Federated(
         Config(
-            imu_model(errors, math.radians(config.turn_degps)),
+            imu_model(errors, math.radians(config.turn_degps), config.states),
             local_filters,
             structure=config.structure,
             sharing=config.sharing,

@@ -64,7 +64,7 @@ OWN_KEYS: Mapping[str, tuple[str, ...]] = {
         ("federated",),
     ),
     **dict.fromkeys(("heading_deg", "levelling", "level", "autopilot"), ("ahrs",)),
-    **dict.fromkeys(("handover", "nonholonomic_mps"), ("ins", "federated")),
+    **dict.fromkeys(("handover", "nonholonomic_mps", "states"), ("ins", "federated")),
     **dict.fromkeys(("engine", "course", "sage_husa", "fading", "false_rejection"), ("ins",)),
     "literal": ("federated", "ahrs"),
 }  # fmt: skip
@@ -244,6 +244,9 @@ class FadingConfig(Section):
     )  # fmt: skip
 
 
+ImuStates: TypeAlias = Literal["biases", "full"]
+
+
 class EstimatorConfig(Section):
     """One ``[[estimator]]``: which IMU it integrates and which sensors aid it.
 
@@ -255,8 +258,9 @@ class EstimatorConfig(Section):
     imu: str = "imu"
     spare_imus: Annotated[tuple[str, ...], Field(max_length=3)] = ()  # voted with the first, of its kind and beside it
     aids: tuple[str, ...]
+    states: ImuStates = Field(default="biases", description="full: in-run instability and scale factors of the IMU too")
     turn_degps: float = Field(
-        default=math.degrees(0.06), ge=0, le=360, description="usual rate of turn: how far gyro scale errors count"
+        default=math.degrees(0.06), ge=0, le=360, description="usual rate of turn: how far scale errors count"
     )
     gust_mps: float = Field(default=1.0, ge=0, le=20, description="turbulence that the filter expects, 1 sigma")
     handover: HandoverConfig | None = Field(default=None, description="how well the start is known; none: it aligns")

@@ -1,35 +1,43 @@
 """Cui et al. 2022: fault-tolerant federated filter of SINS, GPS, Doppler radar and star tracker.
 
-Straight flight of 1200 s with the six faults of table 2, and without any. Each flight carries the federation with and
-without star tracker, judged by ERAIM, and one with it that is judged by the GLR.
+Straight flight of 1200 s with the six faults of table 2, and without any. Flights carry the federation with and without
+star tracker, judged by ERAIM, and one with it that is judged by the GLR. How near one can come is measured as well: with
+a single Kalman filter of all sensors and the same states, which is told of the faults.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from scipy.stats import poisson
 
 from nav.detection import Detector, Eraim, Glr, chi_square_threshold
+from nav.earth import position_difference_n
+from nav.horizon import FusionHorizon
+from nav.ins import Ins
 from nav.local_filter import ISOLATED
-from nav.samples import Array
-from testbed import metrics
+from nav.samples import Array, Estimate
+from testbed import estimators, metrics, sensors
 from testbed.data import write_file
-from testbed.loop import run
+from testbed.loop import motion, run
 from testbed.metrics import column
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report import AXIS_COLOURS, COLOURS, FAULT
+from testbed.truth import TruthBlock
 
 if TYPE_CHECKING:
     import xarray
 
 NAME = "cui2022"
-FAULTY_SEEDS, HEALTHY_SEEDS = 12, 20
+SEEDS, FEW_SEEDS = 20, 12  # of flights, with and without faults; of those that carry every estimator
 HEALTHY = ("fault=[]",)
+WITH_STAR, EVERY = ("with_star",), ("with_star", "without_star", "glr")
 FALSE_ALARM = 1e-5  # per look: table 1
 AFTER_S = 60.0
 REPLAYS = 1000
@@ -42,24 +50,29 @@ AXES = {
     "attitude": ("roll", "pitch", "heading"),
 }
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "arcsec"}
+BOUNDS = {"position": (10.0, 6.0), "velocity": (0.5, 0.1), "attitude": (50.0, 5.0)}  # the paper's, and better ones
 PARTS = {"gnss_position": "GPS position", "gnss_velocity": "GPS velocity", "body_velocity": "Doppler",
          "star_attitude": "star"}  # fmt: skip
 
 Result: TypeAlias = dict[str, Any]
+CHANNELS = {"north": ("gnss_position", 0), "east": ("gnss_position", 1), "down": ("gnss_position", 2),
+            "v_north": ("gnss_velocity", 0), "v_east": ("gnss_velocity", 1),
+            "forward": ("body_velocity", 0)}  # fmt: skip
 
 
-def fly(seed: int, overrides: tuple[str, ...], series: bool) -> Result:
+def fly(seed: int, overrides: tuple[str, ...], names: tuple[str, ...], series: bool) -> Result:
     """One run: by estimator the largest errors and its scores; with ``series`` what the figure shows as well."""
-    done = run(scenario(NAME, overrides), seed=seed)
+    chosen = scenario(NAME, overrides)
+    flown = tuple(one for one in chosen.estimator if one.name in names)
+    done = run(chosen.model_copy(update={"estimator": flown}), seed=seed)
     tree = done.dataset
     faulty = bool(metrics.faults(tree))
     replayed = _replayed(tree, Glr(FALSE_ALARM))
     result: Result = {"faulty": faulty, "glr_on_residuals": _scored(*replayed[:2], SMALL_STEP)}
     for name in metrics.names(tree):
         t, errors = _errors(tree, name)
-        late = t >= AFTER_S
         result[name] = {
-            "largest": {what: np.abs(e[late]).max(axis=0).tolist() for what, e in errors.items()},
+            "largest": _largest(t, errors),
             "heading_at_end": abs(float(errors["attitude"][-1, 2])),
             "scores": {
                 key.split(".", 1)[1]: value for key, value in done.metrics.items() if key.startswith(f"{name}.")
@@ -75,6 +88,73 @@ def fly(seed: int, overrides: tuple[str, ...], series: bool) -> Result:
         result["looks"] = {part: _looks(tree, "with_star", part)[:2] for part in PARTS}
         result["glr_statistic"] = replayed[0], *replayed[2:]
     return result
+
+
+@dataclass(frozen=True)
+class Told:
+    """A measurement policy that leaves out what it was told is wrong: (axis, from, to) of one part of the looks."""
+
+    wrong: tuple[tuple[int, float, float], ...]
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `nav.local_filter.Policy`."""
+        out = [axis for axis, start, end in self.wrong if start <= t + metrics.SAME_TIME_S < end]
+        told = R.copy()
+        told[out] = np.inf
+        return told
+
+
+def floor(seed: int) -> dict[str, dict[str, list[float]]]:
+    """Largest errors of the optimal filter that is told of the faults, and of it where there are none.
+
+    One Kalman filter with every sensor and no gate, of the states, noise and initial errors of ``with_star``. What is
+    wrong it never uses, so the flight may be one without faults.
+    """
+    chosen = scenario(NAME, HEALTHY)
+    federated = next(one for one in chosen.estimator if one.name == "with_star")
+    aids = tuple(aid for local in federated.locals for aid in local.aids)
+    alone = federated.model_copy(update={"kind": "ins", "aids": aids, "locals": (), "false_rejection": 0.0})
+    chosen = chosen.model_copy(update={"estimator": (alone,)})
+    truth = motion(chosen, seed).advance(round(chosen.duration_s * chosen.truth.rate_hz) + 1)
+    sensed: dict[str, Any] = {
+        name: sensors.build(name, config, chosen.truth.rate_hz, seed, chosen.site()).sense(truth)
+        for name, config in chosen.sensors.items()
+    }
+    wrong: dict[str, list[tuple[int, float, float]]] = {}
+    for fault in scenario(NAME).fault:
+        part, axis = CHANNELS[fault.channel]  # type: ignore[union-attr, index]
+        wrong.setdefault(part, []).append((axis, *fault.window))
+    told = {part: Told(tuple(windows)) for part, windows in wrong.items()}
+    t = np.arange(0.0, chosen.duration_s + 0.5)
+    largest = {}
+    for when, policies in (("six faults", told), ("no fault", None)):
+        built = estimators.build(chosen, seed)["with_star"]
+        assert isinstance(built.horizon.estimator, Ins)
+        assert built.handover is not None
+        ins = Ins(built.horizon.estimator.config, policies=policies)
+        replace(built.handover, estimator=ins).take_over(truth)
+        handed = [sample for aid in built.sensors for sample in sensed[aid]]
+        _, estimates = FusionHorizon(ins).track(built.increments(sensed)[0], handed, t.tolist())
+        largest[when] = _largest(t, _differences(estimates, truth, np.searchsorted(truth.t, t - metrics.SAME_TIME_S)))
+    return largest
+
+
+def _largest(t: Array, errors: dict[str, Array]) -> dict[str, list[float]]:
+    """The largest error of each axis after a minute."""
+    return {what: np.abs(e[t >= AFTER_S]).max(axis=0).tolist() for what, e in errors.items()}
+
+
+def _differences(estimates: Sequence[Estimate], truth: TruthBlock, rows: npt.NDArray[np.intp]) -> dict[str, Array]:
+    """The same as `_errors` from estimates (N,), ``rows`` (N,) of truth being at their times."""
+    lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
+    q_nb, true = np.array([e.q_nb for e in estimates]), truth.q_nb[rows]
+    attitude = metrics.euler(q_nb) - metrics.euler(true)
+    attitude[:, 2] = metrics.attitude_error(q_nb, true)[:, 2]
+    return {
+        "position": position_difference_n(lat, lon, h, truth.lat[rows], truth.lon[rows], truth.h[rows]),
+        "velocity": np.array([e.v_n for e in estimates]) - truth.v_n[rows],
+        "attitude": attitude * ARCSEC_PER_RAD,
+    }
 
 
 def _errors(tree: xarray.DataTree, name: str) -> tuple[Array, dict[str, Array]]:
@@ -143,25 +223,31 @@ def replay(kind: Callable[[float], Detector], count: int) -> list[float]:
 
 
 def jobs() -> list[Job]:
-    """Two replays on white residuals, then runs with and without faults."""
+    """Two replays on white residuals, what no filter could better, then runs with and without faults."""
     replays = [Job(replay, (kind, REPLAYS)) for kind in (Eraim, Glr)]
-    faulty = [Job(fly, (seed, (), seed == 1)) for seed in range(1, FAULTY_SEEDS + 1)]
-    healthy = [Job(fly, (seed, HEALTHY, False)) for seed in range(1, HEALTHY_SEEDS + 1)]
-    return [*replays, *faulty, *healthy]
+    floors = [Job(floor, (seed,)) for seed in range(1, SEEDS + 1)]
+    flights = [
+        Job(fly, (seed, overrides, EVERY if seed <= FEW_SEEDS else WITH_STAR, overrides == () and seed == 1))
+        for overrides in ((), HEALTHY)
+        for seed in range(1, SEEDS + 1)
+    ]
+    return [*replays, *floors, *flights]
 
 
 def conclude(results: Sequence[Any]) -> list[Claim]:
     """What the paper claims of detection, accuracy and false alarms."""
-    snapshot, gathered, *runs = results
+    snapshot, gathered, *flown = results
+    floors, runs = [r for r in flown if "faulty" not in r], [r for r in flown if "faulty" in r]
     faulty, healthy = [r for r in runs if r["faulty"]], [r for r in runs if not r["faulty"]]
+    starless = [r for r in faulty if "without_star" in r]
     return [
         *_detection_claims(faulty),
         *_small_step_claims(snapshot, gathered, faulty),
-        *_accuracy_claims("with_star", faulty, "six faults"),
-        *_accuracy_claims("with_star", healthy, "no fault"),
-        *_accuracy_claims("without_star", faulty, "six faults, no star tracker"),
+        *_accuracy_claims("with_star", faulty, "six faults", floors),
+        *_accuracy_claims("with_star", healthy, "no fault", floors),
+        *_accuracy_claims("without_star", starless, "six faults, no star tracker"),
         Claim("heading error at 1200 s, six faults, no star tracker", "arcsec", "50",
-              [r["without_star"]["heading_at_end"] for r in faulty], 50.0),
+              [r["without_star"]["heading_at_end"] for r in starless], 50.0),
         *_false_alarm_claims(healthy),
     ]  # fmt: skip
 
@@ -206,7 +292,7 @@ def _small_step_claims(snapshot: Sequence[float], gathered: Sequence[float], fau
     because = "a look of one sigma passes the limit of 1e-5 once in 9000: 0.3 % of the 30 s steps are ever seen"
     evidence = "its 30 looks hold 15 nats of evidence at most, less what the filter learns of the step, against 15.9"
     delays = [d for d in gathered if np.isfinite(d)]
-    in_flight = [1.0 - r["glr"]["scores"]["missed.east_velocity"] for r in faulty]
+    in_flight = [1.0 - r["glr"]["scores"]["missed.east_velocity"] for r in faulty if "glr" in r]
     on_residuals = [float(np.isfinite(r["glr_on_residuals"][0])) for r in faulty]
     return [
         Claim(f"{what} by ERAIM, share of flights", "", "no delay",
@@ -226,11 +312,12 @@ def _share(delays: Sequence[float]) -> float:
     return float(np.mean(np.isfinite(delays)))
 
 
-def _accuracy_claims(name: str, runs: Sequence[Result], when: str) -> list[Claim]:
-    """Largest error after a minute by axis, of the median flight; with star tracker of all flights and axes as well."""
+def _accuracy_claims(
+    name: str, runs: Sequence[Result], when: str, floors: Sequence[dict[str, dict[str, list[float]]]] = ()
+) -> list[Claim]:
+    """Largest error after a minute by axis, of the median flight; with ``floors`` of all flights and axes as well."""
     claims = []
-    bounds = {"position": (10.0, 6.0), "velocity": (0.5, 0.1), "attitude": (50.0, 5.0)}
-    for what, (bound, target) in bounds.items():
+    for what, (bound, target) in BOUNDS.items():
         largest = np.array([r[name]["largest"][what] for r in runs])
         for k, axis in enumerate(AXES[what]):
             label = f"{axis} {what if what != 'attitude' else ''}".strip()
@@ -243,12 +330,27 @@ def _accuracy_claims(name: str, runs: Sequence[Result], when: str) -> list[Claim
                 Claim(f"largest error after 60 s, {label}, {when}", UNITS[what], f"{bound:g}", largest[:, k].tolist(),
                       120.0 if blind else bound, target=target, impossible=because)
             )  # fmt: skip
-        if name == "with_star":
-            claims.append(
-                Claim(f"largest error after 60 s, {what}, any axis and flight, {when}", UNITS[what], f"{bound:g}",
-                      largest.max(axis=1).tolist(), bound, worst=True, target=target)
-            )  # fmt: skip
+        if floors:
+            least = np.array([one[when][what] for one in floors]).max(axis=1)
+            claims += _every_axis_claims(what, largest.max(axis=1), least, when)
     return claims
+
+
+def _every_axis_claims(what: str, ours: Array, least: Array, when: str) -> list[Claim]:
+    """The largest error of any axis (flights,) and that of the optimal filter in the same flights."""
+    bound, target = BOUNDS[what]
+    told = "the optimal filter" + (" told of them" if when == "six faults" else "")
+    beyond = int(np.sum(least > target))
+    because = (
+        f"{target:g} {UNITS[what]} can't be kept in every flight: {told} exceeds them in {beyond} of {len(least)}, by "
+        f"up to {np.max(least) - target:.2g}" if beyond else ""
+    )  # fmt: skip
+    label = f"largest error after 60 s, {what}, any axis and flight, {when}"
+    return [
+        Claim(label, UNITS[what], f"{bound:g}", ours.tolist(), bound, worst=True, target=target, impossible=because),
+        Claim(f"{label}, of {told}", UNITS[what], "–", least.tolist(), bound, worst=True, target=target),
+        Claim(f"{label}, over that of {told}, median flight", "", "–", (ours / least).tolist(), 1.25),
+    ]
 
 
 def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
@@ -261,7 +363,8 @@ def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
         Claim(f"looks refused in {len(healthy)} flights without fault", "", "none", [float(refused.sum())],
               float(poisson.ppf(0.95, expected)),
               impossible=f"table 1 allows 1e-5 of the {looks.sum()} looks: {expected:.2f} are expected"),
-        Claim("looks refused by GLR in 1200 s without fault", "", "–", [r["glr"]["refused"][0] for r in healthy], 0.0),
+        Claim("looks refused by GLR in 1200 s without fault", "", "–",
+              [r["glr"]["refused"][0] for r in healthy if "glr" in r], 0.0),
     ]  # fmt: skip
 
 
