@@ -1,8 +1,8 @@
 """Cui et al. 2022: fault-tolerant federated filter of SINS, GPS, Doppler radar and star tracker.
 
 Straight flight of 1200 s with the six faults of table 2, and without any. Flights carry the federation with and without
-star tracker, judged by ERAIM, and one with it that is judged by the GLR. How near one can come is measured as well: with
-a single Kalman filter of all sensors and the same states, which is told of the faults.
+star tracker, judged by ERAIM, and one with it that is judged by the GLR. How near one can come is measured as well:
+with a single Kalman filter of all sensors and the same states, which is told of the faults.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     import xarray
 
 NAME = "cui2022"
-SEEDS, FEW_SEEDS = 20, 12  # of flights, with and without faults; of those that carry every estimator
+SEEDS, FEW_SEEDS = 20, 10  # of flights, with and without faults; of those that carry more than one estimator
 HEALTHY = ("fault=[]",)
-WITH_STAR, EVERY = ("with_star",), ("with_star", "without_star", "glr")
+CARRIED = {(): ("with_star", "without_star", "glr"), HEALTHY: ("with_star", "glr")}  # by overrides
 FALSE_ALARM = 1e-5  # per look: table 1
 AFTER_S = 60.0
 REPLAYS = 1000
@@ -227,8 +227,8 @@ def jobs() -> list[Job]:
     replays = [Job(replay, (kind, REPLAYS)) for kind in (Eraim, Glr)]
     floors = [Job(floor, (seed,)) for seed in range(1, SEEDS + 1)]
     flights = [
-        Job(fly, (seed, overrides, EVERY if seed <= FEW_SEEDS else WITH_STAR, overrides == () and seed == 1))
-        for overrides in ((), HEALTHY)
+        Job(fly, (seed, overrides, carried if seed <= FEW_SEEDS else ("with_star",), overrides == () and seed == 1))
+        for overrides, carried in CARRIED.items()
         for seed in range(1, SEEDS + 1)
     ]
     return [*replays, *floors, *flights]
@@ -339,17 +339,16 @@ def _accuracy_claims(
 def _every_axis_claims(what: str, ours: Array, least: Array, when: str) -> list[Claim]:
     """The largest error of any axis (flights,) and that of the optimal filter in the same flights."""
     bound, target = BOUNDS[what]
-    told = "the optimal filter" + (" told of them" if when == "six faults" else "")
+    optimal = "the optimal filter, told of the faults," if when == "six faults" else "the optimal filter"
     beyond = int(np.sum(least > target))
     because = (
-        f"{target:g} {UNITS[what]} can't be kept in every flight: {told} exceeds them in {beyond} of {len(least)}, by "
-        f"up to {np.max(least) - target:.2g}" if beyond else ""
+        f"{target:g} {UNITS[what]} in every flight is out of reach: {optimal} has up to {np.max(least):.2g}, and more "
+        f"than {target:g} in {beyond} of {len(least)}" if beyond else ""
     )  # fmt: skip
     label = f"largest error after 60 s, {what}, any axis and flight, {when}"
     return [
         Claim(label, UNITS[what], f"{bound:g}", ours.tolist(), bound, worst=True, target=target, impossible=because),
-        Claim(f"{label}, of {told}", UNITS[what], "–", least.tolist(), bound, worst=True, target=target),
-        Claim(f"{label}, over that of {told}, median flight", "", "–", (ours / least).tolist(), 1.25),
+        Claim(f"{label}, over that of the optimal filter, median", "", "–", (ours / least).tolist(), 1.25),
     ]
 
 
