@@ -572,5 +572,10 @@ def test_keys_of_an_ins() -> None:
     assert "estimator[0].course: needs a GNSS receiver among the aids" in blind
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.engine="unscented"')
     assert "estimator[2].engine: is a key of kind 'ins', not of 'ahrs'" in ahrs
+    ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.states="full"')
+    assert "estimator[2].states: is a key of kind 'ins' or 'federated', not of 'ahrs'" in ahrs
+    assert 'estimator[0].states: can\'t be "scale": choose from biases, full' in complaint(
+        U_TURN, 'estimator.ins.states="scale"'
+    )
     assert "fading.looks" in complaint(U_TURN, 'estimator.ins.fading={ looks = ["gnss_heading"] }')
     assert "sage_husa.b" in complaint(U_TURN, "estimator.ins.sage_husa={ b = 1.0 }")

@@ -17,7 +17,10 @@ from nav.local_filter import AirspeedAid, GnssAid
 from testbed import Scenario, estimators, metrics, papers, run
 from testbed.errors import UserError
 from testbed.kinematic import Kinematic
+from testbed.loop import motion
 from testbed.scenario import KinematicStart
+from testbed.sensors import build as build_sensor
+from testbed.sensors.imu import ImuConfig
 
 TWO_RECEIVERS = [
     "duration_s=20",
@@ -41,6 +44,63 @@ def test_datasheet_units() -> None:
     assert model.accel_noise == pytest.approx(0.06 / math.sqrt(hour))
     assert model.gyro_bias_sigma >= math.radians(40) / hour
     assert model.accel_bias_sigma >= 2e-3 * 9.80665
+
+
+def test_drift_and_scale_factors_are_states_when_asked_for() -> None:
+    """Then no walk and no sigma of a bias stands in for them; misalignment has no state either way."""
+    scenario = Scenario.load("loiter_gnss_outage")
+    imu = scenario.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    e, biases = imu.errors(), told(scenario).config.imu
+    full = told(Scenario.load("loiter_gnss_outage", ['estimator.ins.states="full"'])).config.imu
+    assert (biases.gyro_drift_sigma, biases.accel_drift_sigma) == (0.0, 0.0)
+    assert (biases.gyro_scale_sigma, biases.accel_scale_sigma) == (0.0, 0.0)
+    assert (full.gyro_drift_sigma, full.accel_drift_sigma) == (e.gyro_in_run, e.accel_in_run)
+    assert (full.gyro_drift_correlation_s, full.accel_drift_correlation_s) == (e.gyro_in_run_tau, e.accel_in_run_tau)
+    assert (full.gyro_scale_sigma, full.accel_scale_sigma) == (e.gyro_scale, e.accel_scale)
+    rate, load, changes = 0.06, 0.1 * 9.80665, 1 / math.sqrt(120)
+    gyro, accel = rate * e.gyro_scale, load * e.accel_scale
+    drift = e.gyro_in_run * math.sqrt(2 / e.gyro_in_run_tau), e.accel_in_run * math.sqrt(2 / e.accel_in_run_tau)
+    for before, after, parts in (
+        (biases.gyro_bias_walk, full.gyro_bias_walk, (gyro * changes, drift[0])),
+        (biases.accel_bias_walk, full.accel_bias_walk, (accel * changes, drift[1])),
+        (biases.gyro_bias_sigma, full.gyro_bias_sigma, (gyro, e.gyro_in_run)),
+        (biases.accel_bias_sigma, full.accel_bias_sigma, (10 * accel, e.accel_in_run)),
+    ):
+        assert before == pytest.approx(math.hypot(after, *parts))
+        assert after > 0
+
+
+@pytest.mark.parametrize("engine", ["linear", "unscented"])
+def test_scale_factors_are_found_in_flight(engine: str) -> None:
+    """Against what the unit made of the true increments, which an unerring unit gives."""
+    estimator = (
+        f"{{name='ins', states='full', aids=['gnss', 'stars'], engine='{engine}',"
+        " handover={level_deg=0.1, heading_deg=0.1, velocity_mps=0.1, position_m=1}}"
+    )
+    overrides = [
+        "sensors.imu={grade='perfect', gyro_scale_ppm=2000, accel_scale_ppm=2000, gyro_turn_on_degph=1,"
+        " accel_turn_on_mg=0.1, angle_random_walk_degprth=0.01, velocity_random_walk_mpsprth=0.01}",
+        "sensors.stars={kind='star_tracker'}",
+        "sensors.gnss={grade='rtk', rate_hz=1}",
+        "duration_s=240",
+        f"estimator=[{estimator}]",
+        "expect={}",
+    ]
+    scenario = Scenario.load("kinematic_u_flight", overrides)
+    done = run(scenario, seed=4)
+    truth = motion(scenario, 4).advance(240 * 200 + 1)
+    units = (scenario.sensors["imu"], ImuConfig(grade="perfect"))
+    sensed = [build_sensor("imu", unit, 200.0, 4, scenario.site()).sense(truth) for unit in units]
+    own, true = (np.hstack([unit.dtheta, unit.dv])[200 * 200 :] for unit in sensed)
+    for name, axis, column in (("gyro_scale", 2, 2), ("accel_scale", 2, 5)):
+        expected = np.polyfit(true[:, column], own[:, column], 1)[0] - 1
+        found = done.dataset[f"estimators/ins/{name}"].values[-1, axis]
+        sigma = done.dataset[f"estimators/ins/sigma_{name}"].values[-1, axis]
+        print(name, expected, found, sigma)
+        assert sigma < 0.25 * 2e-3
+        assert abs(found - expected) < 4 * sigma
+        assert abs(expected) > 4 * sigma
 
 
 def test_a_receiver_that_is_no_aid_is_not_fused() -> None:

@@ -115,12 +115,12 @@ def test_the_states_are_those_of_eq_36() -> None:
         ("gyro_bias", 0.01 * per_hour), ("gyro_drift", 0.005 * per_hour), ("gyro_scale", 2e-5), ("accel_scale", 2e-5),
         ("accel_bias", g0 * math.hypot(5e-5, 15 * math.radians(1 / 3600))),
     ):  # fmt: skip
-        np.testing.assert_allclose(model.sigma[model.slices[name]], sigma, rtol=0.01)
+        np.testing.assert_allclose(model.sigma[model.slices[name]], sigma, rtol=0.015)
     np.testing.assert_allclose(1 / model.decay_rate[model.slices["gyro_drift"]], 3600)
-    # What is left of the walks: over the whole flight a hundredth of the turn-on.
-    for name in ("gyro_bias", "accel_bias"):
-        walked = model.density[model.slices[name]] * math.sqrt(1200)
-        assert (walked < 0.01 * model.sigma[model.slices[name]]).all()
+    # The walks left are those of misalignment: of the gyros at the Earth's rate, of the accelerometers next to none.
+    gyro, accel = (model.density[model.slices[name]] for name in ("gyro_bias", "accel_bias"))
+    np.testing.assert_allclose(gyro, 7.27e-5 * math.radians(0.006) / math.sqrt(120), rtol=1e-3)
+    assert (accel * math.sqrt(1200) < 1e-4 * model.sigma[model.slices["accel_bias"]]).all()
 
 
 def normalised(seeds: range, duration_s: int, *, faults: bool) -> Array:
@@ -153,11 +153,11 @@ def test_the_claimed_covariance_is_that_of_the_errors() -> None:
 @pytest.mark.slow
 def test_the_claimed_covariance_at_the_end_of_the_flight() -> None:
     """Two-sided 99 % of one filter; the federation without resets claims no less than its errors, faults or none."""
-    alone = normalised(range(1, 31), 1200, faults=False)
+    alone = normalised(range(1, 21), 1200, faults=False)
     low, high = chi2.ppf([0.005, 0.995], 3 * len(alone))
     print(alone.mean(axis=0), low / len(alone), high / len(alone))
     assert ((low < alone.sum(axis=0)) & (alone.sum(axis=0) < high)).all()
-    federated = normalised(range(1, 31), 1200, faults=True)
+    federated = normalised(range(1, 21), 1200, faults=True)
     print(federated.mean(axis=0))
     assert (federated.sum(axis=0) < high).all()
 
