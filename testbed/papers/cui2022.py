@@ -51,6 +51,8 @@ AXES = {
 }
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "arcsec"}
 BOUNDS = {"position": (10.0, 6.0), "velocity": (0.5, 0.1), "attitude": (50.0, 5.0)}  # the paper's, and better ones
+FIGURES = {"position": (10.0, 10.0, 10.0), "velocity": (0.5, 0.1, 0.2), "attitude": (50.0, 10.0, 5.0)}  # by axis
+NO_WORSE = 1.25  # than the optimal filter
 PARTS = {"gnss_position": "GPS position", "gnss_velocity": "GPS velocity", "body_velocity": "Doppler",
          "star_attitude": "star"}  # fmt: skip
 
@@ -264,15 +266,16 @@ def _detection_claims(faulty: Sequence[Result]) -> list[Claim]:
         for fault, what in (("longitude", "longitude step"), ("height", "height step"),
                             ("doppler_velocity", "Doppler step"))
     ]  # fmt: skip
+    latitude, ramp = (
+        _scores(faulty, "with_star", f"detection_delay_s.{fault}") for fault in ("latitude", "north_velocity")
+    )
+    slow = "the drift is below 3 sigma of GPS for 6 s: one look in nine shows it after 7 s, and 86 % after 9 s"
+    steep = "it passes 5 sigma after 3 s: 54 % of looks show it then, and 96 % after 4 s"
     drifts = [
-        Claim(f"detection delay, {what}", "s", "no delay", _scores(faulty, "with_star", f"detection_delay_s.{fault}"),
-              bound, impossible=because)
-        for fault, what, bound, because in (
-            ("latitude", "latitude drift", 10.0, "the drift is below 3 sigma of GPS for 6 s: one look in nine shows "
-             "it after 7 s, and 86 % after 9 s"),
-            ("north_velocity", "north velocity ramp", 4.0, "it passes 5 sigma after 3 s: 54 % of looks show it then, "
-             "and 96 % after 4 s"),
-        )
+        Claim("detection delay, latitude drift", "s", "no delay", latitude, 10.0, worst=True, impossible=slow),
+        Claim("detection delay, north velocity ramp, median", "s", "no delay", ramp, 4.0, impossible=steep),
+        Claim("detection delay, north velocity ramp, any flight", "s", "no delay", ramp, 5.0, worst=True,
+              impossible=steep),
     ]  # fmt: skip
     found = [fault for fault in ("longitude", "latitude", "doppler_velocity", "height", "north_velocity")]
     isolated = [min(r["with_star"]["scores"][f"isolation_correct.{fault}"] for fault in found) for r in faulty]
@@ -294,9 +297,10 @@ def _small_step_claims(snapshot: Sequence[float], gathered: Sequence[float], fau
     delays = [d for d in gathered if np.isfinite(d)]
     in_flight = [1.0 - r["glr"]["scores"]["missed.east_velocity"] for r in faulty if "glr" in r]
     on_residuals = [float(np.isfinite(r["glr_on_residuals"][0])) for r in faulty]
+    covered = np.array(_scores(faulty, "with_star", "coverage.east_velocity"))
+    seen = float(np.mean(np.where(np.isnan(covered), np.nan, covered > 0)))
     return [
-        Claim(f"{what} by ERAIM, share of flights", "", "no delay",
-              [float(np.mean(_scores(faulty, "with_star", "coverage.east_velocity")) > 0)], 0.0, impossible=because),
+        Claim(f"{what} by ERAIM, share of flights", "", "no delay", [seen], 0.0, impossible=because),
         Claim(f"{what} by ERAIM, share of {len(snapshot)} replays", "", "no delay", [_share(snapshot)], 0.02,
               impossible=because),
         Claim(f"{what} by GLR, share of {len(gathered)} replays", "", "–", [_share(gathered)], 0.5, at_least=True),
@@ -315,41 +319,48 @@ def _share(delays: Sequence[float]) -> float:
 def _accuracy_claims(
     name: str, runs: Sequence[Result], when: str, floors: Sequence[dict[str, dict[str, list[float]]]] = ()
 ) -> list[Claim]:
-    """Largest error after a minute by axis, of the median flight; with ``floors`` of all flights and axes as well."""
+    """Largest error after a minute by axis, of the median flight; with ``floors``, those of the optimal filter, it
+    must keep the better bounds, and the worst flight the paper's or next to the optimal filter's.
+    """
     claims = []
-    for what, (bound, target) in BOUNDS.items():
+    for what, (bound, better) in BOUNDS.items():
         largest = np.array([r[name]["largest"][what] for r in runs])
         for k, axis in enumerate(AXES[what]):
-            label = f"{axis} {what if what != 'attitude' else ''}".strip()
-            blind = axis == "heading" and name == "without_star"
+            label = f"largest error after 60 s, {axis} {what if what != 'attitude' else ''}".strip()
+            blind = axis == "heading" and not floors
             because = (
                 "the 120 arcsec at the start show in GPS only when the speed changes: 0.3 m/s of noise over the "
                 "100 m/s gained" if blind else ""
             )  # fmt: skip
             claims.append(
-                Claim(f"largest error after 60 s, {label}, {when}", UNITS[what], f"{bound:g}", largest[:, k].tolist(),
-                      120.0 if blind else bound, target=target, impossible=because)
+                Claim(f"{label}, {when}", UNITS[what], f"{bound:g}", largest[:, k].tolist(),
+                      120.0 if blind else better if floors else bound, target=better, impossible=because)
             )  # fmt: skip
+            if floors:
+                least = np.array([one[when][what][k] for one in floors])
+                claims.append(
+                    _any_flight_claim(label, what, when, FIGURES[what][k], FIGURES[what][k], largest[:, k], least)
+                )
         if floors:
-            least = np.array([one[when][what] for one in floors]).max(axis=1)
-            claims += _every_axis_claims(what, largest.max(axis=1), least, when)
+            of_all, least = largest.max(axis=1), np.array([one[when][what] for one in floors]).max(axis=1)
+            label = f"largest error after 60 s, {what}, any axis"
+            claims.append(_any_flight_claim(label, what, when, bound, better, of_all, least))
+            ratio = (of_all / least).tolist()
+            claims.append(Claim(f"{label}, {when}, over that of the optimal filter", "", "–", ratio, NO_WORSE))
     return claims
 
 
-def _every_axis_claims(what: str, ours: Array, least: Array, when: str) -> list[Claim]:
-    """The largest error of any axis (flights,) and that of the optimal filter in the same flights."""
-    bound, target = BOUNDS[what]
-    optimal = "the optimal filter, told of the faults," if when == "six faults" else "the optimal filter"
-    beyond = int(np.sum(least > target))
-    because = (
-        f"{target:g} {UNITS[what]} in every flight is out of reach: {optimal} has up to {np.max(least):.2g}, and more "
-        f"than {target:g} in {beyond} of {len(least)}" if beyond else ""
-    )  # fmt: skip
-    label = f"largest error after 60 s, {what}, any axis and flight, {when}"
-    return [
-        Claim(label, UNITS[what], f"{bound:g}", ours.tolist(), bound, worst=True, target=target, impossible=because),
-        Claim(f"{label}, over that of the optimal filter, median", "", "–", (ours / least).tolist(), 1.25),
-    ]
+def _any_flight_claim(label: str, what: str, when: str, paper: float, bound: float, ours: Array, least: Array) -> Claim:
+    """The worst flight against ``bound``; where the optimal filter breaks it too, next to its worst flight."""
+    because, kept = "", bound
+    if np.max(least) > bound:
+        kept = NO_WORSE * float(np.max(least))
+        optimal = "the optimal filter, told of the faults," if when == "six faults" else "the optimal filter"
+        because = (
+            f"{optimal} has up to {np.max(least):.2g}, more than {bound:g} in {np.sum(least > bound)} of {len(least)}"
+        )
+    return Claim(f"{label}, any flight, {when}", UNITS[what], f"{paper:g}", ours.tolist(), kept, worst=True,
+                 impossible=because)  # fmt: skip
 
 
 def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
