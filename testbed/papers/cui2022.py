@@ -51,7 +51,7 @@ AXES = {
 }
 UNITS = {"position": "m", "velocity": "m/s", "attitude": "arcsec"}
 BOUNDS = {"position": (10.0, 6.0), "velocity": (0.5, 0.1), "attitude": (50.0, 5.0)}  # the paper's, and better ones
-FIGURES = {"position": (10.0, 10.0, 10.0), "velocity": (0.5, 0.1, 0.2), "attitude": (50.0, 10.0, 5.0)}  # by axis
+FIGURES = {"position": (10.0, 10.0, 10.0), "velocity": (0.5, 0.1, 0.2), "attitude": (50.0, 10.0, 5.0)}  # in its figures
 NO_WORSE = 1.25  # than the optimal filter
 PARTS = {"gnss_position": "GPS position", "gnss_velocity": "GPS velocity", "body_velocity": "Doppler",
          "star_attitude": "star"}  # fmt: skip
@@ -320,7 +320,7 @@ def _accuracy_claims(
     name: str, runs: Sequence[Result], when: str, floors: Sequence[dict[str, dict[str, list[float]]]] = ()
 ) -> list[Claim]:
     """Largest error after a minute by axis, of the median flight; with ``floors``, those of the optimal filter, it
-    must keep the better bounds, and the worst flight the paper's or next to the optimal filter's.
+    must keep the better bounds, and the worst flight too or be next to the optimal filter's.
     """
     claims = []
     for what, (bound, better) in BOUNDS.items():
@@ -336,22 +336,22 @@ def _accuracy_claims(
                 Claim(f"{label}, {when}", UNITS[what], f"{bound:g}", largest[:, k].tolist(),
                       120.0 if blind else better if floors else bound, target=better, impossible=because)
             )  # fmt: skip
-            if floors:
-                least = np.array([one[when][what][k] for one in floors])
-                claims.append(
-                    _any_flight_claim(label, what, when, FIGURES[what][k], FIGURES[what][k], largest[:, k], least)
-                )
         if floors:
             of_all, least = largest.max(axis=1), np.array([one[when][what] for one in floors]).max(axis=1)
             label = f"largest error after 60 s, {what}, any axis"
-            claims.append(_any_flight_claim(label, what, when, bound, better, of_all, least))
+            claims.append(_any_flight_claim(label, what, when, of_all, least))
             ratio = (of_all / least).tolist()
             claims.append(Claim(f"{label}, {when}, over that of the optimal filter", "", "–", ratio, NO_WORSE))
+    if floors:
+        within = [all(np.all(np.less(r[name]["largest"][what], most)) for what, most in FIGURES.items()) for r in runs]
+        what = f"share of flights within every figure of the paper by axis, {when}"
+        claims.append(Claim(what, "", "1 flight", [float(np.mean(within))], 0.9, at_least=True))
     return claims
 
 
-def _any_flight_claim(label: str, what: str, when: str, paper: float, bound: float, ours: Array, least: Array) -> Claim:
-    """The worst flight against ``bound``; where the optimal filter breaks it too, next to its worst flight."""
+def _any_flight_claim(label: str, what: str, when: str, ours: Array, least: Array) -> Claim:
+    """The worst flight against the better bound; where the optimal filter breaks it too, next to its worst flight."""
+    paper, bound = BOUNDS[what]
     because, kept = "", bound
     if np.max(least) > bound:
         kept = NO_WORSE * float(np.max(least))
