@@ -443,7 +443,8 @@ class Federated:
         weight, reason = 0.0, withheld
         if not withheld and not out:
             used = decision.axis_mask & ~watch.isolated if suspect else decision.axis_mask
-            weight, reason = filter_.take(self._reference, state, look, nu, S, used, self._policy(filter_, watch), t)
+            policy = self._policy(filter_, watch)
+            weight, reason = filter_.take(self._reference, state, look, nu, S, used, watch.noise, policy, t)
         if out or watch.suspect:
             reason = ISOLATED
         elif decision.alarm and not withheld:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -209,7 +209,8 @@ class Ins:
         self._others = {aid.sensor: aid for aid in config.others}
         self._gate = ChiSquareGate(config.false_rejection)
         self._filter = LocalFilter(config.imu, config.used(), self._gate, scaling=config.scaling)
-        self._filter.policies, self._filter.fadings = policies or {}, fadings or {}
+        self._filter.weigh_by(policies or {})
+        self._filter.fadings = fadings or {}
         self.model = self._filter.model
         self._reference = Reference([self.model], [1.0], config.covariance_period, field_n, config.scaling)
         self._turns = TurnDetector(config.course.max_turn_rate, config.course.quiet_s) if config.course else None
@@ -342,16 +343,17 @@ class Ins:
     def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
         look = self._filter.look(self._reference, state, aid, "gnss_position", sample)
         assert look is not None
-        nu, H, R, _, at_points = look
+        nu, H, R, at_points = look.nu, look.H, look.R, look.at_points
         S, nis = self._filter.absorb(self._reference, state, nu, H, R, -math.inf, at_points)
         with_velocity = aiding.has_velocity(sample)
         v_n, sigma_v = (
-            (sample.v_n, sample.sigma_velocity_n)
+            (sample.v_n, self._filter.learned_sigma("gnss_velocity", sample.sigma_velocity_n))
             if with_velocity
             else (state.v_n.copy(), np.sqrt(np.diag(state.P[0])[VEL : VEL + 3]))
         )
         threshold = self._gate.threshold(3)
-        verdict = self._monitor.judge(sample, v_n, sigma_v, nis <= threshold)
+        sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
+        verdict = self._monitor.judge(replace(sample, sigma_position_n=sigma_p), v_n, sigma_v, nis <= threshold)
         use_velocity = with_velocity and self.config.gnss_use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
@@ -386,8 +388,8 @@ class Ins:
         if use_velocity:
             velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
-            nu_v, H, R, _, at_points = velocity
-            S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, at_points)
+            nu_v, H, R = velocity.nu, velocity.H, velocity.R
+            S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, velocity.at_points)
             if not nis <= self._gate.threshold(3):
                 forget(P, VEL, nu_v**2 + np.diag(S_v))
                 wind = self.model.start("wind")

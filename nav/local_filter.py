@@ -37,7 +37,7 @@ from nav.samples import (
     UpdateReport,
 )
 from nav.unscented import CURVED, Scaling
-from nav.weighting import Fading, InOrder, SageHusa, residual
+from nav.weighting import Fading, SageHusa, split
 
 Axes: TypeAlias = tuple[float, float, float]
 
@@ -48,7 +48,11 @@ NO_RATES = "how fast the sensor swings about the IMU isn't known before the firs
 
 
 class Policy(Protocol):
-    """What the variances of a look are worth: called after the detector and before the update."""
+    """What the variances of a look are worth: called after the detector and before the update.
+
+    It is shown the axes that the detector has left, and no others. `SageHusa` alone is asked before the detector, about
+    whole looks.
+    """
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
         """Variances (m,) to use for innovation ``nu`` (m,), S (m, m) = H P H' + diag(R); inf leaves an axis out."""
@@ -58,7 +62,8 @@ class Policy(Protocol):
 class Look(NamedTuple):
     """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,), why it must not be used.
 
-    ``at_points`` (7, m) are the innovations at the sigma points of an unscented filter.
+    ``at_points`` (7, m) are the innovations at the sigma points of an unscented filter; ``told`` (m,) are the variances
+    as the sensor has them, where R is what they were learned to be.
     """
 
     nu: Array
@@ -66,6 +71,7 @@ class Look(NamedTuple):
     R: Array
     withheld: str = ""
     at_points: Array | None = None
+    told: Array | None = None
 
 
 class Seat(NamedTuple):
@@ -477,6 +483,8 @@ class Change(Enum):
 class Watch:
     """What is known of one part of a sensor's looks: which axes are isolated, how long each has been bad or good.
 
+    Of its policy ``noise`` is what learns R, before the detector judges, and ``policy`` the rest (`split`).
+
     A condemned look goes axis by axis (`Decision.axis_mask`). An axis that was condemned in ``isolate_after``
     consecutive looks is isolated; it is readmitted when it has been sound in ``readmit_after`` consecutive ones, or
     when all isolated axes would each be sound alone in `PATIENT` times as many: while a sensor is isolated nothing
@@ -490,7 +498,8 @@ class Watch:
     def __init__(
         self, detector: Detector, policy: Policy | None, size: int, isolate_after: int, readmit_after: int
     ) -> None:
-        self.detector, self.policy = detector, policy
+        self.detector = detector
+        self.noise, self.policy = split(policy)
         self._isolate_after, self._readmit_after = isolate_after, readmit_after
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
@@ -552,7 +561,8 @@ class LocalFilter:
         self.gate, self.row, self.closed, self.scaling = gate, row, closed, scaling
         self.watches: dict[tuple[str, str], Watch] = {}
         self.of_sensor: dict[str, list[Watch]] = {}
-        self.policies: Mapping[str, Policy] = {}
+        self.noises: dict[str, SageHusa] = {}  # of parts without a watch, as the two below
+        self.policies: dict[str, Policy] = {}
         self.fadings: Mapping[str, Fading] = {}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
 
@@ -565,11 +575,35 @@ class LocalFilter:
             )
         self.of_sensor[sensor] = [self.watches[sensor, part] for part, _ in watched.aid.parts]
 
+    def weigh_by(self, policies: Mapping[str, Policy]) -> None:
+        """Weigh looks that have no watch, by the names of their parts."""
+        for part, policy in policies.items():
+            noise, rest = split(policy)
+            if noise is not None:
+                self.noises[part] = noise
+            if rest is not None:
+                self.policies[part] = rest
+
+    def _noise(self, sensor: str, part: str) -> SageHusa | None:
+        """What learns the variances of one part of a sensor's looks."""
+        watch = self.watches.get((sensor, part))
+        return self.noises.get(part) if watch is None else watch.noise
+
+    def learned_sigma(self, part: str, sigma: Array) -> Array:
+        """The 1-sigma (m,) that a sensor tells of one part of its looks, as learned."""
+        noise = self.noises.get(part)
+        return sigma if noise is None or noise.ratio is None else sigma * np.sqrt(noise.ratio)
+
     def look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
-        """One part of a sample at the nominal state and the filter's own errors of aids."""
+        """One part of a sample at the nominal state and the filter's own errors of aids, its R as learned."""
         starts = self._starts[aid.sensor]
         look = aid.look(part, sample, Seat(reference, state, state.x[self.row], starts))
-        if look is None or self.scaling is None:
+        if look is None:
+            return None
+        noise = self._noise(aid.sensor, part)
+        if noise is not None:
+            look = look._replace(R=noise.learned(look.R), told=look.R)
+        if self.scaling is None:
             return look
         root = unscented.factor(state.P[self.row], CURVED)
         points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
@@ -633,8 +667,8 @@ class LocalFilter:
         """Gate, policy and correction of a closed filter, whatever ``withheld`` says against its use."""
         withheld = withheld or look.withheld
         threshold = self.gate.threshold(len(look.nu))
-        nu, H, R, _, at_points = look
-        simple = part not in self.policies and part not in self.fadings
+        nu, H, R, at_points = look.nu, look.H, look.R, look.at_points
+        simple = part not in self.policies and part not in self.fadings and part not in self.noises
         limit = threshold if simple and not withheld else -math.inf
         S, nis = self.absorb(reference, state, nu, H, R, limit, at_points)
         reason = withheld or ("" if nis <= threshold else OUTSIDE)
@@ -656,7 +690,8 @@ class LocalFilter:
             look = again
             S, _ = self.absorb(reference, state, look.nu, look.H, look.R, -math.inf, look.at_points)
         every = np.full(len(look.nu), True)
-        return self.take(reference, state, look, look.nu, S, every, self.policies.get(part), sample.t)
+        noise, policy = self._noise(sample.sensor, part), self.policies.get(part)
+        return self.take(reference, state, look, look.nu, S, every, noise, policy, sample.t)
 
     def take(
         self,
@@ -666,25 +701,30 @@ class LocalFilter:
         nu: Array,
         S: Array,
         used: Mask,
+        noise: SageHusa | None,
         policy: Policy | None,
         t: float,
     ) -> tuple[float, str]:
-        """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason)."""
-        if policy is None and used.all():
+        """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason).
+
+        What was used teaches ``noise``.
+        """
+        if policy is None and noise is None and used.all():
             self.absorb(reference, state, nu, look.H, look.R, math.inf, look.at_points)
             return 1.0, ""
-        R = look.R
+        R = np.where(used, look.R, np.inf)
         if policy is not None and used.any():
-            R = policy.adapt(nu, S, R, t)
-            used = used & np.isfinite(R)
-            if isinstance(policy, (SageHusa, InOrder)):
-                policy.learn(*residual(nu, S - np.diag(look.R), np.where(used, R, np.inf)))
+            R[used] = policy.adapt(nu[used], S[np.ix_(used, used)], look.R[used], t)
+            used = np.isfinite(R)
             if not used.any():
                 return 0.0, LEFT_OUT
+        if noise is not None:
+            noise.learn(nu, S - np.diag(look.R), R)
         if used.any():
             at_points = None if look.at_points is None else look.at_points[:, used]
             self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf, at_points)
-        return float(np.mean(np.where(used, look.R / R, 0.0))), ""
+        told = look.R if look.told is None else look.told
+        return float(np.mean(told / R)), ""
 
 
 @njit

@@ -4,19 +4,24 @@ Every policy on R has one method, ``adapt(nu, S, R, t) -> variances``: from the 
 ``S = H P H' + diag(R)`` (m, m), the variances ``R`` (m,) and the time ``t`` [s], the variances to use in this update;
 an infinite one leaves its axis out. A policy holds the state of one sensor: build one for each.
 
-Order of application (`InOrder` sees to it that each policy is told the S that the one before has left):
+Order of application (`InOrder` sees to it that each policy is told the S that the one before has left; a local filter
+has gate and detectors of its own and keeps the same order around them: see `split`):
 
 1. `SageHusa`: what R has been learned to be, so that everything after it judges by the R that is true;
 2. `Gate`: an axis that a detector has put out stays out, and nobody inflates or learns from it;
 3. `MahalanobisInflation`: what passes and is still too far off counts for less;
 4. `Weight`: what the detectors of all sensors together say (`normalised_weights`);
-5. after the update `learn` shows the residual to `SageHusa`.
+5. after the update `learn` shows to `SageHusa` what is left of the innovation.
 
 `Fading` is about P: it raises the gain, so it must never answer an outlier of the measurement. Gate first, then apply
 its factor to P, and form S (and the sigma points) anew before the update.
 
-Detectors must go on seeing the S of the R that was told, not of the one used here: otherwise a weight feeds back into
-the statistic that made it.
+Detectors see the S of the R that was told or learned, never of one that was inflated or weighted here: otherwise a
+weight feeds back into the statistic that made it. The learned R must reach them, for a sensor noisier than it says
+would be condemned for that alone. The feedback that this brings is a slow one: only what passed teaches, and by no
+more than 1 - b of the mean. Its price is that a fault which grows more slowly than the memory of 1/(1 - b) looks, and
+stays below the limit while it does, is taken for noise: where slow faults are to be found, the memory must be longer
+than what the detector gathers, or R not learned.
 
 Sources: Zhou et al. 2025 (normalised weights, Eq 22-26), Cheng et al. 2020 (Sage-Husa, Eq 25-30; fading, Eq 31-36),
 Zhu et al. 2020 (inflation, Eq 8-12), Chang, J. Geodesy 88 (2014) 391 (inflation by the Mahalanobis distance).
@@ -179,6 +184,10 @@ class SageHusa:
     member of the mean (Eq 25 prints b^k with k = 0 at first: a division by zero). What is learned is the ratio to the
     nominal variance, so a sensor that tells its own sigma is followed; it stays within `R_FLOOR` and `R_CEILING`.
 
+    Behind a gate of 1e-3 that judges by what has been learned, a sensor twice as noisy as it says is known to be so
+    after some tens of looks, one four times as noisy after a hundred or so: the few that pass open the gate. In a
+    federation a sensor that was isolated before teaches nothing, and stays so.
+
     ``literal`` is the mean of nu nu' - sum Wc (z - Z_j)(z - Z_j)' as printed, whose sum has the measurement where the
     mean of the sigma points belongs: it is -H P- H' whatever was measured, and R becomes negative.
     """
@@ -186,32 +195,42 @@ class SageHusa:
     b: float = 0.98
     literal: bool = False
     ratio: Array | None = field(default=None, init=False)  # (m,) learned variance / nominal variance
-    _looks: int = field(default=0, init=False)
+    _looks: Array = field(default_factory=lambda: np.zeros(1), init=False)  # (m,) that have taught
     _R: Array = field(default_factory=lambda: np.ones(1), init=False)  # nominal, of the last look
-    _HPH: Array = field(default_factory=lambda: np.zeros(1), init=False)  # its diagonal before the update
 
     def __post_init__(self) -> None:
         if not 0.0 < self.b < 1.0:
             raise ValueError(f"a forgetting factor between 0 and 1 is needed, not {self.b}")
 
-    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
-        """See `Policy`."""
-        if self.ratio is None or len(self.ratio) != len(R):
-            self.ratio, self._looks = np.ones_like(R), 0
-        self._R, self._HPH = R, np.diag(S) - R
+    def learned(self, R: Array) -> Array:
+        """What the nominal variances ``R`` (m,) of a look are learned to be; it always has all its axes."""
+        if self.ratio is None:
+            self.ratio, self._looks = np.ones_like(R), np.zeros_like(R)
+        self._R = R
         return self.ratio * R
 
-    def learn(self, residual: Array, HPH_after: Array) -> None:
-        """Take z - h(x+) (m,) and H P+ H' (m, m) of the look just adapted; an axis that is NaN teaches nothing."""
-        if self.ratio is None:
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `Policy`."""
+        return self.learned(R)
+
+    def learn(self, nu: Array, HPH: Array, used: Array) -> None:
+        """Take the look just adapted: its innovation (m,), H P H' (m, m) before the update, the variances of that (m,).
+
+        An axis whose variance is infinite teaches nothing, nor does one whose residual is no number. A residual whose
+        variance was made k times larger by other policies counts as one k^-1/2 times as large, so that an outlier
+        teaches no more than the limit that it was inflated to.
+        """
+        if self.ratio is None or not np.isfinite(used).any():
             return
-        self._looks += 1
-        d = (1.0 - self.b) / (1.0 - self.b ** (self._looks + 1))
-        look = (-self._HPH if self.literal else residual**2 + np.diag(HPH_after)) / self._R
-        learned = (1.0 - d) * self.ratio + d * look
+        left, after = residual(nu, HPH, used)
+        taught = np.isfinite(left)
+        self._looks = self._looks + taught
+        d = (1.0 - self.b) / (1.0 - self.b ** (self._looks + 1.0))
+        look = -np.diag(HPH) if self.literal else left**2 * (self.ratio * self._R / used) + np.diag(after)
+        learned = (1.0 - d) * self.ratio + d * look / self._R
         if not self.literal:
             learned = np.clip(learned, R_FLOOR, R_CEILING)
-        self.ratio = np.where(np.isfinite(residual), learned, self.ratio)
+        self.ratio = np.where(taught, learned, self.ratio)
 
 
 def residual(nu: Array, HPH: Array, R: Array) -> tuple[Array, Array]:
@@ -230,22 +249,20 @@ def residual(nu: Array, HPH: Array, R: Array) -> tuple[Array, Array]:
 
 
 class InOrder:
-    """Policies one after the other, each with the S that belongs to the R of the one before.
+    """Policies one after the other, each with the S that belongs to the R of the one before; `SageHusa` is the first.
 
-    An axis that one has left out is not shown to the next. `learn` goes to those that learn; a residual whose variance
-    was made k times larger after them counts as one k^-1/2 times as large, so that an outlier teaches no more than the
-    limit that it was inflated to.
+    An axis that one has left out is not shown to the next.
     """
 
     def __init__(self, policies: Sequence[Policy]) -> None:
         self.policies = tuple(policies)
-        self._told: list[tuple[SageHusa, Array]] = []
+        if any(isinstance(policy, SageHusa) for policy in self.policies[1:]):
+            raise ValueError("what learns R comes first: everything after it judges by the R that is true")
         self._used: Array = np.empty(0)
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
         """See `Policy`; ``R`` is finite."""
         HPH = S - np.diag(R)
-        self._told = []
         for policy in self.policies:
             kept = np.isfinite(R)
             if not kept.any():
@@ -253,17 +270,23 @@ class InOrder:
             adapted = np.full_like(R, np.inf)
             adapted[kept] = policy.adapt(nu[kept], HPH[np.ix_(kept, kept)] + np.diag(R[kept]), R[kept], t)
             R = adapted
-            if isinstance(policy, SageHusa):
-                self._told.append((policy, R))
         self._used = R
         return R
 
-    def learn(self, residual: Array, HPH_after: Array) -> None:
-        """See `SageHusa.learn`: the residual (m,) and H P+ H' (m, m) after the update."""
-        for policy, R in self._told:
-            in_use = np.isfinite(self._used)
-            share = np.where(in_use, R / np.where(in_use, self._used, 1.0), np.nan)
-            policy.learn(residual * np.sqrt(share), HPH_after)
+    def learn(self, nu: Array, HPH: Array) -> None:
+        """Show the look just adapted to the first policy, where that learns: see `SageHusa.learn`."""
+        first = self.policies[0] if self.policies else None
+        if isinstance(first, SageHusa):
+            first.learn(nu, HPH, self._used)
+
+
+def split(policy: Policy | None) -> tuple[SageHusa | None, Policy | None]:
+    """(what learns R, the rest) of a policy: the first must be asked before the gate of a filter, the rest after it."""
+    if isinstance(policy, SageHusa):
+        return policy, None
+    if isinstance(policy, InOrder) and policy.policies and isinstance(policy.policies[0], SageHusa):
+        return policy.policies[0], InOrder(policy.policies[1:])
+    return None, policy
 
 
 @dataclass

@@ -26,7 +26,7 @@ from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
 from nav.samples import BarometerSample, FixType, ImuSamples, Status
-from nav.weighting import Weight
+from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
 INFORMATION = Config(CONSUMER, (Local("only", ()),))
 SCALAR = Config(CONSUMER, (Local("only", ()),), sharing="none", combination="scalar")
@@ -638,6 +638,64 @@ def test_a_faulty_axis_leaves_the_others_in_use():
     assert np.mean([r.weight for r in during]) == pytest.approx(2 / 3, abs=0.02)
     assert federated.events[0].isolated == (False, False, True)
     assert max(abs(error(e, truth)[2]) for e in estimates if e.t > 50) < 1.5
+
+
+def learner(made):
+    """A policy that learns, and remembers itself in a list."""
+
+    def make():
+        made.append(SageHusa(0.98))
+        return made[-1]
+
+    return make
+
+
+def test_a_condemned_axis_does_not_weaken_the_sound_ones():
+    """Two kilometres north, which the detector takes out: what inflates is not asked about them."""
+    _, increments, one, two, others = world(120)
+    bad = [dataclasses.replace(f, lat=f.lat + 2000 / 6.37e6) if 60 <= f.t < 80 else f for f in one]
+    first, *rest = three(DETECTORS["eraim"])
+    locals_ = (Local("one", (dataclasses.replace(first.sensors[0], policy=MahalanobisInflation),)), *rest)
+    federated, _, reports = fly(Config(CONSUMER, locals_), bad + two + others, increments)
+    during = [r for r in reports if r.aid == "gnss_position" and r.sensor == "gnss" and 60 <= r.t < 80]
+    assert np.mean([r.weight for r in during]) == pytest.approx(2 / 3, abs=0.02)
+    assert federated.events[0].isolated == (True, False, False)
+
+
+@pytest.mark.parametrize("detector", ["chi_square", "eraim", "glr"])
+def test_a_detector_judges_by_the_noise_that_was_learned(detector):
+    """A receiver twice as bad as it says, which would be isolated for that."""
+    truth, increments, _, two, others = world(120)
+    rng = np.random.default_rng(9)
+    bad = [
+        dataclasses.replace(f, sigma_position_n=np.full(3, 1.5), sigma_velocity_n=np.full(3, 0.1))
+        for f in gnss(truth, rng, 5.0, sigma_p=3.0, sigma_v=0.2)
+    ]
+    made = []
+    first, *rest = three(DETECTORS[detector])
+    locals_ = (Local("one", (dataclasses.replace(first.sensors[0], policy=learner(made)),)), *rest)
+    federated, _, reports = fly(Config(CONSUMER, locals_), bad + two + others, increments)
+    assert not federated.events
+    for policy in made:
+        assert np.mean(policy.ratio) == pytest.approx(4, rel=0.25)
+    refused = [bool(r.reason) for r in reports if r.sensor == "gnss" and r.t > 40]
+    assert len(refused) > 700
+    assert np.mean(refused) < 0.01
+
+
+def test_an_axis_left_out_teaches_nothing_and_the_others_go_on():
+    _, increments, one, two, others = world(120)
+    bad = [dataclasses.replace(f, h=f.h + 640.0) if f.t >= 60 else f for f in one]
+    ratios = {}
+    for name, fixes in (("sound", [f for f in one if f.t < 60]), ("bad", bad)):
+        made = []
+        first, *rest = three(DETECTORS["eraim"])
+        locals_ = (Local("one", (dataclasses.replace(first.sensors[0], policy=learner(made)),)), *rest)
+        fly(Config(CONSUMER, locals_), fixes + two + others, increments)
+        ratios[name] = made[0].ratio
+    assert ratios["bad"][2] == ratios["sound"][2] != 1.0
+    assert (ratios["bad"][:2] != ratios["sound"][:2]).all()
+    assert (np.abs(ratios["bad"][:2] - 1) < 0.5).all()
 
 
 def test_both_receivers_off_for_long_are_believed_in_the_end():

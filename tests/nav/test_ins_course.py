@@ -97,10 +97,7 @@ def test_noise_is_learned_inside_the_filter(scaling):
     truth = flight(120)
     rng = np.random.default_rng(4)
     increments, *_ = imu(truth, CONSUMER, rng)
-    fixes = [
-        dataclasses.replace(fix, sigma_position_n=np.full(3, 1.5), sigma_velocity_n=np.full(3, 0.1))
-        for fix in gnss(truth, rng, 5.0, sigma_p=3.0, sigma_v=0.2)
-    ]
+    fixes = noisy(truth, rng, 2)
     policies = {part: SageHusa(0.99) for part in ("gnss_position", "gnss_velocity")}
     ins = Ins(InsConfig(CONSUMER, ("gnss",), false_rejection=0.0, scaling=scaling), lambda *_: FIELD_N, policies)
     ins.start(_start(truth, 1 * DEG))
@@ -109,6 +106,44 @@ def test_noise_is_learned_inside_the_filter(scaling):
         assert np.mean(policy.ratio) == pytest.approx(4, rel=0.25), part
         last = [report for report in reports if report.aid == part][-1]
         assert last.weight == pytest.approx(0.25, rel=0.25)
+
+
+def noisy(truth, rng, times, rate_hz=5.0):
+    """A receiver that says 1.5 m and 0.1 m/s and is `times` as bad."""
+    return [
+        dataclasses.replace(fix, sigma_position_n=np.full(3, 1.5), sigma_velocity_n=np.full(3, 0.1))
+        for fix in gnss(truth, rng, rate_hz, sigma_p=1.5 * times, sigma_v=0.1 * times)
+    ]
+
+
+def learning(times, outage=(0.0, 0.0)):
+    """What is learned behind the usual gate, and the reports on a flight of 600 looks."""
+    truth = flight(120)
+    rng = np.random.default_rng(4)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    fixes = [fix for fix in noisy(truth, rng, times) if not outage[0] <= fix.t < outage[1]]
+    policies = {part: SageHusa(0.99) for part in ("gnss_position", "gnss_velocity")}
+    ins = Ins(InsConfig(CONSUMER, ("gnss",)), lambda *_: FIELD_N, policies)
+    ins.start(_start(truth, 1 * DEG))
+    return policies, feed(FusionHorizon(ins), increments, fixes)[1]
+
+
+@pytest.mark.parametrize("times", [1, 2, 4])
+def test_the_gate_judges_by_what_was_learned(times):
+    """Otherwise it turns sound looks of a noisier receiver away, and what passes never teaches how noisy it is."""
+    policies, reports = learning(times)
+    for part, policy in policies.items():
+        assert np.mean(policy.ratio) == pytest.approx(times**2, rel=0.25), part
+        refused = [bool(report.reason) for report in reports if report.aid == part and report.t > 30]
+        assert len(refused) > 400
+        assert np.mean(refused) < 0.01  # the gate's rate is 0.001
+
+
+def test_fixes_of_a_receiver_found_noisier_agree_after_an_outage():
+    """They agree with each other by the learned sigma: by that told, no streak of them would last a second."""
+    _, reports = learning(4, outage=(60.0, 80.0))
+    after = [report for report in reports if report.aid == "gnss_position" and report.t > 82]
+    assert np.mean([report.weight > 0 for report in after]) > 0.95
 
 
 def _start(truth, heading_sigma, heading_error=0.0):
