@@ -100,6 +100,7 @@ from nav.reference import (
     inject,
     nothing_known,
     spread,
+    turned,
 )
 from nav.samples import (
     Array,
@@ -111,6 +112,7 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.unscented import Scaling
 from nav.weighting import InOrder, Policy, Weight, normalised_weights
 
 Structure = Literal["no_reset", "full_reset", "partial"]
@@ -127,11 +129,15 @@ LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow t
 
 @dataclass(frozen=True)
 class Local:
-    """One local filter: its sensors; ``share`` of the information, all alike when no filter has one."""
+    """One local filter: its sensors; ``share`` of the information, all alike when no filter has one.
+
+    With a ``scaling`` it works by sigma points instead of derivatives.
+    """
 
     name: str
     sensors: tuple[Watched, ...]
     share: float | None = None
+    scaling: Scaling | None = None
 
 
 @dataclass(frozen=True)
@@ -223,7 +229,7 @@ class Federated:
         self.shares = config.shares
         gate = ChiSquareGate(1e-3)
         self.locals = [
-            LocalFilter(config.imu, [w.aid for w in local.sensors], gate, row, closed=False)
+            LocalFilter(config.imu, [w.aid for w in local.sensors], gate, row, closed=False, scaling=local.scaling)
             for row, local in enumerate(config.locals)
         ]
         self._users: dict[str, list[LocalFilter]] = {}
@@ -234,8 +240,9 @@ class Federated:
         # Rows of the state: the filters, then, with a recall, their younger shadows and their older ones.
         self._copies = 1 if config.recall_s is None else 3
         self._reference = Reference(
-            [f.model for f in self.locals] * self._copies, self._told_shares(), config.covariance_period, field_n
-        )
+            [f.model for f in self.locals] * self._copies, self._told_shares(), config.covariance_period, field_n,
+            scalings=[local.scaling for local in config.locals] * self._copies,
+        )  # fmt: skip
         self.model = self.locals[0].model
         self._common = self._reference.common
         self._state: State | None = None
@@ -430,7 +437,8 @@ class Federated:
             return UpdateReport(t, sample.sensor, part, nu, S, nis, math.nan, 0.0, withheld)
         watches = filter_.of_sensor[sample.sensor]
         suspect = any(w.suspect for w in watches)
-        decision, changed = watch.judge(*(self._against_master(state, filter_, look) if suspect else (nu, S)), t)
+        judged = self._against_master(state, filter_, sample, part) if suspect else (nu, S)
+        decision, changed = watch.judge(*judged, t)
         if changed:
             self._note(t, filter_, sample.sensor, part, watch)
             if changed is Change.ISOLATED:
@@ -438,6 +446,10 @@ class Federated:
                     self._start_again(state, filter_, sample.sensor)
                 else:
                     self._recall(state, filter_)
+                if filter_.scaling is not None:
+                    again = filter_.look(self._reference, state, filter_.aids[sample.sensor], part, sample)
+                    assert again is not None
+                    look = again
                 nu, S, nis = filter_.innovate(state, look)
         suspect, out = any(w.suspect for w in watches), any(w.out for w in watches)
         weight, reason = 0.0, withheld
@@ -468,7 +480,7 @@ class Federated:
             return watch.policy
         return Weight(N) if watch.policy is None else InOrder([watch.policy, Weight(N)])
 
-    def _against_master(self, state: State, filter_: LocalFilter, look: Look) -> tuple[Array, Array]:
+    def _against_master(self, state: State, filter_: LocalFilter, sample: Sample, part: str) -> tuple[Array, Array]:
         """Innovation and covariance of a look against the fused solution of the healthy filters.
 
         What its own filter knows of the sensor's error given the common states goes with it. With a recall all filters
@@ -477,7 +489,9 @@ class Federated:
         everyone = np.ones(len(self.locals))
         healthy = everyone if self.config.recall_s is not None else self._healthy()
         master = self._combine(state, healthy if healthy.any() else everyone)
-        x, P, common = state.x[filter_.row].copy(), state.P[filter_.row].copy(), self._common
+        look = filter_.nominal_look(self._reference, state, filter_.aids[sample.sensor], part, sample)
+        assert look is not None
+        x, P, common = state.x[filter_.row].copy(), self._charted(state, filter_.row), self._common
         change = -x
         change[:common] = 0.0  # the nominal state is without what the filter would add to it
         reset(x, P, master.x, master.P)
@@ -511,7 +525,7 @@ class Federated:
                 state.x[row, where] = 0.0
                 forget(state.P[row], where.start, model.sigma[where] ** 2)
         for i, share in enumerate(shares):
-            reset(state.x[i], state.P[i], master.x, master.P / share)
+            self._reset(state, i, master.x, master.P / share)
 
     def _remember(self, state: State) -> None:
         """The younger shadows become the older ones, and the filters the younger."""
@@ -593,7 +607,21 @@ class Federated:
     def _combine(self, state: State, members: Array) -> Master:
         """The fused solution of the ``members`` (filters,), one or zero each."""
         n = len(self.locals)
-        return combine(state.x[:n], state.P[:n], self._common, members, self.config)
+        P = state.P[:n]
+        if self._reference.scalings:
+            P = np.stack([self._charted(state, row) for row in range(n)])
+        return combine(state.x[:n], P, self._common, members, self.config)
+
+    def _charted(self, state: State, row: int) -> Array:
+        """A copy of one filter's P, as the covariance of its x; by sigma points it is that of its own estimate."""
+        P = state.P[row]
+        return turned(state.x[row], P, own=False) if row in self._reference.scalings else P.copy()
+
+    def _reset(self, state: State, row: int, x_g: Array, P_g: Array) -> None:
+        """`reset` one filter."""
+        P = self._charted(state, row)
+        reset(state.x[row], P, x_g, P_g)
+        state.P[row] = turned(state.x[row], P, own=True) if row in self._reference.scalings else P
 
     def _fuse(self, state: State) -> None:
         """Fuse, correct the nominal state, reset the filters as the structure says."""
@@ -610,8 +638,8 @@ class Federated:
             for i, share in enumerate(self._reset_shares()):
                 target = master.x, master.P / share
                 if retention < 1:
-                    target = blend(state.x[i], state.P[i], *target, retention)
-                reset(state.x[i], state.P[i], *target)
+                    target = blend(state.x[i], self._charted(state, i), *target, retention)
+                self._reset(state, i, *target)
         self._reference.correct(state, master.x)
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
@@ -624,7 +652,8 @@ class Federated:
         self._reference.settle(state)
         master = self._combine(state, np.ones(len(self.locals)))
         inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
-        covariance, sigma = spread(master.P, self.config.mounting_sigma**2)
+        P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
+        covariance, sigma = spread(P, self.config.mounting_sigma**2)
         imu = state.imu.copy()
         extra = {
             name: (imu[where], sigma[where])
@@ -633,7 +662,7 @@ class Federated:
         }
         for name, row, where in self._extra:
             extra[name] = (state.x[row, where].copy(), np.sqrt(state.P[row, where, where].diagonal()))
-        return describe(state, imu, master.P, self.model, t, status, covariance, sigma, extra)
+        return describe(state, imu, P, self.model, t, status, covariance, sigma, extra)
 
 
 def combine(x: Array, P: Array, common: int, members: Array, config: Config) -> Master:

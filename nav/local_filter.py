@@ -23,7 +23,7 @@ from nav.detection import ChiSquare, ChiSquareGate, Decision, Detector, Mask, ch
 from nav.earth import pressure_altitude
 from nav.error_model import MOTION, Block, ErrorModel, ImuModel, Indices, markov, sensor_errors
 from nav.kalman import innovate
-from nav.reference import Reference, State, absorb
+from nav.reference import Reference, State, absorb, remove_open
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -541,8 +541,8 @@ class Watch:
 class LocalFilter:
     """One filter's aids and what becomes of their looks; the numbers are rows ``row`` of a `State`.
 
-    ``closed`` filters put each correction into the nominal state at once; only these may work by sigma points, with a
-    ``scaling``. Parts without a `Watch` pass the ``gate``.
+    ``closed`` filters put each correction into the nominal state at once. With a ``scaling`` they work by sigma points
+    around the filter's own estimate. Parts without a `Watch` pass the ``gate``.
     """
 
     def __init__(
@@ -595,16 +595,17 @@ class LocalFilter:
         return sigma if noise is None or noise.ratio is None else sigma * np.sqrt(noise.ratio)
 
     def look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
-        """One part of a sample at the nominal state and the filter's own errors of aids, its R as learned."""
-        starts = self._starts[aid.sensor]
-        look = aid.look(part, sample, Seat(reference, state, state.x[self.row], starts))
+        """One part of a sample with the filter's own errors of aids, its R as learned.
+
+        It is a look at the nominal state, with sigma points at the filter's own estimate.
+        """
+        if self.scaling is None:
+            return self.nominal_look(reference, state, aid, part, sample)
+        state = state if self.closed else reference.own(state, self.row)
+        look = self.nominal_look(reference, state, aid, part, sample)
         if look is None:
             return None
-        noise = self._noise(aid.sensor, part)
-        if noise is not None:
-            look = look._replace(R=noise.learned(look.R), told=look.R)
-        if self.scaling is None:
-            return look
+        starts = self._starts[aid.sensor]
         root = unscented.factor(state.P[self.row], CURVED)
         points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
         at_points, there = np.empty((len(points.x), len(look.nu))), state.copy()
@@ -616,6 +617,14 @@ class LocalFilter:
             at_points[k] = at_point.nu
         return look._replace(at_points=at_points)
 
+    def nominal_look(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Look | None:
+        """One part of a sample at the nominal state and the filter's own errors of aids, its R as learned."""
+        look = aid.look(part, sample, Seat(reference, state, state.x[self.row], self._starts[aid.sensor]))
+        noise = self._noise(aid.sensor, part)
+        if look is None or noise is None:
+            return look
+        return look._replace(R=noise.learned(look.R), told=look.R)
+
     def _whole(self, state: State) -> Array:
         """All estimated values beyond the motion (n,) of a closed filter, those of the inertial sensors too."""
         x: Array = state.x[self.row].copy()
@@ -624,6 +633,9 @@ class LocalFilter:
 
     def innovate(self, state: State, look: Look) -> tuple[Array, Array, float]:
         """(nu, S, nis) of a look at the filter's own estimate."""
+        if look.at_points is not None:
+            nu, S, _, _, nis = self._innovate_points(state.P[self.row], look.at_points, look.H, look.R)
+            return nu, S, nis
         return _innovate(state.P[self.row], state.x[self.row], len(state.imu), look.H, look.R, look.nu)
 
     def absorb(
@@ -640,23 +652,33 @@ class LocalFilter:
         s = state
         if self.scaling is not None:
             assert at_points is not None
-            return self._absorb_points(reference, s, -at_points, H, R, threshold)
+            return self._absorb_points(reference, s, at_points, H, R, threshold)
         return absorb(
             s.q_nb, s.v_n, s.lla, s.imu, s.x[self.row], s.P[self.row], s.errors, reference.driven,
             nu, H, R, threshold, self.closed,
         )  # fmt: skip
 
-    def _absorb_points(
-        self, reference: Reference, state: State, Z: Array, H: Array, R: Array, threshold: float
-    ) -> tuple[Array, float]:
-        """`absorb` by sigma points: ``Z`` (7, m) is prediction - measurement at each, so that zero is measured."""
-        s, P, scaling = state, state.P[self.row], self.scaling
-        assert scaling is not None
+    def _innovate_points(
+        self, P: Array, at_points: Array, H: Array, R: Array
+    ) -> tuple[Array, Array, Array, Array, float]:
+        """`unscented.innovate`: minus ``at_points`` is prediction - measurement, so that zero is measured."""
+        assert self.scaling is not None
         root, z = unscented.factor(P, CURVED), np.zeros(len(R))
-        nu, S, D, HP, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
+        return unscented.innovate(P, -at_points, z, R, root, H, self.scaling.spread, self.scaling.excess)
+
+    def _absorb_points(
+        self, reference: Reference, state: State, at_points: Array, H: Array, R: Array, threshold: float
+    ) -> tuple[Array, float]:
+        """`absorb` by sigma points."""
+        s, P = state, state.P[self.row]
+        nu, S, D, HP, nis = self._innovate_points(P, at_points, H, R)
         if nis <= threshold:
+            error = unscented.correct(P, nu, D, HP)
+            if not self.closed:
+                remove_open(s.x[self.row], error)
+                return S, nis
             x, common = self._whole(s), len(s.imu)
-            unscented.remove(s.q_nb, s.v_n, s.lla, x, unscented.correct(P, nu, D, HP))
+            unscented.remove(s.q_nb, s.v_n, s.lla, x, error)
             s.imu[MOTION:], s.x[self.row, common:] = x[MOTION:common], x[common:]
             sensor_errors(s.errors, s.imu, reference.driven)
         return S, nis

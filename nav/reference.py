@@ -17,10 +17,18 @@ from nav.alignment import FORCE_LIMIT, RATE_LIMIT, Alignment, InitialState
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors, transition
 from nav.kalman import predict, update
-from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
+from nav.rotation import (
+    dcm_from_quat,
+    left_jacobian_solve,
+    quat_conjugate,
+    quat_from_rotvec,
+    quat_multiply,
+    quat_normalise,
+    rotvec_from_quat,
+)
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.strapdown import step
-from nav.unscented import Scaling, remove
+from nav.unscented import Scaling, carry, remove
 from nav.unscented import predict as predict_points
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
@@ -87,7 +95,12 @@ class Reference:
     Filter i is told ``1 / shares[i]`` times the noise and the initial covariance of the common states, so that a fusion
     of all may add up their information as if they were independent (Cui et al. 2022, Eq 7). Filters with fewer states
     than the largest have dead ones behind. ``field_n`` gives the reference magnetic field (3,) [T], NED, at (lat, lon,
-    h). A covariance step takes ``period`` samples, by sigma points with a ``scaling`` (of one closed filter only).
+    h). A covariance step takes ``period`` samples, by sigma points with a ``scaling`` (of one closed filter only), or
+    for those of several open filters that have one in ``scalings``.
+
+    What an open filter of the second kind would add to the nominal attitude may be of any size: x = -phi with
+    ``C_own = exp(-[x x]) C_nb``, and it is never added to or subtracted from but as a rotation. Its P is that of the
+    error of its own estimate, in axes that go with it (`own`, `turned`).
     """
 
     def __init__(
@@ -97,8 +110,11 @@ class Reference:
         period: int,
         field_n: FieldModel | None,
         scaling: Scaling | None = None,
+        scalings: Sequence[Scaling | None] = (),
     ) -> None:
         self.models, self.period, self.scaling = models, period, scaling
+        self.scalings = {row: given for row, given in enumerate(scalings) if given is not None}
+        self._pauses = scaling is not None or bool(self.scalings)
         self.common = models[0].mixing
         self.driven = models[0].driven
         self.size = max(model.size for model in models)
@@ -155,13 +171,13 @@ class Reference:
         period, first, last_bad = self.period * periods, 0, -math.inf
         while first < len(imu):
             # the kernel takes linear steps only: sigma points stop it before one is due
-            stop = len(imu) if self.scaling is None else first + max(1, period - int(s.elapsed[1]))
+            stop = first + max(1, period - int(s.elapsed[1])) if self._pauses else len(imu)
             part = slice(first, stop)
-            every = period if self.scaling is None else NEVER
+            every = NEVER if self._pauses else period
             bad = self._propagate(s, every, imu.dtheta[part], imu.dv[part], imu.dt[part])
             if bad >= 0:
                 last_bad = float(imu.t[first + bad])
-            if self.scaling is not None and s.elapsed[1] >= period:
+            if self._pauses and s.elapsed[1] >= period:
                 self.settle(s)
             first = stop
         return last_bad
@@ -175,7 +191,30 @@ class Reference:
                 self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
         elif s.elapsed[0] > 0:
+            before = s.copy() if self.scalings else None
             self._propagate(s, NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES, settle=True)
+            if before is not None:
+                Phi = self._scratch[0].copy()
+                for row, scaling in self.scalings.items():
+                    self._sigma_step(s, before, Phi, row, scaling)
+
+    def _sigma_step(self, s: State, before: State, Phi: Array, row: int, scaling: Scaling) -> None:
+        """Take an open filter over an interval by sigma points around its own estimate.
+
+        ``s`` is at the end of it in all but this filter, ``before`` has the filter at the beginning and the integrals;
+        ``Phi`` is the nominal transition.
+        """
+        x, T = before.x[row], float(before.elapsed[0])
+        x[:MOTION] = -carry(-x, Phi, before.sums[2].sum(axis=1), T)
+        q_nb, v_n, lla, imu = s.q_nb.copy(), s.v_n.copy(), s.lla.copy(), np.zeros(self.common)
+        inject(q_nb, v_n, lla, imu, x[: self.common])
+        error = _sigma_step(
+            q_nb, v_n, lla, imu, x, before.P[row], np.empty((4, 3)), dcm_from_quat(_turn(x)) @ before.sums,
+            np.array([T, 0.0]), self.driven, self._decay_rate[row], self._variance_rate[row], *self._scratch,
+            scaling.spread, scaling.excess,
+        )  # fmt: skip
+        remove_open(x, error)
+        s.x[row], s.P[row] = x, before.P[row]
 
     def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
         """See the kernel."""
@@ -189,7 +228,18 @@ class Reference:
         s = state
         inject(s.q_nb, s.v_n, s.lla, s.imu, correction)
         sensor_errors(s.errors, s.imu, self.driven)
+        left = {row: quat_multiply(_turn(s.x[row]), quat_conjugate(_turn(correction))) for row in self.scalings}
         s.x[:, : self.common] -= correction
+        for row, turn in left.items():
+            s.x[row, PHI : PHI + 3] = -rotvec_from_quat(turn)
+
+    def own(self, state: State, row: int) -> State:
+        """A copy whose nominal state is what an open filter estimates itself."""
+        own = state.copy()
+        inject(own.q_nb, own.v_n, own.lla, own.imu, own.x[row, : self.common])
+        own.x[row, : self.common] = 0.0
+        sensor_errors(own.errors, own.imu, self.driven)
+        return own
 
     def field_n(self, lla: Array) -> Array:
         """The reference field, looked up again only after the place has changed."""
@@ -201,6 +251,31 @@ class Reference:
             self._field_at = (lat, lon, h)
             self._field_value = np.array(self._field_model(lat, lon, h), dtype=float)
         return self._field_value
+
+
+def _turn(x: Array) -> Array:
+    """What ``x`` (of the common states at least) adds to the nominal attitude, as a quaternion: exp(-[x x])."""
+    return quat_conjugate(quat_from_rotvec(x[PHI : PHI + 3]))
+
+
+def remove_open(x: Array, error: Array) -> None:
+    """Take an ``error`` (n,), of an open filter's own estimate, out of what it would add to the nominal state."""
+    phi = rotvec_from_quat(quat_multiply(quat_from_rotvec(error[PHI : PHI + 3]), _turn(x)))
+    x -= error
+    x[PHI : PHI + 3] = -phi
+
+
+def turned(x: Array, P: Array, *, own: bool) -> Array:
+    """``P`` (n, n) of the error of x (n,) made that of the error of the estimate at x, in its ``own`` axes, or back.
+
+    ``exp(-[(x + dx) x]) = exp([phi x]) exp(-[x x])`` for ``dx = -J_l^-1(-x) phi``, so only the attitude's part turns.
+    """
+    J = np.eye(len(P))
+    J[:3, :3] = np.array([left_jacobian_solve(-x[PHI : PHI + 3], axis) for axis in np.eye(3)]).T
+    if own:
+        J[:3, :3] = np.linalg.inv(J[:3, :3])
+    P = J @ P @ J.T
+    return 0.5 * (P + P.T)
 
 
 def nothing_known(t: float, status: Status) -> Estimate:
@@ -355,8 +430,8 @@ def _sigma_step(
     q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
     work: Array, spread: float, excess: float,
-) -> None:  # fmt: skip
-    """`_covariance_step` of one closed filter by sigma points, whose mean error is taken out of the motion."""
+) -> Array:  # fmt: skip
+    """`_covariance_step` of one closed filter by sigma points, whose mean error (n,) is taken out of the motion."""
     T = elapsed[0]
     transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
     push_n = np.empty(3)
@@ -373,6 +448,7 @@ def _sigma_step(
     remove(q_nb, v_n, lla, imu, error[: len(imu)])
     sensor_errors(errors, imu, driven)
     _empty(sums, elapsed)
+    return error
 
 
 @njit

@@ -168,6 +168,16 @@ def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n:
 
 
 @njit
+def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
+    """What an error ``e`` (n,) of any size becomes over ``T`` seconds: the motion's part (9,), arguments as `predict`."""
+    linear, odd, even = np.empty(MOTION), np.empty(MOTION), np.empty(MOTION)
+    _carry(linear, odd, even, e, Phi, push_n, T, 1.0)
+    for i in range(MOTION):
+        linear[i] += odd[i] + even[i]
+    return linear
+
+
+@njit
 def predict(
     P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array, push_n: Array, T: float, spread: float,
     excess: float,
