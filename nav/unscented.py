@@ -169,7 +169,7 @@ def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n:
 
 @njit
 def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
-    """What an error ``e`` (n,) of any size becomes over ``T`` seconds: the motion's part (9,), arguments as `predict`."""
+    """What an error ``e`` (n,) of any size becomes over ``T`` seconds: the motion's part (9,); see `predict`."""
     linear, odd, even = np.empty(MOTION), np.empty(MOTION), np.empty(MOTION)
     _carry(linear, odd, even, e, Phi, push_n, T, 1.0)
     for i in range(MOTION):

@@ -16,7 +16,20 @@ import numpy as np
 
 from nav.ahrs import Ahrs, AhrsConfig
 from nav.alignment import InitialState
-from nav.detection import ChiSquare, Detector, Eraim, Glr, Never, Reset, Sprt, exponential
+from nav.detection import (
+    ChiSquare,
+    Detector,
+    Eraim,
+    Glr,
+    Mean,
+    Never,
+    Reset,
+    Sprt,
+    WindowMean,
+    eq20,
+    exponential,
+    plain,
+)
 from nav.earth import STANDARD_GRAVITY, radii, wrap_longitude
 from nav.error_model import ImuModel
 from nav.federated import Config, Federated, Local
@@ -298,7 +311,7 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
             aids,
             tuple(aid for aid in others.values() if aid is not None),
             mounting_sigma=errors.accel_misalignment,
-            scaling=Scaling() if config.engine == "unscented" else None,
+            scaling=_scaling(config.engine),
             false_rejection=config.false_rejection,
             **told,  # type: ignore[arg-type]
         ),
@@ -315,6 +328,11 @@ def _ins(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:
         _handover(config, ins, errors, seed),
         voter,
     )
+
+
+def _scaling(engine: str) -> Scaling | None:
+    """How far out the sigma points of an engine lie, None when it has none."""
+    return Scaling() if engine == "unscented" else None
 
 
 def _course(config: CourseConfig, slip: object) -> Course:
@@ -418,6 +436,7 @@ def _federated(config: EstimatorConfig, scenario: Scenario, seed: int) -> Runnin
                 Watched(aids[name], partial(_detector, local.detector), _policy(local.policy)) for name in local.aids
             ),
             local.share,
+            _scaling(local.engine),
         )
         for local in config.locals
     )
@@ -459,19 +478,35 @@ def _detector(config: DetectorConfig) -> Detector:
         case "eraim":
             return Eraim(config.false_alarm or SNAPSHOT_FALSE_ALARM)
         case "sprt":
-            mean = exponential(config.forgetting)
-            return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, mean, Reset(config.reset))
+            return Sprt(config.false_alarm or GATHERED_FALSE_ALARM, _mean(config), Reset(config.reset))
         case "glr":
             return Glr(config.false_alarm or GATHERED_FALSE_ALARM, config.window_s)
         case "none":
             return Never()
 
 
+def _mean(config: DetectorConfig) -> Mean:
+    """What a sequential test remembers."""
+    match config.mean:
+        case "plain":
+            return plain()
+        case "window":
+            return WindowMean(config.window_s)
+        case "exponential":
+            return exponential(config.forgetting)
+        case "eq20":
+            return eq20(config.forgetting)
+
+
 def _policy(config: PolicyConfig | None) -> Callable[[], Policy] | None:
     """What makes the measurement policy of a sensor, as the scenario says."""
     if config is None:
         return None
-    return partial(MahalanobisInflation, config.false_alarm, config.reject_above or math.inf)
+    if config.kind == "sage_husa":
+        return partial(SageHusa, config.b)
+    return partial(
+        MahalanobisInflation, config.false_alarm, config.reject_above or math.inf, config.solver == "reciprocal"
+    )
 
 
 def _ahrs(config: EstimatorConfig, scenario: Scenario, seed: int) -> Running:

@@ -162,29 +162,63 @@ class DetectorConfig(Section):
 
     kind: Literal["chi_square", "eraim", "sprt", "glr", "none"] = "chi_square"
     false_alarm: float | None = Field(default=None, gt=0, lt=0.5)
-    forgetting: float = Field(default=0.95, gt=0, lt=1, description="sprt: what a look leaves of the weight before it")
-    reset: Literal["none", "fast", "complete"] = "complete"
-    window_s: float = Field(default=40.0, gt=0, le=600, description="glr: how long ago the fault may have begun")
+    mean: Literal["plain", "window", "exponential", "eq20"] = Field(
+        default="exponential", description="sprt: of what it has gathered; eq20 as Zhou et al. 2025 print it"
+    )
+    forgetting: float = Field(
+        default=0.95, gt=0, lt=1, description="sprt, mean exponential or eq20: what a look leaves of the weight before"
+    )
+    reset: Literal["none", "fast", "complete"] = Field(default="complete", description="sprt: when a fault seems over")
+    window_s: float = Field(
+        default=40.0,
+        gt=0,
+        le=600,
+        description="glr: how long ago the fault may have begun; sprt, mean window: its span",
+    )
 
     @model_validator(mode="after")
     def _own_keys(self) -> Self:
-        for key, kind in (("forgetting", "sprt"), ("reset", "sprt"), ("window_s", "glr")):
-            if key in self.model_fields_set and kind != self.kind:
-                raise ValueError(f"{key} is a key of kind {kind!r}, not of {self.kind!r}: leave it out")
+        for key, kinds, means in (
+            ("mean", ("sprt",), ()),
+            ("forgetting", ("sprt",), ("exponential", "eq20")),
+            ("reset", ("sprt",), ()),
+            ("window_s", ("glr", "sprt"), ("window",)),
+        ):
+            if key in self.model_fields_set and self.kind not in kinds:
+                named = " or ".join(map(repr, kinds))
+                raise ValueError(f"{key} is a key of kind {named}, not of {self.kind!r}: leave it out")
+            if key in self.model_fields_set and self.kind == "sprt" and means and self.mean not in means:
+                named = " or ".join(map(repr, means))
+                raise ValueError(f"{key} is a key of mean {named}, not of {self.mean!r}: leave it out")
         if self.kind == "none" and self.false_alarm is not None:
             raise ValueError("false_alarm is no key of kind 'none', which condemns nothing: leave it out")
         return self
 
 
 class PolicyConfig(Section):
-    """What becomes of the variances of a sample that the detector has let pass (`nav.weighting`).
+    """What the variances of a sample are taken for (`nav.weighting`).
 
-    ``inflate`` makes a suspect sample's R so large that its distance is at the limit (`MahalanobisInflation`).
+    ``inflate`` makes the R of a suspect sample that the detector has let pass so large that its distance is at the
+    limit (`MahalanobisInflation`); ``sage_husa`` learns R from the residuals, and the detector judges by that.
     """
 
-    kind: Literal["inflate"]
-    false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="of the limit, probability per look")
-    reject_above: float | None = Field(default=None, gt=0, description="squared distance to leave out; none: never")
+    kind: Literal["inflate", "sage_husa"]
+    false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="inflate: of the limit, probability per look")
+    reject_above: float | None = Field(
+        default=None, gt=0, description="inflate: squared distance to leave out; none: never"
+    )
+    solver: Literal["reciprocal", "newton"] = Field(
+        default="reciprocal", description="inflate: Newton's method on the distance's reciprocal, or on itself"
+    )
+    b: float = Field(default=0.97, ge=0.5, lt=1, description="sage_husa: forgetting factor per look")
+
+    @model_validator(mode="after")
+    def _own_keys(self) -> Self:
+        for key in self.model_fields_set - {"kind"}:
+            kind = "sage_husa" if key == "b" else "inflate"
+            if kind != self.kind:
+                raise ValueError(f"{key} is a key of kind {kind!r}, not of {self.kind!r}: leave it out")
+        return self
 
 
 class LocalConfig(Section):
@@ -193,6 +227,7 @@ class LocalConfig(Section):
     name: str
     aids: Annotated[tuple[str, ...], Field(min_length=1)]
     share: float | None = Field(default=None, gt=0, le=1, description="of the information; all alike without")
+    engine: Literal["linear", "unscented"] = Field(default="linear", description="derivatives or sigma points")
     detector: DetectorConfig = DetectorConfig()
     policy: PolicyConfig | None = Field(default=None, description="what it does to R; none: R is as told")
 

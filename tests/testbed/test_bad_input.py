@@ -346,6 +346,29 @@ def test_same_name_for_two_estimators() -> None:
             'estimator[0].locals[0].detector={kind="glr", reset="fast"}',
             "estimator[0].locals[0].detector: reset is a key of kind 'sprt', not of 'glr': leave it out",
         ),
+        (
+            'estimator[0].locals[0].detector={kind="eraim", window_s=5.0}',
+            "estimator[0].locals[0].detector: window_s is a key of kind 'glr' or 'sprt', not of 'eraim': leave it out",
+        ),
+        (
+            'estimator[0].locals[0].detector={kind="sprt", window_s=5.0}',
+            "estimator[0].locals[0].detector: window_s is a key of mean 'window', not of 'exponential': leave it out",
+        ),
+        (
+            'estimator[0].locals[0].detector={kind="sprt", mean="plain", forgetting=0.9}',
+            "locals[0].detector: forgetting is a key of mean 'exponential' or 'eq20', not of 'plain': leave it out",
+        ),
+        ('estimator[0].locals[0].detector.mean="plane"', 'detector.mean: can\'t be "plane": did you mean plain?'),
+        (
+            'estimator[0].locals[0].policy={kind="inflate", b=0.98}',
+            "estimator[0].locals[0].policy: b is a key of kind 'sage_husa', not of 'inflate': leave it out",
+        ),
+        (
+            'estimator[0].locals[0].policy={kind="sage_husa", solver="newton"}',
+            "estimator[0].locals[0].policy: solver is a key of kind 'inflate', not of 'sage_husa': leave it out",
+        ),
+        ('estimator[0].locals[0].policy={kind="sage_husa", b=1.0}', "estimator[0].locals[0].policy.b: must be less"),
+        ('estimator[0].locals[0].engine="ukf"', 'locals[0].engine: can\'t be "ukf": choose from linear, unscented'),
         ('estimator[0].kind="ins"', "estimator[0].locals: is a key of kind 'federated', not of 'ins': leave it out"),
     ],
 )

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nav.detection import Eraim, Glr
+from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, eq20, exponential, plain
 from nav.earth import position_difference_n
 from nav.federated import Federated
 from nav.ins import Ins
 from nav.local_filter import AirspeedAid, GnssAid
+from nav.unscented import Scaling
+from nav.weighting import MahalanobisInflation, SageHusa
 from testbed import Scenario, estimators, metrics, papers, run
 from testbed.errors import UserError
 from testbed.kinematic import Kinematic
@@ -290,6 +292,52 @@ def test_a_federation_is_told_of_each_sensor() -> None:
     assert detector.window_s == 20.0
     assert isinstance(air.sensors[0].detector(), Eraim)
     assert air.sensors[0].detector() is not air.sensors[0].detector()
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ('mean="plain"', plain()),
+        ('mean="window", window_s=7.0', WindowMean(7.0)),
+        ('mean="exponential", forgetting=0.8', exponential(0.8)),
+        ('mean="eq20", forgetting=0.8, reset="fast"', eq20(0.8)),
+        ('reset="none"', exponential(0.95)),
+    ],
+)
+def test_every_sequential_test_can_be_asked_for(keys: str, expected: Mean) -> None:
+    """It remembers as the mean that is built by hand."""
+    override = f"estimator[0].locals[0].detector={{kind='sprt', {keys}}}"
+    running = estimators.build(Scenario.load("u_turn", [*FEDERATED, override]), 0)["fed"]
+    federated = running.horizon.estimator
+    assert isinstance(federated, Federated)
+    detector = federated.config.locals[0].sensors[0].detector()
+    assert isinstance(detector, Sprt)
+    assert detector.reset is Reset({"fast": "fast", "none": "none"}.get(keys.split('reset="')[-1][:-1], "complete"))
+    rng = np.random.default_rng(0)
+    for k in range(100):
+        nu = rng.normal(size=3)
+        detector.mean.add(np.stack([nu, nu]), 0.2 * k)
+        expected.add(np.stack([nu, nu]), 0.2 * k)
+    np.testing.assert_array_equal(detector.mean.value, expected.value)
+    assert detector.mean.variance == expected.variance
+
+
+def test_a_local_filter_has_its_own_engine_and_policy() -> None:
+    keys = [
+        "estimator[0].locals[0].engine='unscented'",
+        "estimator[0].locals[0].policy={kind='sage_husa', b=0.9}",
+        "estimator[0].locals[1].policy={kind='inflate', solver='newton', reject_above=50.0}",
+    ]
+    federated = estimators.build(Scenario.load("u_turn", [*FEDERATED, *keys]), 0)["fed"].horizon.estimator
+    assert isinstance(federated, Federated)
+    one, two, air = federated.config.locals
+    assert [local.scaling for local in (one, two, air)] == [Scaling(), None, None]
+    assert one.sensors[0].policy is not None
+    assert two.sensors[0].policy is not None
+    assert one.sensors[0].policy() == SageHusa(0.9)
+    assert two.sensors[0].policy() == MahalanobisInflation(0.01, 50.0, reciprocal=False)
+    assert [watch.noise is not None for watch in federated.locals[0].watches.values()] == [True, True]
+    assert air.sensors[0].policy is None
 
 
 def test_a_federation_without_receivers_aligns_with_the_first() -> None:
