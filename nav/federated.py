@@ -47,15 +47,15 @@ Weighting. ``normalised`` weakens a look before its detector condemns it: its va
 each filter counting by the most suspect of its latest looks. A filter without one in the last seconds has no say.
 
 A policy that learns R (`nav.weighting.SageHusa`) is asked before the detector, which judges by what was learned. What
-is condemned or isolated teaches nothing: a sensor so much noisier than it says that it is isolated before its R is known
-stays so, as a faulty one would. A detector that keeps the sound axes, or gathers evidence, leaves it the time.
+is condemned or isolated teaches nothing: a sensor so much noisier than it says that it is isolated before its R is
+known stays so, as a faulty one would. A detector that keeps the sound axes, or gathers evidence, leaves it the time.
 
 Engines. A filter with a `Local.scaling` works by sigma points around its own estimate, nominal state and x together,
 which may be tens of degrees from the nominal one: there x of the attitude is a rotation vector and is composed, not
 added. Its P is of its own estimate's error, and is turned into x's for the fusion and back after a reset
-(`nav.reference.turned`). Fused at once or seldom, one such filter is the closed one of `nav.ins`. A linear filter beside
-it may be wrong about a heading far off and sure of itself, and then the fusion is: give all the same engine that have to
-find it.
+(`nav.reference.turned`). Fused at once or seldom, one such filter is the closed one of `nav.ins`. A linear filter
+beside it may be wrong about a heading far off and sure of itself, and then the fusion is: all that shall find one need
+the engine.
 
 When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
 velocities are given up as in `nav.ins`, and the next fixes are believed.
