@@ -684,7 +684,8 @@ def _estimator_faults(
     for key, owners in OWN_KEYS.items():
         if key in config.model_fields_set and config.kind not in owners:
             named = " or ".join(map(repr, owners))
-            yield (*path, key), f"is a key of kind {named}, not of {config.kind!r}: leave it out"
+            todo = "give it to its locals" if (config.kind, key) == ("federated", "engine") else "leave it out"
+            yield (*path, key), f"is a key of kind {named}, not of {config.kind!r}: {todo}"
     imus = [name for name, kind in kinds.items() if kind == "imu"]
     if config.imu not in imus:
         yield (*path, "imu"), _unknown("IMU", config.imu, imus)

@@ -368,6 +368,7 @@ def test_same_name_for_two_estimators() -> None:
             "estimator[0].locals[0].policy: solver is a key of kind 'inflate', not of 'sage_husa': leave it out",
         ),
         ('estimator[0].locals[0].policy={kind="sage_husa", b=1.0}', "estimator[0].locals[0].policy.b: must be less"),
+        ('estimator[0].engine="unscented"', "engine: is a key of kind 'ins', not of 'federated': give it to"),
         ('estimator[0].locals[0].engine="ukf"', 'locals[0].engine: can\'t be "ukf": choose from linear, unscented'),
         ('estimator[0].kind="ins"', "estimator[0].locals: is a key of kind 'federated', not of 'ins': leave it out"),
     ],
