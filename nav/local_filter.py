@@ -183,7 +183,8 @@ class GnssAid:
             state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven,
             self.arm, seat.starts[1], sample.v_n,
         )  # fmt: skip
-        return Look(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]))
+        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else ""
+        return Look(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]), unknown)
 
     def _course(self, sample: GnssSample, seat: Seat) -> Look | None:
         assert self.course is not None

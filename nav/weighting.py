@@ -77,7 +77,8 @@ def inflation(nu: Array, HPH: Array, R: Array, limit: float, reciprocal: bool, l
 
     theta is convex and 1/theta concave, so both come from the left and theta stays over the limit until it is within
     `TOLERANCE` of it. The reciprocal takes one step when H P H' is proportional to R. ``literal`` is Eq 12 as printed,
-    the fraction upside down: it ends at the root by chance only.
+    the fraction upside down: it ends at the root by chance only. NaN when S is not positive definite, and when there is
+    no R to inflate.
     """
     m = len(nu)
     S = np.empty((m, m))
@@ -100,6 +101,8 @@ def inflation(nu: Array, HPH: Array, R: Array, limit: float, reciprocal: bool, l
         excess = theta - limit
         if excess <= (TOLERANCE * limit if lam > 1.0 else 0.0):
             return lam, iteration
+        if slope == 0.0:
+            return math.nan, iteration
         if literal:
             lam += slope / excess
         elif reciprocal:

@@ -133,6 +133,7 @@ def test_inflation_policy_limits_rejects_and_survives_garbage():
     assert np.isinf(MahalanobisInflation().adapt(np.array([np.nan, 0.0]), S, R, 0.0)).all()
     assert np.isinf(MahalanobisInflation().adapt(np.array([np.inf, 0.0]), S, R, 0.0)).all()
     assert np.isinf(MahalanobisInflation().adapt(nu, -S, R, 0.0)).all()
+    assert np.isinf(MahalanobisInflation().adapt(nu, HPH, np.zeros(2), 0.0)).all()  # nothing to inflate
 
 
 def test_inflated_step_falls_with_the_outlier():

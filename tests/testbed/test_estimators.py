@@ -156,6 +156,17 @@ def test_fixes_and_body_velocities_are_of_the_centre_of_gravity_wherever_the_imu
     assert (ahead < 1.1 * at_the_centre + [*least, *least, 0.0]).all(), ahead / at_the_centre
 
 
+@pytest.mark.parametrize(("arm", "first"), [("[10.0, 0.0, 0.0]", 0.0), ("[0.0, 0.0, 0.0]", 1.0)])
+def test_velocity_at_the_end_of_an_arm_waits_for_the_rates(arm: str, first: float) -> None:
+    estimator = "{name='ins', aids=['gnss'], handover={level_deg=0.1, heading_deg=1, velocity_mps=0.1, position_m=1}}"
+    receiver = f"{{kind='gnss', grade='rtk', rate_hz=1, latency_s=0, lever_arm_m={arm}}}"
+    more = [*RIVER, "duration_s=5", f"sensors.gnss={receiver}", f"estimator=[{estimator}]"]
+    own = "estimators/ins/innovations/gnss_velocity"
+    dataset = run(papers.scenario("zhu2020", more)).dataset
+    assert metrics.column(dataset, f"{own}/sample_time")[0] == 0.0
+    assert metrics.column(dataset, f"{own}/weight").tolist() == [first, 1.0, 1.0, 1.0, 1.0, 1.0]
+
+
 THREE_IMUS = [
     "duration_s=90",
     "sensors.spare={kind='imu', grade='mems-consumer'}",
