@@ -457,10 +457,9 @@ class Federated:
                     self._start_again(state, filter_, sample.sensor)
                 else:
                     self._recall(state, filter_)
-                if filter_.scaling is not None:
-                    again = filter_.look(self._reference, state, filter_.aids[sample.sensor], part, sample)
-                    assert again is not None
-                    look = again
+                again = filter_.look(self._reference, state, filter_.aids[sample.sensor], part, sample)
+                assert again is not None  # as there was one
+                look = again
                 nu, S, nis = filter_.innovate(state, look)
         suspect, out = any(w.suspect for w in watches), any(w.out for w in watches)
         weight, reason = 0.0, withheld

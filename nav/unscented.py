@@ -349,13 +349,12 @@ def innovate(
 def correct(P: Array, nu: Array, D: Array, HP: Array) -> Array:
     """Update ``P`` in place and return the mean error (n,) found, for `remove`; the arguments as from `innovate`.
 
-    An axis of infinite variance is left out. With W = D^-1 H P and y = D^-1 nu
+    With W = D^-1 H P and y = D^-1 nu
 
     mean = -W' y,  P <- P - TAKEN W' W
 
-    which leaves as much as rounding may have taken too much; then the
-    attitude's part is turned into the axes of the corrected estimate, phi <- J_l(mean phi) (phi - mean phi). ``HP`` is
-    used up.
+    which leaves as much as rounding may have taken too much; then the attitude's part is turned into the axes of the
+    corrected estimate, phi <- J_l(mean phi) (phi - mean phi). ``HP`` is used up.
     """
     m, n = HP.shape
     y, mean = nu.copy(), np.zeros(n)

@@ -366,6 +366,7 @@ def _any_flight_claim(label: str, what: str, when: str, ours: Array, least: Arra
 def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
     refused, isolated, looks = np.array([r["with_star"]["refused"] for r in healthy]).T
     expected = FALSE_ALARM * looks.sum()
+    by_glr = np.array([r["glr"]["refused"] for r in healthy if "glr" in r])
     return [
         Claim("looks while a sensor was isolated in 1200 s without fault", "", "none", isolated.tolist(), 0.0,
               worst=True),
@@ -373,8 +374,8 @@ def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
         Claim(f"looks refused in {len(healthy)} flights without fault", "", "none", [float(refused.sum())],
               float(poisson.ppf(0.95, expected)),
               impossible=f"table 1 allows 1e-5 of the {looks.sum()} looks: {expected:.2f} are expected"),
-        Claim("looks refused by GLR in 1200 s without fault", "", "–",
-              [r["glr"]["refused"][0] for r in healthy if "glr" in r], 0.0),
+        Claim(f"flights of {len(by_glr)} in which GLR refused a look without fault", "", "–",
+              [float(np.sum(by_glr[:, 0] > 0))], float(poisson.ppf(0.95, FALSE_ALARM * by_glr[:, 2].sum()))),
     ]  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from nav.federated import (
 )
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
+from nav.local_filter import BarometerAid, GnssAid, LocalFilter, MagnetometerAid, Watched
 from nav.samples import BarometerSample, FixType, ImuSamples, Status
 from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
@@ -638,6 +638,34 @@ def test_a_faulty_axis_leaves_the_others_in_use():
     assert np.mean([r.weight for r in during]) == pytest.approx(2 / 3, abs=0.02)
     assert federated.events[0].isolated == (False, False, True)
     assert max(abs(error(e, truth)[2]) for e in estimates if e.t > 50) < 1.5
+
+
+def test_what_is_fused_after_an_isolation_is_seen_from_the_new_start(monkeypatch):
+    """The sound axes of the look that isolated one: the aid's own errors began anew, and so must its innovation."""
+    _, increments, one, two, others = world(120)
+    bad = [dataclasses.replace(f, h=f.h + 640.0) if 60 <= f.t < 62 else f for f in one]
+    first, *rest = three(DETECTORS["eraim"])
+    correlated = GnssAid(position_error_sigma=(1.0, 1.0, 1.0))
+    locals_ = (Local("one", (dataclasses.replace(first.sensors[0], aid=correlated),)), *rest)
+    now, off = [], []
+    use, take = Federated._use_look, LocalFilter.take
+
+    def noted(self, state, filter_, sample, part, look, withheld):
+        now[:] = sample, part
+        return use(self, state, filter_, sample, part, look, withheld)
+
+    def checked(self, reference, state, look, nu, S, used, *more):
+        sample, part = now
+        fresh = self.look(reference, state, self.aids[sample.sensor], part, sample)
+        if not used.all():
+            off.append(np.abs(self.innovate(state, fresh)[0] - nu)[used].max())
+        return take(self, reference, state, look, nu, S, used, *more)
+
+    monkeypatch.setattr(Federated, "_use_look", noted)
+    monkeypatch.setattr(LocalFilter, "take", checked)
+    fly(Config(CONSUMER, locals_), bad + two + others, increments)
+    assert len(off) >= 10
+    assert max(off) < 1e-9
 
 
 def learner(made):

@@ -104,23 +104,6 @@ def left_jacobian(phi):
     return expm(block)[:3, 3:]
 
 
-def test_an_infinite_variance_leaves_its_axis_out():
-    rng = np.random.default_rng(3)
-    n, P = 15, positive(rng, 15)
-    H, bend, R, nu = rng.normal(size=(3, n)), positive(rng, 3), np.array([1.0, np.inf, 2.0]), rng.normal(size=3)
-    P_two, keep, HP = P.copy(), [0, 2], H @ P
-    S = HP @ H.T + bend
-    both = np.ix_(keep, keep)
-    found = unscented.correct(P, nu, unscented.factor(S + np.diag(R), 3), HP.copy())
-    again = unscented.correct(P_two, nu[keep], unscented.factor(S[both] + np.diag(R[keep]), 2), HP[keep])
-    np.testing.assert_array_equal(found, again)
-    np.testing.assert_array_equal(P, P_two)
-    before = P.copy()
-    never = np.full(3, np.inf)
-    assert not unscented.correct(P, nu, unscented.factor(S + np.diag(never), 3), HP).any()
-    np.testing.assert_allclose(P, before, rtol=1e-10, atol=1e-12)
-
-
 def test_curved_measurement_is_the_weighted_sum():
     """The weights of Julier and Uhlmann, summed as printed, for a three-axis field that turns with the attitude."""
     n, scaling = 15, Scaling(alpha=0.6)
