@@ -104,7 +104,7 @@ def made_up() -> list[Any]:
         zhou2025.FAST: Hard(0.0, 0.5, 0.94, 0.0, 0.0, -50.0),
         zhou2025.FAST_EQ20: Hard(0.0, 1.4, 0.93, 0.0, 0.0, -150.0),
         zhou2025.FADING_EQ20: Hard(0.0, 1.4, 0.93, 20.0, 1.0, 20.0),
-        zhou2025.COMPLETE_EQ20: Hard(0.0, 1.8, 0.9, 0.0, 0.0, 0.0),
+        zhou2025.COMPLETE_EQ20: Hard(0.0, 1.3, 0.9, 0.0, 0.0, 0.0),
     }
     sooner = {zhou2025.FAST_EQ20: 30.0, zhou2025.COMPLETE_EQ20: 14.0, zhou2025.COMPLETE_CHI2: 8.0, GLR: 9.9}
     chatters = {COMPLETE: 20.0, zhou2025.COMPLETE_CHI2: 18.0, zhou2025.CHI2: 34.0}
