@@ -27,6 +27,14 @@ def njit(function: Callable[P, R]) -> Callable[P, R]:
     return cast("Callable[P, R]", compiled)
 
 
+def embedded(function: Callable[P, R]) -> Callable[P, R]:
+    """As `njit`, and repeated in the machine code of every kernel that calls it: where handing over arrays would show.
+
+    For a function that is called from Python as well, or from several kernels.
+    """
+    return cast("Callable[P, R]", numba.njit(cache=True, forceinline=True)(function))
+
+
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """As `njit`, but compiled as part of the kernel that calls it: for a long function with one caller.
 

@@ -51,7 +51,13 @@ STRATOSPHERE_SCALE = GAS_CONSTANT * TROPOPAUSE_TEMPERATURE / STANDARD_GRAVITY  #
 @njit
 def radii(lat: Scalar) -> tuple[Scalar, Scalar]:
     """Radii of curvature (R_M, R_N) [m]: in the meridian and in the prime vertical (Groves 2.105, 2.106)."""
-    root2 = 1 - E2 * np.sin(lat) ** 2
+    return radii_of(np.sin(lat) ** 2)
+
+
+@njit
+def radii_of(sin2: Scalar) -> tuple[Scalar, Scalar]:
+    """`radii` where the square of the latitude's sine is ``sin2``."""
+    root2 = 1 - E2 * sin2
     R_N = A / np.sqrt(root2)
     return R_N * (1 - E2) / root2, R_N
 
@@ -63,7 +69,13 @@ def gravity(lat: Scalar, h: Scalar) -> Scalar:
     Somigliana on the ellipsoid, then the second-order free-air series (TR8350.2 equations 4-1, 4-3). The horizontal
     component that appears above the ellipsoid (8e-9 h sin 2 lat [m/s^2]) is left out.
     """
-    sin2 = np.sin(lat) ** 2
+    down: Scalar = gravity_of(np.sin(lat) ** 2, h)
+    return down
+
+
+@njit
+def gravity_of(sin2: Scalar, h: Scalar) -> Scalar:
+    """`gravity` where the square of the latitude's sine is ``sin2``."""
     on_ellipsoid = GRAVITY_EQUATOR * (1 + SOMIGLIANA_K * sin2) / np.sqrt(1 - E2 * sin2)
     ratio = h / A
     at_height: Scalar = on_ellipsoid * (1 - 2 * (1 + F + M - 2 * F * sin2) * ratio + 3 * ratio * ratio)

@@ -41,7 +41,8 @@ import numpy as np
 import numpy.typing as npt
 
 from nav._jit import inlined, njit
-from nav.earth import OMEGA_IE, gravity, radii
+from nav.earth import OMEGA_IE, gravity_of, radii_of
+from nav.matrix import multiply
 from nav.samples import Array
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -224,7 +225,8 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
             FT[i, j] = 0.0
     sin_lat, cos_lat = math.sin(lat), math.cos(lat)
     tan_lat = sin_lat / cos_lat
-    R_M, R_N = radii(lat)
+    sin2 = sin_lat * sin_lat
+    R_M, R_N = radii_of(sin2)
     rm, rn = 1 / (R_M + h), 1 / (R_N + h)
     vn, ve, vd = v_n[0] * T, v_n[1] * T, v_n[2] * T  # every term below is already times T
     ie_n, ie_d = OMEGA_IE * cos_lat * T, -OMEGA_IE * sin_lat * T
@@ -269,7 +271,7 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
     FT[VEL, POS + 2] = v_n[1] * en_d_down - v_n[2] * en_e_down
     FT[VEL + 1, POS + 2] = v_n[2] * en_n_down - v_n[0] * en_d_down
     FT[VEL + 2, POS + 2] = v_n[0] * en_e_down - v_n[1] * en_n_down
-    FT[VEL + 2, POS + 2] += 2 * gravity(lat, h) / (math.sqrt(R_M * R_N) + h) * T
+    FT[VEL + 2, POS + 2] += 2 * gravity_of(sin2, h) / (math.sqrt(R_M * R_N) + h) * T
 
     # dp
     FT[POS, VEL] = FT[POS + 1, VEL + 1] = FT[POS + 2, VEL + 2] = T
@@ -287,15 +289,11 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
             for j in range(3):
                 FT[row + i, start + j] = sign * sums[term, i, j]
 
+    multiply(Phi, FT, FT, 0, MOTION, FT[:0], FT)
     for i in range(MOTION):
         for j in range(mixing):
-            Phi[i, j] = FT[i, j]
+            Phi[i, j] = 0.5 * Phi[i, j] + FT[i, j]
         Phi[i, i] += 1.0
-        for k in range(MOTION):
-            half = 0.5 * FT[i, k]
-            if half != 0.0:
-                for j in range(mixing):
-                    Phi[i, j] += half * FT[k, j]
 
 
 @inlined

@@ -635,7 +635,7 @@ class LocalFilter:
     def innovate(self, state: State, look: Look) -> tuple[Array, Array, float]:
         """(nu, S, nis) of a look at the filter's own estimate."""
         if look.at_points is not None:
-            nu, S, _, _, nis = self._innovate_points(state.P[self.row], look.at_points, look.H, look.R)
+            nu, S, _, nis = self._innovate_points(state.P[self.row], look.at_points, look.H, look.R)
             return nu, S, nis
         return _innovate(state.P[self.row], state.x[self.row], len(state.imu), look.H, look.R, look.nu)
 
@@ -659,9 +659,7 @@ class LocalFilter:
             nu, H, R, threshold, self.closed,
         )  # fmt: skip
 
-    def _innovate_points(
-        self, P: Array, at_points: Array, H: Array, R: Array
-    ) -> tuple[Array, Array, Array, Array, float]:
+    def _innovate_points(self, P: Array, at_points: Array, H: Array, R: Array) -> tuple[Array, Array, Array, float]:
         """`unscented.innovate`: minus ``at_points`` is prediction - measurement, so that zero is measured."""
         assert self.scaling is not None
         root, z = unscented.factor(P, CURVED), np.zeros(len(R))
@@ -672,9 +670,9 @@ class LocalFilter:
     ) -> tuple[Array, float]:
         """`absorb` by sigma points."""
         s, P = state, state.P[self.row]
-        nu, S, D, HP, nis = self._innovate_points(P, at_points, H, R)
+        _, S, W, nis = self._innovate_points(P, at_points, H, R)
         if nis <= threshold:
-            error = unscented.correct(P, nu, D, HP)
+            error = unscented.correct(P, W, unscented.scratch(len(P)))
             if not self.closed:
                 remove_open(s.x[self.row], error)
                 return S, nis

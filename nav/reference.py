@@ -28,7 +28,7 @@ from nav.rotation import (
 )
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.strapdown import step
-from nav.unscented import Scaling, carry, remove
+from nav.unscented import Scaling, carry, remove, scratch
 from nav.unscented import predict as predict_points
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
@@ -133,7 +133,7 @@ class Reference:
             np.zeros((MOTION, self.common)),
             np.ones(n),
             np.zeros(n),
-            np.zeros((MOTION, n)),
+            scratch(n),
         )
         self.share_noise(shares)
         # The longest kernel is loaded here, or compiled, and not when samples wait for it.

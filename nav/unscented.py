@@ -42,14 +42,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nav import kalman
-from nav._jit import inlined, njit
-from nav.earth import radii, wrap_longitude
+from nav._jit import embedded, inlined, njit
+from nav.earth import radii_of, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
-from nav.rotation import rotation_coefficients
+from nav.matrix import LANES, multiply
+from nav.rotation import SMALL_ANGLE_SQUARED, rotation_coefficients
 from nav.samples import Array
 
 CURVED = 3  # error states in which the equations are not linear: the attitude's, which are the first
+USUAL, USUAL_ROWS = 15, 6  # states and rows of a measurement for which loops are compiled as well: half of the time
+FURTHER = 10  # numbers of a point before its further states: attitude, velocity, place
 HALF_TURN2 = math.pi**2
 GUARD = 1e-14  # of a variance, what rounding may have left of it at least
 TAKEN = 1 - GUARD  # of what a measurement takes from the covariance
@@ -68,7 +70,14 @@ class Scaling(NamedTuple):
 
     @property
     def excess(self) -> float:
-        """What the square of the mean's shift counts in the covariance."""
+        """What the square of the mean's shift counts in the covariance.
+
+        Raises ValueError when it is negative.
+        """
+        if self.alpha**2 > self.beta:
+            raise ValueError(
+                f"alpha {self.alpha} is more than the root of beta, {self.beta}: weights would be negative"
+            )
         return self.beta - self.alpha**2
 
 
@@ -81,27 +90,37 @@ class Points(NamedTuple):
     x: Array  # (N, n), the further states; the motion's entries are those of the estimate
 
 
-@njit
+@embedded
 def factor(P: Array, columns: int) -> Array:
     """The first ``columns`` columns of L as rows (columns, n): L is lower triangular, L L' = P.
 
     A pivot that rounding has made too small is raised to `GUARD` of P_ii.
     """
-    n = len(P)
-    root = np.zeros((columns, n))
-    for j in range(columns):
-        for i in range(j, n):
-            root[j, i] = P[j, i]
-        for k in range(j):
-            c = root[k, j]
-            for i in range(j, n):
-                root[j, i] -= c * root[k, i]
-        pivot = math.sqrt(max(root[j, j], GUARD * P[j, j], 0.0))
-        root[j, j] = pivot
-        c = 1 / pivot if pivot > 0.0 else 0.0
-        for i in range(j + 1, n):
-            root[j, i] *= c
+    root = np.empty((columns, len(P)))
+    if columns == CURVED and len(P) == USUAL:
+        _factor(P, root, CURVED, USUAL)
+    else:
+        _factor(P, root, columns, len(P))
     return root
+
+
+@inlined
+def _factor(P: Array, root: Array, columns: int, n: int) -> None:
+    """`factor` into ``root``, with sizes that may be known when it is compiled."""
+    for j in range(columns):
+        pivot = P[j, j]
+        for k in range(j):
+            pivot -= root[k, j] * root[k, j]
+        pivot = max(pivot, GUARD * P[j, j], 0.0)
+        per_pivot = math.sqrt(1 / pivot) if pivot > 0.0 else 0.0
+        for i in range(j):
+            root[j, i] = 0.0
+        root[j, j] = pivot * per_pivot
+        for i in range(j + 1, n):
+            total = P[j, i]
+            for k in range(j):
+                total -= root[k, j] * root[k, i]
+            root[j, i] = per_pivot * total
 
 
 @njit
@@ -110,139 +129,189 @@ def _cross(ux: float, uy: float, uz: float, vx: float, vy: float, vz: float) -> 
 
 
 @inlined
-def _carry(linear: Array, odd: Array, even: Array, e: Array, Phi: Array, push_n: Array, T: float, s: float) -> None:
-    """What a column ``e`` of L becomes over ``T`` seconds, all (9,) or longer: ``linear`` is ``Phi @ e``.
+def _bend(
+    x: float, y: float, z: float, dx: float, dy: float, dz: float, gx: float, gy: float, gz: float,
+    px: float, py: float, pz: float, fx: float, fy: float, fz: float,
+) -> tuple[float, float, float, float, float, float, float, float, float, float, float, float]:  # fmt: skip
+    """What an error adds to attitude and velocity beyond the linear step: parts odd and even in the error, 3 x 4.
 
-    ``odd`` and ``even`` are what the errors ``+-s e`` become beyond that, over s, in parts odd and even in e.
+    ``x`` is its attitude, any size; the linear step makes the turns ``d`` of its velocity and place, and ``g`` and the
+    velocity ``p`` of the errors of the sensors; ``f`` is the integral of the specific force. To be taken ``s`` times
+    the error, x and f alone have to be taken s times and 1 / s times.
     """
-    dx = dy = dz = gx = gy = gz = px = py = pz = 0.0
-    for j in range(VEL, MOTION):  # the turn of n that errors of velocity and place add
-        dx += Phi[PHI, j] * e[j]
-        dy += Phi[PHI + 1, j] * e[j]
-        dz += Phi[PHI + 2, j] * e[j]
-    for j in range(MOTION, Phi.shape[1]):  # the turn and the velocity that the sensors' errors add
-        gx += Phi[PHI, j] * e[j]
-        gy += Phi[PHI + 1, j] * e[j]
-        gz += Phi[PHI + 2, j] * e[j]
-        px += Phi[VEL, j] * e[j]
-        py += Phi[VEL + 1, j] * e[j]
-        pz += Phi[VEL + 2, j] * e[j]
-    linear[PHI], linear[PHI + 1], linear[PHI + 2] = dx + gx, dy + gy, dz + gz
-    linear[VEL], linear[VEL + 1], linear[VEL + 2] = px, py, pz
-    linear[POS], linear[POS + 1], linear[POS + 2] = 0.0, 0.0, 0.0
-    for third in range(3):
-        i, known = 3 * third, (PHI + 3, MOTION, Phi.shape[1])[third]
-        hx, hy, hz = linear[i], linear[i + 1], linear[i + 2]
-        for j in range(known):
-            hx += Phi[i, j] * e[j]
-            hy += Phi[i + 1, j] * e[j]
-            hz += Phi[i + 2, j] * e[j]
-        linear[i], linear[i + 1], linear[i + 2] = hx, hy, hz
-
-    x, y, z = s * e[PHI], s * e[PHI + 1], s * e[PHI + 2]
-    fx, fy, fz = push_n[0] / s, push_n[1] / s, push_n[2] / s
     angle2 = x * x + y * y + z * z
     a, b, _ = rotation_coefficients(angle2)
-    k = 1 / 12  # of the Jacobian's inverse, which has no meaning beyond half a turn
-    if angle2 > 1e-8:
+    # of the Jacobian's inverse, which has no meaning beyond half a turn
+    k = 1 / 12 + angle2 * (1 / 720 + angle2 * (1 / 30240 + angle2 * (1 / 1209600 + angle2 / 47900160)))
+    if angle2 > SMALL_ANGLE_SQUARED:
         k = (1 - 0.5 * a / b) / angle2 if angle2 < HALF_TURN2 else 1 / HALF_TURN2
-
-    ux, uy, uz = _cross(x, y, z, gx - dx, gy - dy, gz - dz)
-    even[PHI], even[PHI + 1], even[PHI + 2] = 0.5 * ux, 0.5 * uy, 0.5 * uz
     ux, uy, uz = _cross(x, y, z, gx + dx, gy + dy, gz + dz)
     ux, uy, uz = _cross(x, y, z, ux, uy, uz)
-    odd[PHI], odd[PHI + 1], odd[PHI + 2] = k * ux, k * uy, k * uz
+    ex, ey, ez = _cross(x, y, z, gx - dx, gy - dy, gz - dz)
 
-    # (I - E^-1 + [phi x]) push + (E^-1 - I) p, with E^-1 = I + a [phi x] + b [phi x]^2
-    ux, uy, uz = _cross(x, y, z, fx, fy, fz)
-    sx, sy, sz = _cross(x, y, z, ux, uy, uz)
+    # (I - E^-1 + [phi x]) f + (E^-1 - I) p, with E^-1 = I + a [phi x] + b [phi x]^2
+    vx, vy, vz = _cross(x, y, z, fx, fy, fz)
+    sx, sy, sz = _cross(x, y, z, vx, vy, vz)
     wx, wy, wz = _cross(x, y, z, px, py, pz)
     tx, ty, tz = _cross(x, y, z, wx, wy, wz)
-    even[VEL], even[VEL + 1], even[VEL + 2] = a * wx - b * sx, a * wy - b * sy, a * wz - b * sz
-    odd[VEL] = (1 - a) * ux + b * tx
-    odd[VEL + 1] = (1 - a) * uy + b * ty
-    odd[VEL + 2] = (1 - a) * uz + b * tz
-    for i in range(3):
-        even[POS + i] = 0.5 * T * even[VEL + i]
-        odd[POS + i] = 0.5 * T * odd[VEL + i]
+    return (
+        k * ux, k * uy, k * uz, (1 - a) * vx + b * tx, (1 - a) * vy + b * ty, (1 - a) * vz + b * tz,
+        0.5 * ex, 0.5 * ey, 0.5 * ez, a * wx - b * sx, a * wy - b * sy, a * wz - b * sz,
+    )  # fmt: skip
 
 
 @njit
 def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
     """What an error ``e`` (n,) of any size becomes over ``T`` seconds: the motion's part (9,); see `predict`."""
-    linear, odd, even = np.empty(MOTION), np.empty(MOTION), np.empty(MOTION)
-    _carry(linear, odd, even, e, Phi, push_n, T, 1.0)
+    moved, sensed, carried = np.zeros((3, MOTION))
     for i in range(MOTION):
-        linear[i] += odd[i] + even[i]
-    return linear
+        for j in range(VEL, MOTION):
+            moved[i] += Phi[i, j] * e[j]
+        for j in range(MOTION, Phi.shape[1]):
+            sensed[i] += Phi[i, j] * e[j]
+        for j in range(VEL):
+            carried[i] += Phi[i, j] * e[j]
+        carried[i] += moved[i] + sensed[i]
+    bent = _bend(
+        e[0], e[1], e[2], moved[PHI], moved[PHI + 1], moved[PHI + 2], sensed[PHI], sensed[PHI + 1], sensed[PHI + 2],
+        sensed[VEL], sensed[VEL + 1], sensed[VEL + 2], push_n[0], push_n[1], push_n[2],
+    )  # fmt: skip
+    for i in range(6):
+        carried[i] += bent[i] + bent[6 + i]
+    for i in range(3):
+        carried[POS + i] += 0.5 * T * (bent[VEL + i] + bent[6 + VEL + i])
+    return carried
 
 
-@njit
+def scratch(n: int) -> Array:
+    """Room for `predict` and `correct` with n states to work in; it may be used again and again."""
+    return np.empty((n + 29, n))
+
+
+@embedded
 def predict(
     P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array, push_n: Array, T: float, spread: float,
     excess: float,
 ) -> Array:  # fmt: skip
     """Take ``P`` (n, n) in place over ``T`` seconds and return the mean error (n,) that arises, estimate minus truth.
 
-    The first five arguments as in `kalman.predict`, with the Phi (9, columns) of `error_model.transition`; ``push_n``
-    (3,) is the integral of the specific force in n [m/s], the row sums of the integral of C_nb diag(f_b); ``spread``
-    and ``excess`` are of `Scaling`. The mean must be subtracted from the estimate.
+    The first four arguments as in `kalman.predict`, with the Phi (9, columns) of `error_model.transition`; ``work`` is
+    a `scratch`, part of which is the mean; ``push_n`` (3,) is the integral of the specific force in n [m/s], the row
+    sums of the integral of C_nb diag(f_b); ``spread`` and ``excess`` are of `Scaling`. The mean must be subtracted from
+    the estimate.
 
-    With l_j what the linear step makes of a column, o_j and b_j / s the parts of what it becomes beyond that,
+    With T the whole transition and L_1 the three columns of L that have an attitude,
 
-        a_j a_j' = (l_j + o_j) (l_j + o_j)' = l_j l_j' + m_j o_j' + o_j m_j',  m_j = l_j + o_j / 2
+        P <- T (P - L_1 L_1') T' + sum a_j a_j' + sum b_j b_j' / s^2 + (beta - alpha^2) c c'
 
-    and the linear step of the whole P has the l_j l_j' and all that is not of these columns.
+    of which P - L_1 L_1' has no rows of the attitude.
     """
-    n = len(P)
-    root, mean = factor(P, CURVED), np.zeros(n)
-    kalman.predict(P, Phi, decay, half_noise, work)
-    for k in range(CURVED):  # work has been used
-        middle, odd, even = work[k], work[CURVED + k], work[2 * CURVED + k]
-        _carry(middle, odd, even, root[k], Phi, push_n, T, spread)
+    if len(P) == USUAL and Phi.shape[1] == USUAL:
+        return _predict(P, Phi, decay, half_noise, work, push_n, T, spread, excess, USUAL, USUAL)
+    return _predict(P, Phi, decay, half_noise, work, push_n, T, spread, excess, len(P), Phi.shape[1])
+
+
+@inlined
+def _predict(
+    P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array, push_n: Array, T: float, spread: float,
+    excess: float, n: int, columns: int,
+) -> Array:  # fmt: skip
+    """`predict` with the sizes (n, columns) of Phi and P, so that they may be known when it is compiled."""
+    TT, root, own, moved = work[:n], work[n : n + 3], work[n + 3 : n + 6], work[n + 6 : n + 9]
+    sensed, curved, rest = work[n + 9 : n + 12], work[n + 12 : n + 19], work[n + 19 : n + 28]
+    none: Array = work[:0]
+    mean: Array = work[n + 28]
+    for i in range(n):
+        P[i, i] += half_noise[i]
+    _factor(P, root, CURVED, n)
+    for j in range(n):  # T'
         for i in range(MOTION):
-            middle[i] += 0.5 * odd[i]
-            mean[i] += even[i] / spread
+            TT[j, i] = Phi[i, j] if j < columns else 0.0
         for i in range(MOTION, n):
-            middle[i] = decay[i] * root[k, i]
-            odd[i] = even[i] = 0.0
-    for i in range(MOTION):
-        a, b, c, d, e, f = work[0, i], work[1, i], work[2, i], work[3, i], work[4, i], work[5, i]
-        g, h, p, shift = work[6, i], work[7, i], work[8, i], mean[i]
-        for j in range(n):  # in pairs of the same bits for (i, j) and (j, i)
-            first = (a * work[3, j] + d * work[0, j]) + (b * work[4, j] + e * work[1, j])
-            second = (c * work[5, j] + f * work[2, j]) + (g * work[6, j] + h * work[7, j])
-            P[i, j] += first + second + (p * work[8, j] + excess * (shift * mean[j]))
+            TT[j, i] = 0.0
+        if j >= MOTION:
+            TT[j, j] = decay[j]
+
+    multiply(own, root, TT, 0, VEL, none, TT)
+    multiply(moved, root, TT, VEL, MOTION, none, TT)
+    multiply(sensed, root, TT, MOTION, n, none, TT)
+    per_spread, half, weight = 1 / spread, 0.5 * T, math.sqrt(excess)
+    fx, fy, fz = per_spread * push_n[0], per_spread * push_n[1], per_spread * push_n[2]
+    for k in range(CURVED):  # rows a_j, then b_j / s, then that of c
+        odd, even = curved[k], curved[CURVED + k]
+        for i in range(MOTION):
+            further = moved[k, i] + sensed[k, i]
+            odd[i] = own[k, i] + further
+            own[k, i] = -further
+        for i in range(MOTION, n):
+            odd[i], even[i] = sensed[k, i], 0.0
+        ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz = _bend(
+            spread * root[k, 0], spread * root[k, 1], spread * root[k, 2], moved[k, 0], moved[k, 1], moved[k, 2],
+            sensed[k, 0], sensed[k, 1], sensed[k, 2], sensed[k, 3], sensed[k, 4], sensed[k, 5], fx, fy, fz,
+        )  # fmt: skip
+        odd[0] += ax
+        odd[1] += ay
+        odd[2] += az
+        odd[3] += bx
+        odd[4] += by
+        odd[5] += bz
+        odd[6] += half * bx
+        odd[7] += half * by
+        odd[8] += half * bz
+        even[0], even[1], even[2], even[3], even[4], even[5] = cx, cy, cz, dx, dy, dz
+        even[6], even[7], even[8] = half * dx, half * dy, half * dz
+    for i in range(n):
+        mean[i] = per_spread * (curved[3, i] + curved[4, i] + curved[5, i])
+        curved[6, i] = weight * mean[i]
+
+    multiply(rest, Phi, P, CURVED, columns, own, root)
+    multiply(P[:MOTION], rest, TT, CURVED, n, curved, curved)
+    for i in range(1, MOTION):
+        for j in range(i):
+            P[i, j] = P[j, i]
     for i in range(MOTION, n):
         for j in range(MOTION):
             P[i, j] = P[j, i]
+        if decay[i] != 1.0:
+            for j in range(MOTION, n):
+                P[i, j] *= decay[i]
+                P[j, i] = P[i, j] if j != i else P[i, j] * decay[i]
+    for i in range(n):
+        P[i, i] += half_noise[i]
     return mean
 
 
-@njit
-def _turned(q: Array, x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """The unit quaternion of exp([phi x]) times ``q`` (4,), phi = (x, y, z)."""
+@inlined
+def _half_turn(x: float, y: float, z: float) -> tuple[float, float]:
+    """The scalar part of the quaternion of exp([phi x]), phi = (x, y, z), and its vector part over phi."""
     quarter = 0.25 * (x * x + y * y + z * z)
     sinc, versine, _ = rotation_coefficients(quarter)
-    w, half = 1 - quarter * versine, 0.5 * sinc
-    x, y, z = half * x, half * y, half * z
+    return 1 - quarter * versine, 0.5 * sinc
+
+
+@inlined
+def _turn_into(out: Array, q: Array, w: float, x: float, y: float, z: float) -> None:
+    """The unit quaternion (w, x, y, z) times ``q`` (4,) into ``out``, which may be q, made a unit one again."""
     a, b = w * q[0] - x * q[1] - y * q[2] - z * q[3], w * q[1] + x * q[0] + y * q[3] - z * q[2]
     c, d = w * q[2] - x * q[3] + y * q[0] + z * q[1], w * q[3] + x * q[2] - y * q[1] + z * q[0]
-    unit = 1 / math.sqrt(a * a + b * b + c * c + d * d)
-    return unit * a, unit * b, unit * c, unit * d
+    unit = 1.5 - 0.5 * (a * a + b * b + c * c + d * d)  # a Newton step: rounding only is to be made good
+    out[0], out[1], out[2], out[3] = unit * a, unit * b, unit * c, unit * d
 
 
 @njit
 def _per_metre(lat: float, h: float) -> tuple[float, float]:
     """What a metre north is of latitude, and a metre east of longitude [rad/m]."""
-    R_M, R_N = radii(lat)
-    return 1 / (R_M + h), 1 / ((R_N + h) * math.cos(lat))
+    sin2 = math.sin(lat) ** 2
+    R_M, R_N = radii_of(sin2)
+    return 1 / (R_M + h), 1 / ((R_N + h) * math.sqrt(1 - sin2))
 
 
-@njit
+@embedded
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
     """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size."""
-    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = _turned(q_nb, error[PHI], error[PHI + 1], error[PHI + 2])
+    x_n, y_n, z_n = error[PHI], error[PHI + 1], error[PHI + 2]
+    w, half = _half_turn(x_n, y_n, z_n)
+    _turn_into(q_nb, q_nb, w, half * x_n, half * y_n, half * z_n)
     per_north, per_east = _per_metre(lla[0], lla[2])
     for i in range(3):
         v_n[i] -= error[VEL + i]
@@ -253,151 +322,188 @@ def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
         x[i] -= error[i]
 
 
-@njit
-def _points(
-    q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float
-) -> tuple[Array, Array, Array, Array]:
-    """`remove` of 0, of + and of - ``spread`` times each row of ``root``."""
-    columns, n = root.shape
-    size = 2 * columns + 1
-    q, v, place, further = np.empty((size, 4)), np.empty((size, 3)), np.empty((size, 3)), np.empty((size, n))
+@embedded
+def _points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> Array:
+    """`remove` of 0, of + and of - ``spread`` times each row of ``root``: rows (10 + n,) of q_nb, v_n, lla, x."""
+    if len(root) == CURVED and len(x) == USUAL:
+        return _spread_out(q_nb, v_n, lla, x, root, spread, CURVED, USUAL)
+    return _spread_out(q_nb, v_n, lla, x, root, spread, len(root), len(x))
+
+
+@inlined
+def _spread_out(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float, columns: int, n: int
+) -> Array:  # fmt: skip
+    """`_points`, with sizes that may be known when it is compiled."""
+    found = np.empty((2 * columns + 1, FURTHER + n))
     per_north, per_east = _per_metre(lla[0], lla[2])
-    for k in range(size):
-        row, s = (0, 0.0) if k == 0 else (k - 1, spread) if k <= columns else (k - 1 - columns, -spread)
-        q[k, 0], q[k, 1], q[k, 2], q[k, 3] = _turned(
-            q_nb, s * root[row, PHI], s * root[row, PHI + 1], s * root[row, PHI + 2]
-        )
+    for i in range(4):
+        found[0, i] = q_nb[i]
+    for i in range(3):
+        found[0, 4 + i], found[0, 7 + i] = v_n[i], lla[i]
+    for i in range(n):
+        found[0, FURTHER + i] = x[i]
+    for k in range(columns):
+        ahead, behind, column = found[1 + k], found[1 + columns + k], root[k]
+        x_n, y_n, z_n = spread * column[PHI], spread * column[PHI + 1], spread * column[PHI + 2]
+        w, half = _half_turn(x_n, y_n, z_n)
+        _turn_into(ahead, q_nb, w, half * x_n, half * y_n, half * z_n)
+        _turn_into(behind, q_nb, w, -half * x_n, -half * y_n, -half * z_n)
         for i in range(3):
-            v[k, i] = v_n[i] - s * root[row, VEL + i]
-        place[k, 0] = lla[0] - s * root[row, POS] * per_north
-        place[k, 1] = wrap_longitude(lla[1] - s * root[row, POS + 1] * per_east)
-        place[k, 2] = lla[2] + s * root[row, POS + 2]
-        for i in range(n):
-            further[k, i] = x[i] - s * root[row, i] if i >= MOTION else x[i]
-    return q, v, place, further
+            d = spread * column[VEL + i]
+            ahead[4 + i], behind[4 + i] = v_n[i] - d, v_n[i] + d
+        d = spread * column[POS] * per_north
+        ahead[7], behind[7] = lla[0] - d, lla[0] + d
+        d = spread * column[POS + 1] * per_east
+        ahead[8], behind[8] = wrap_longitude(lla[1] - d), wrap_longitude(lla[1] + d)
+        d = spread * column[POS + 2]
+        ahead[9], behind[9] = lla[2] + d, lla[2] - d
+        for i in range(MOTION):
+            ahead[FURTHER + i] = behind[FURTHER + i] = x[i]
+        for i in range(MOTION, n):
+            d = spread * column[i]
+            ahead[FURTHER + i], behind[FURTHER + i] = x[i] - d, x[i] + d
+    return found
 
 
 def points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> Points:
     """The candidates for the truth around an estimate along the columns of L in ``root`` (columns, n): see `factor`."""
-    return Points(*_points(q_nb, v_n, lla, x, root, spread))
+    found = _points(q_nb, v_n, lla, x, root, spread)
+    return Points(found[:, :4], found[:, 4:7], found[:, 7:FURTHER], found[:, FURTHER:])
 
 
-@njit
+@embedded
 def innovate(
     P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
-) -> tuple[Array, Array, Array, Array, float]:
-    """(nu, S, D, H P, nis) of a measurement ``z`` (m,) with variances ``R`` from ``Z`` (2 k + 1, m) at the points.
+) -> tuple[Array, Array, Array, float]:
+    """(nu, S, W, nis) of a measurement ``z`` (m,) with variances ``R`` from ``Z`` (2 k + 1, m) at the points.
 
     The points lie along the first k columns of L (``root`` (k, n) by `factor`, ``P`` (n, n) = L L'); along the others
     the measurement is linear, with ``H`` (m, n) as in `kalman.innovate`, whose first k columns are not used: in its
-    ``H P`` there are those that have the slopes which the points found, H L_j = -a_j.
+    H P there are those that have the slopes which the points found, H L_j = -a_j.
 
-    nu = z - mean; S = H P H' + diag(R) and what the curvature adds to R; S = D D', D by `factor`; nis = nu' S^-1 nu,
-    NaN when rounding has left S not positive definite.
+    nu = z - mean; S = H P H' + diag(R) and what the curvature adds to R; S = D D', D lower triangular; W = D^-1 (H P,
+    -nu) (m, n + 1 or wider) for `correct`; nis = nu' S^-1 nu, NaN when rounding has left S not positive definite.
     """
-    curved, n, m = len(root), len(P), len(z)
-    nu, S, HP = np.empty(m), np.empty((m, m)), np.zeros((m, n))
-    slope, bend, part = np.empty((3, m, curved))
+    if len(P) == USUAL and len(z) == USUAL_ROWS and len(root) == CURVED:
+        return _innovate(P, Z, z, R, root, H, spread, excess, USUAL, USUAL_ROWS, CURVED)
+    return _innovate(P, Z, z, R, root, H, spread, excess, len(P), len(z), len(root))
+
+
+@inlined
+def _innovate(
+    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float, n: int, m: int,
+    curved: int,
+) -> tuple[Array, Array, Array, float]:  # fmt: skip
+    """`innovate`, with sizes that may be known when it is compiled."""
+    wide, last = max(m, LANES), 2 * curved
+    both = np.empty((m + 1, wide))
+    S, nu = both[:m], both[m]
+    work = np.empty((4 * m + n + 2 * last + 2, max(n + 1, wide)))
+    W, HP, L, inverse = work[:m], work[m : 2 * m], work[2 * m : 3 * m], work[3 * m : 4 * m]
+    rows, none = work[4 * m :, :wide], work[:0]
+    HT, left, right = rows[:n], rows[n : n + last + 1], rows[n + last + 1 :]
     per_spread = 1 / spread
     half = 0.5 * per_spread
     for i in range(m):
-        shift = 0.0
+        base, shift = Z[0, i], 0.0
         for j in range(curved):
-            ahead, behind = Z[1 + j, i] - Z[0, i], Z[1 + curved + j, i] - Z[0, i]
-            slope[i, j] = part[i, j] = half * (ahead - behind)
-            bend[i, j] = half * (ahead + behind)
-            shift += per_spread * bend[i, j]
-        nu[i] = shift
-        # of the rows of P, what lies along the first columns is replaced: ``part`` is the slope less the linear share
+            ahead, behind = Z[1 + j, i] - base, Z[1 + curved + j, i] - base
+            bend = half * (ahead + behind)
+            left[j, i] = half * (behind - ahead)
+            left[curved + j, i] = right[curved + j, i] = bend
+            shift += bend
+        shift *= per_spread
+        left[last, i], right[last, i] = excess * shift, shift
+        nu[i] = z[i] - base - shift
         for j in range(curved, n):
-            h = H[i, j]
-            if h != 0.0:
-                for k in range(n):
-                    HP[i, k] += h * P[j, k]
-                for k in range(curved):
-                    part[i, k] += h * root[k, j]
-        for k in range(curved):
-            a = part[i, k]
-            for j in range(n):
-                HP[i, j] -= a * root[k, j]
-    for k in range(m):
-        for i in range(k, m):
-            S[i, k] = excess * nu[i] * nu[k]
-            for j in range(curved):
-                S[i, k] += bend[i, j] * bend[k, j] + slope[i, j] * part[k, j]
-        S[k, k] += R[k]
-        for j in range(curved, n):
-            h = H[k, j]
-            if h != 0.0:
-                for i in range(k, m):
-                    S[i, k] += h * HP[i, j]
-        for i in range(k + 1, m):
-            S[k, i] = S[i, k]
-    D, nis = factor(S, m), 0.0
+            HT[j, i] = H[i, j]
+    # of the rows of P, what lies along the first columns is replaced: by the slope less the linear share
+    share = right[:curved]
+    multiply(share, root, HT, curved, n, none, HT)
+    for k in range(curved):
+        for i in range(m):
+            share[k, i] = left[k, i] - share[k, i]
+    multiply(HP, H, P, curved, n, share, root)
+    multiply(S, HP, HT, curved, n, left, right)
     for i in range(m):
-        nu[i] = z[i] - Z[0, i] - nu[i]
-    y = nu.copy()
+        HP[i, n] = -nu[i]
+        S[i, i] += R[i]
+
+    # S = L diag(d) L', in which no root stands in the way of the next pivot; L d is kept above L
     for i in range(m):
-        y[i] *= 1 / D[i, i] if D[i, i] > math.sqrt(GUARD * S[i, i]) else math.nan
-        nis += y[i] * y[i]
-        for k in range(i + 1, m):
-            y[k] -= D[i, k] * y[i]
-    return nu, S, D, HP, nis
+        pivot = S[i, i]
+        for k in range(i):
+            c = S[i, k]
+            S[k, i] = c
+            for j in range(k):
+                c -= L[j, i] * L[k, j]
+            L[k, i] = c
+            L[i, k] = c * L[k, k]
+            pivot -= c * L[i, k]
+        L[i, i] = 1 / pivot if pivot > GUARD * S[i, i] else math.nan
+        for k in range(m):
+            inverse[i, k] = 1.0 if k == i else 0.0
+        for k in range(i):
+            for j in range(k + 1):
+                inverse[i, j] -= L[i, k] * inverse[k, j]
+    for i in range(m):
+        c = math.sqrt(L[i, i])
+        for k in range(i + 1):
+            inverse[i, k] *= c
+    multiply(W, inverse, HP, 0, m, none, HP[:, : n + 1])
+    nis = 0.0
+    for i in range(m):
+        nis += W[i, n] * W[i, n]
+    return nu[:m], S[:, :m], W, nis
 
 
-@njit
-def correct(P: Array, nu: Array, D: Array, HP: Array) -> Array:
-    """Update ``P`` in place and return the mean error (n,) found, for `remove`; the arguments as from `innovate`.
+@embedded
+def correct(P: Array, W: Array, work: Array) -> Array:
+    """Update ``P`` in place and return the mean error (n,) found, for `remove`; ``W`` = D^-1 (H P, -nu) by `innovate`.
 
-    With W = D^-1 H P and y = D^-1 nu
+    mean = W_P' w,  P <- P - TAKEN W_P' W_P,  with W = (W_P, w)
 
-    mean = -W' y,  P <- P - TAKEN W' W
+    ``work`` is a `scratch`, part of which is the mean.
 
     which leaves as much as rounding may have taken too much; then the attitude's part is turned into the axes of the
-    corrected estimate, phi <- J_l(mean phi) (phi - mean phi). ``HP`` is used up.
+    corrected estimate, phi <- J_l(mean phi) (phi - mean phi).
     """
-    m, n = HP.shape
-    y, mean = nu.copy(), np.zeros(n)
-    W = np.zeros((6 * ((m + 5) // 6), n))
-    for i in range(m):
-        c = 1 / D[i, i]
-        y[i] *= c
-        for j in range(n):
-            W[i, j] = c * HP[i, j]
-            mean[j] -= y[i] * W[i, j]
-        for k in range(i + 1, m):
-            c = D[i, k]
-            y[k] -= c * y[i]
-            for j in range(n):
-                HP[k, j] -= c * W[i, j]
-    for sixth in range(len(W) // 6):
-        k = 6 * sixth
-        for i in range(n):
-            a, b, c, d, e, f = W[k, i], W[k + 1, i], W[k + 2, i], W[k + 3, i], W[k + 4, i], W[k + 5, i]
-            for j in range(n):
-                first = a * W[k, j] + b * W[k + 1, j] + c * W[k + 2, j]
-                P[i, j] -= TAKEN * (first + d * W[k + 3, j] + e * W[k + 4, j] + f * W[k + 5, j])
-    _turn(P, mean)
+    if len(P) == USUAL and len(W) == USUAL_ROWS:
+        return _correct(P, W, work, USUAL, USUAL_ROWS)
+    return _correct(P, W, work, len(P), len(W))
+
+
+@inlined
+def _correct(P: Array, W: Array, work: Array, n: int, m: int) -> Array:
+    """`correct`, with sizes that may be known when it is compiled."""
+    taken = work[: n + 1]
+    multiply(taken, W, W, 0, 0, W[:m], W[:m, :n])
+    left, less = P.ravel(), taken.ravel()
+    mean: Array = taken[n]
+    for i in range(n * n):
+        left[i] -= TAKEN * less[i]
+    _turn(P, mean, n)
     return mean
 
 
 @inlined
-def _turn(P: Array, error: Array) -> None:
+def _turn(P: Array, error: Array, n: int) -> None:
     """J P J' for the attitude's part of ``P``, with J = J_l(phi) = I + b [phi x] + c [phi x]^2 and phi of ``error``."""
     x, y, z = error[PHI], error[PHI + 1], error[PHI + 2]
     _, b, c = rotation_coefficients(x * x + y * y + z * z)
     xx, xy, xz = 1 - c * (y * y + z * z), c * x * y - b * z, c * x * z + b * y
     yx, yy, yz = c * x * y + b * z, 1 - c * (x * x + z * z), c * y * z - b * x
     zx, zy, zz = c * x * z - b * y, c * y * z + b * x, 1 - c * (x * x + y * y)
-    for j in range(len(P)):
+    for j in range(n):
         u, v, w = P[0, j], P[1, j], P[2, j]
         P[0, j], P[1, j], P[2, j] = xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w
     for i in range(3):
         u, v, w = P[i, 0], P[i, 1], P[i, 2]
         P[i, 0], P[i, 1], P[i, 2] = xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w
-    for i in range(1, len(P)):
-        for j in range(min(i, 3)):
-            P[i, j] = P[j, i]
+    P[1, 0], P[2, 0], P[2, 1] = P[0, 1], P[0, 2], P[1, 2]
+    for j in range(3, n):
+        P[j, 0], P[j, 1], P[j, 2] = P[0, j], P[1, j], P[2, j]
 
 
 def update(
@@ -415,7 +521,7 @@ def update(
     root = factor(P, len(P) if H is None else CURVED)
     Z = h(points(q_nb, v_n, lla, x, root, scaling.spread))
     slope = np.zeros((len(z), len(P))) if H is None else H
-    nu, S, D, HP, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
+    nu, S, W, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
     if nis <= threshold:
-        remove(q_nb, v_n, lla, x, correct(P, nu, D, HP))
+        remove(q_nb, v_n, lla, x, correct(P, W, scratch(len(P))))
     return nu, S, nis

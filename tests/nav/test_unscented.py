@@ -80,20 +80,50 @@ def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     H, R, z = rng.normal(size=(m, n)), rng.uniform(0.1, 1, m), rng.normal(size=m)
     root = unscented.factor(P, k)
     Z = -ONE.spread * alpha * np.vstack([np.zeros(n), root, -root]) @ H.T  # truth = estimate - error
-    nu, S, D, H_zP, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
+    nu, S, W, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
     S_linear, S_inverse, HP, nis_linear = kalman.innovate(P, H, R, z)
     np.testing.assert_allclose(nu, z, atol=1e-10)
     np.testing.assert_allclose(S, S_linear, rtol=1e-10)
     np.testing.assert_allclose(nis, nis_linear, rtol=1e-9)
     P_linear = P.copy()
     correction = kalman.correct(P_linear, H, R, HP, S_inverse, z)
-    found = unscented.correct(P, nu, D, H_zP)
+    found = unscented.correct(P, W, unscented.scratch(n))
     np.testing.assert_allclose(found, -correction, atol=1e-10)
     # the attitude's covariance is turned into the corrected axes: undo that with scipy's left Jacobian
     G = np.eye(n)
     G[:3, :3] = left_jacobian(found[:3])
     np.testing.assert_allclose(P, G @ P_linear @ G.T, atol=1e-10)
     assert (P == P.T).all()
+
+
+def test_a_dead_state_changes_nothing():
+    """15 states and six rows have loops of their own size: with a sixteenth, always zero, it is the other ones."""
+    rng = np.random.default_rng(11)
+    scale = np.array([0.3] * 3 + [1.0] * 3 + [10.0] * 3 + [1e-3] * 3 + [0.05] * 3)
+    P = positive(rng, 15, scale) / 15
+    Phi = np.eye(9, 15) + 0.1 * rng.normal(size=(9, 15)) * np.outer(scale[:9], 1 / scale)
+    Z, z, R, H = rng.normal(size=(7, 6)), rng.normal(size=6), rng.uniform(0.1, 1, 6), rng.normal(size=(6, 15)) / scale
+    decay, half, push_n = rng.uniform(0.9, 1.0, 15), (1e-3 * scale) ** 2, np.array([1.0, 2.0, -9.0])
+
+    def period(dead):
+        n, work = 15 + dead, unscented.scratch(15 + dead)
+        P_here, H_here = np.zeros((n, n)), np.zeros((6, n))
+        P_here[:15, :15], H_here[:, :15] = P, H
+        given = np.pad(decay, (0, dead), constant_values=1.0), np.pad(half, (0, dead))
+        mean = unscented.predict(P_here, Phi, *given, work, push_n, 0.7, ONE.spread, ONE.excess)[:15].copy()
+        predicted, root = P_here.copy(), unscented.factor(P_here, 3)
+        nu, S, W, nis = unscented.innovate(P_here, Z, z, R, root, H_here, ONE.spread, ONE.excess)
+        found = unscented.correct(P_here, W, work)
+        return mean, predicted[:15, :15], nu, S, W[:, :15], nis, found[:15], P_here[:15, :15]
+
+    for own, other in zip(period(0), period(1), strict=True):
+        np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-14)
+
+
+def test_scaling_with_negative_weights_is_refused():
+    assert Scaling(alpha=0.5).excess == 1.75
+    with pytest.raises(ValueError, match="weights would be negative"):
+        _ = Scaling(alpha=2.0).excess
 
 
 def left_jacobian(phi):
@@ -120,7 +150,8 @@ def test_curved_measurement_is_the_weighted_sum():
     z, R = np.array([0.3, 0.4, 0.5]), np.array([0.01, 0.02, 0.03])
     root = unscented.factor(P, n)
     Z = h(unscented.points(q, v, lla, x, root, scaling.spread))
-    nu, S, _, HP, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    nu, S, W, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    HP = np.linalg.cholesky(S) @ W[:, :n]
 
     c = scaling.spread**2
     W = np.full(2 * n + 1, 0.5 / c)
@@ -202,7 +233,9 @@ def test_small_errors_take_the_linear_step():
     P = positive(rng, n, scale)
     P_linear = P.copy()
     kalman.predict(P_linear, Phi, decay, half, np.empty((9, n)))
-    mean = unscented.predict(P, Phi, decay, half, np.empty((9, n)), sums[2].sum(axis=1), 1.0, ONE.spread, ONE.excess)
+    mean = unscented.predict(
+        P, Phi, decay, half, unscented.scratch(n), sums[2].sum(axis=1), 1.0, ONE.spread, ONE.excess
+    )
     sigma = np.sqrt(np.diag(P_linear))
     np.testing.assert_allclose((P - P_linear) / np.outer(sigma, sigma), 0.0, atol=1e-10)
     np.testing.assert_allclose(mean / sigma, 0.0, atol=1e-5)
@@ -249,7 +282,7 @@ def test_time_update_is_a_strapdown_of_every_point(level):
     linear = P.copy()
     none, still = np.zeros(n), np.ones(n)
     kalman.predict(linear, Phi, still, none, np.empty((9, n)))
-    shift = unscented.predict(P, Phi, still, none, np.empty((9, n)), push_n, 1.0, scaling.spread, scaling.excess)
+    shift = unscented.predict(P, Phi, still, none, unscented.scratch(n), push_n, 1.0, scaling.spread, scaling.excess)
     sigma = np.sqrt(np.diag(expected))
     beyond = np.abs((expected - linear) / np.outer(sigma, sigma)).max()
     missed = np.abs((P - expected) / np.outer(sigma, sigma)).max()
@@ -273,7 +306,7 @@ class Filter:
         sums = advance(self.state, errors, dtheta, dv)
         T = len(dtheta) * DT
         Phi = transition(model, self.state, sums, T)
-        step = (self.P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, np.empty((9, n)))
+        step = (self.P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, unscented.scratch(n))
         if self.engine == "linear":
             kalman.predict(*step)
         else:
@@ -356,7 +389,7 @@ def hostile(updates):
     scale = np.array([1.0] * 3 + [10.0] * 3 + [1e3] * 3 + [1e-6] * 3 + [1e-4] * 3)
     P = positive(rng, n, scale) / n
     Phi = np.eye(9, n) + 1e-3 * rng.normal(size=(9, n)) * np.outer(scale[:9], 1 / scale)
-    half, decay, work = (1e-7 * scale) ** 2, np.ones(n), np.empty((9, n))
+    half, decay, work = (1e-7 * scale) ** 2, np.ones(n), unscented.scratch(n)
     R = np.full(3, 1e-6)
     slopes = rng.normal(size=(100, 3, n)) / scale
     numbers = rng.normal(size=(100, 7, 3))
@@ -366,8 +399,8 @@ def hostile(updates):
         mean = unscented.predict(P, Phi, decay, half, work, pushes[i], 1.0, ONE.spread, ONE.excess)
         root = unscented.factor(P, 3)
         Z = numbers[i] if i % 10 == 0 else numbers[i] * 1e-6
-        nu, _, D, HP, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
-        found = unscented.correct(P, nu, D, HP)
+        _, _, W, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
+        found = unscented.correct(P, W, work)
         if i == 0:
             assert np.isfinite(nis)
             assert np.isfinite(mean).all()
@@ -393,7 +426,7 @@ def _cycles(
 ):  # fmt: skip
     """`count` filter periods from the same start: transition, `predict`, and GNSS position and velocity."""
     n = len(P0)
-    P, Phi, FT, work = P0.copy(), np.zeros((9, n)), np.zeros((9, n)), np.empty((9, n))
+    P, Phi, FT, work = P0.copy(), np.zeros((9, n)), np.zeros((9, n)), np.empty((n + 29, n))
     push = sums[2].sum(axis=1)
     for _ in range(count):
         P[:] = P0
@@ -403,8 +436,8 @@ def _cycles(
         if sigma_update:
             root = unscented.factor(P, 3)
             unscented._points(q, v, lla, x, root, spread)
-            nu, _, D, HP, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
-            unscented.correct(P, nu, D, HP)
+            _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+            unscented.correct(P, W, work)
         else:
             _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
             kalman.correct(P, H, R, HP, S_inverse, z)

@@ -1,0 +1,88 @@
+"""Products of small matrices for kernels, eight columns at a time in the processor's vector registers.
+
+The compiler makes vectors of loops over long arrays, but none of those over the fifteen columns of a covariance, so
+that the innermost loop is written here in its own language. Each element is summed one term after the other, as
+written: the result does not depend on how wide the registers are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nav._jit import inlined
+from nav.samples import Array
+
+# isort: split
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+LANES = 8  # columns of a product that are summed at a time, so that it must have as many
+_REAL, _LANE = ir.DoubleType(), ir.IntType(32)
+_VECTOR = ir.VectorType(_REAL, LANES)
+
+
+@inlined
+def multiply(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array) -> None:
+    """Fill the first columns of ``out`` (r, n or wider) with A[:, first:stop] B[first:stop] + C' D.
+
+    ``A`` (r, stop or wider), ``B`` (stop or longer, n), ``C`` (k, r or wider), ``D`` (k, n), n at least `LANES`; either
+    product may be empty, and ``out`` is none of the factors.
+    """
+    rows, columns, terms = len(out), D.shape[1], len(C)
+    for block in range((columns + LANES - 1) // LANES):
+        column = min(LANES * block, columns - LANES)  # the last columns may be found twice, to the same bits
+        for third in range((rows + 2) // 3):
+            i = 3 * third
+            j, k = min(i + 1, rows - 1), min(i + 2, rows - 1)
+            _tile(out, i, j, k, column, A, B, first, stop, C, D, terms)  # type: ignore[call-arg]
+
+
+def _at(context: Any, builder: Any, kind: types.Array, array: Any) -> Callable[[Any, Any, Any], Any]:
+    """The address of an element of ``array``, for reading and writing a ``target`` there."""
+    struct = context.make_array(kind)(context, builder, array)
+    stride = cgutils.unpack_tuple(builder, struct.strides, 2)[0]  # type: ignore[no-untyped-call]
+
+    def address(row: Any, column: Any, target: Any) -> Any:
+        offset = builder.add(builder.mul(row, stride), builder.mul(column, ir.Constant(column.type, 8)))
+        start = builder.bitcast(struct.data, ir.IntType(8).as_pointer())
+        return builder.bitcast(builder.gep(start, [offset]), target.as_pointer())
+
+    return address
+
+
+@intrinsic
+def _tile(
+    typing: Any, out: Any, i: Any, j: Any, k: Any, column: Any, A: Any, B: Any, first: Any, stop: Any, C: Any, D: Any,
+    terms: Any,
+) -> Any:  # fmt: skip
+    """Rows i, j and k of `multiply`, `LANES` columns from ``column`` on."""
+    signature = types.void(out, i, j, k, column, A, B, first, stop, C, D, terms)
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = {k: _at(context, builder, signature.args[k], values[k]) for k in (0, 5, 6, 9, 10)}
+        rows, column = values[1:4], values[4]
+        nothing, first_lane = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_LANE, LANES), [0] * LANES)
+        nought = ir.Constant(_VECTOR, [0.0] * LANES)
+        sums = [cgutils.alloca_once_value(builder, nought) for _ in rows]  # type: ignore[no-untyped-call]
+        for total in sums:
+            builder.store(nought, total)
+
+        def add(start: Any, end: Any, left: Callable[[Any, Any], Any], right: Callable[[Any, Any, Any], Any]) -> None:
+            step = ir.Constant(start.type, 1)
+            with cgutils.for_range_slice(builder, start, end, step, intp=start.type) as (term, _):
+                lanes = builder.load(right(term, column, _VECTOR), align=8)
+                for row, total in zip(rows, sums, strict=True):
+                    one = builder.insert_element(nothing, builder.load(left(row, term)), ir.Constant(_LANE, 0))
+                    all_ = builder.shuffle_vector(one, nothing, first_lane)
+                    builder.store(builder.fadd(builder.load(total), builder.fmul(all_, lanes)), total)
+
+        add(values[7], values[8], lambda row, term: arrays[5](row, term, _REAL), arrays[6])
+        zero = ir.Constant(values[11].type, 0)
+        add(zero, values[11], lambda row, term: arrays[9](term, row, _REAL), arrays[10])
+        for row, total in zip(rows, sums, strict=True):
+            builder.store(builder.load(total), arrays[0](row, column, _VECTOR), align=8)
+        return context.get_dummy_value()
+
+    return signature, generate

@@ -1,0 +1,45 @@
+"""Products of small matrices against numpy's, and their order of summation bit by bit."""
+
+import numpy as np
+import pytest
+
+from nav._jit import njit
+from nav.matrix import LANES, multiply
+from nav.samples import Array
+
+
+@njit
+def product(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array) -> None:
+    multiply(out, A, B, first, stop, C, D)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 5, 9])
+@pytest.mark.parametrize("columns", [LANES, 9, 15, 16, 17, 25])
+@pytest.mark.parametrize(("first", "stop"), [(0, 4), (1, 3), (2, 2)])
+@pytest.mark.parametrize("terms", [0, 1, 3])
+def test_is_the_sum_of_both_products(rows, columns, first, stop, terms):
+    rng = np.random.default_rng(rows * columns + stop + terms)
+    A, B = rng.normal(size=(rows, 4)), rng.normal(size=(4, columns))
+    C, D = rng.normal(size=(terms, rows + 2)), rng.normal(size=(terms, columns))
+    wide = np.full((rows, columns + 3), 7.0)
+    product(wide, A, B, first, stop, C, D)
+    expected = A[:, first:stop] @ B[first:stop] + C[:, :rows].T @ D
+    np.testing.assert_allclose(wide[:, :columns], expected, rtol=1e-12, atol=1e-13)
+    assert (wide[:, columns:] == 7.0).all()
+
+
+def test_sums_one_term_after_the_other():
+    """The same bits as a loop in Python, also in rows of wider arrays: neither fused nor in another order."""
+    rng = np.random.default_rng(0)
+    work = 10.0 ** rng.uniform(-8, 8, (40, 19))
+    A, B, C, D = work[:7, :15], work[7:22, :17], work[22:25, :15], work[25:28, :17]
+    out = work[28:35, :17]
+    expected = np.zeros((7, 17))
+    for i in range(7):
+        for j in range(17):
+            for k in range(2, 15):
+                expected[i, j] += A[i, k] * B[k, j]
+            for k in range(3):
+                expected[i, j] += C[k, i] * D[k, j]
+    product(out, A, B, 2, 15, C, D)
+    np.testing.assert_array_equal(out, expected)
