@@ -289,7 +289,7 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
             for j in range(3):
                 FT[row + i, start + j] = sign * sums[term, i, j]
 
-    multiply(Phi, FT, FT, 0, MOTION, FT[:0], FT)
+    multiply(Phi, FT, FT, 0, MOTION, FT[:0], FT, mixing)
     for i in range(MOTION):
         for j in range(mixing):
             Phi[i, j] = 0.5 * Phi[i, j] + FT[i, j]

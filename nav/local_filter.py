@@ -662,8 +662,10 @@ class LocalFilter:
     def _innovate_points(self, P: Array, at_points: Array, H: Array, R: Array) -> tuple[Array, Array, Array, float]:
         """`unscented.innovate`: minus ``at_points`` is prediction - measurement, so that zero is measured."""
         assert self.scaling is not None
-        root, z = unscented.factor(P, CURVED), np.zeros(len(R))
-        return unscented.innovate(P, -at_points, z, R, root, H, self.scaling.spread, self.scaling.excess)
+        root, z, work = unscented.factor(P, CURVED), np.zeros(len(R)), unscented.scratch(len(P), len(R))
+        spread, excess = self.scaling.spread, self.scaling.excess
+        nu, S, W, nis = unscented.innovate(P, -at_points, z, R, root, H, work, spread, excess)
+        return nu.copy(), S.copy(), W, nis
 
     def _absorb_points(
         self, reference: Reference, state: State, at_points: Array, H: Array, R: Array, threshold: float

@@ -24,13 +24,13 @@ _VECTOR = ir.VectorType(_REAL, LANES)
 
 
 @inlined
-def multiply(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array) -> None:
-    """Fill the first columns of ``out`` (r, n or wider) with A[:, first:stop] B[first:stop] + C' D.
+def multiply(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array, columns: int) -> None:
+    """Fill the first ``columns`` of ``out`` (r, columns or wider) with those of A[:, first:stop] B[first:stop] + C' D.
 
-    ``A`` (r, stop or wider), ``B`` (stop or longer, n), ``C`` (k, r or wider), ``D`` (k, n), n at least `LANES`; either
-    product may be empty, and ``out`` is none of the factors.
+    ``A`` (r, stop or wider), ``B`` (stop or longer, columns or wider), ``C`` (k, r or wider), ``D`` (k, columns or
+    wider), columns at least `LANES`; either product may be empty, and ``out`` is none of the factors.
     """
-    rows, columns, terms = len(out), D.shape[1], len(C)
+    rows, terms = len(out), len(C)
     for block in range((columns + LANES - 1) // LANES):
         column = min(LANES * block, columns - LANES)  # the last columns may be found twice, to the same bits
         for third in range((rows + 2) // 3):

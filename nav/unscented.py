@@ -90,18 +90,24 @@ class Points(NamedTuple):
     x: Array  # (N, n), the further states; the motion's entries are those of the estimate
 
 
-@embedded
+@njit
 def factor(P: Array, columns: int) -> Array:
     """The first ``columns`` columns of L as rows (columns, n): L is lower triangular, L L' = P.
 
     A pivot that rounding has made too small is raised to `GUARD` of P_ii.
     """
     root = np.empty((columns, len(P)))
-    if columns == CURVED and len(P) == USUAL:
+    factor_into(root, P)
+    return root
+
+
+@embedded
+def factor_into(root: Array, P: Array) -> None:
+    """`factor` for kernels: into ``root`` (columns, n)."""
+    if len(root) == CURVED and len(P) == USUAL:
         _factor(P, root, CURVED, USUAL)
     else:
-        _factor(P, root, columns, len(P))
-    return root
+        _factor(P, root, len(root), len(P))
 
 
 @inlined
@@ -183,9 +189,9 @@ def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
     return carried
 
 
-def scratch(n: int) -> Array:
-    """Room for `predict` and `correct` with n states to work in; it may be used again and again."""
-    return np.empty((n + 29, n))
+def scratch(n: int, m: int = USUAL_ROWS, curved: int = CURVED) -> Array:
+    """Room to work in, again and again: n states, m rows of a measurement, points along ``curved`` columns of L."""
+    return np.empty((2 * n + 32 + 5 * m + 4 * curved, max(n, m, LANES) + 1))
 
 
 @embedded
@@ -220,7 +226,7 @@ def _predict(
     TT, root, own, moved = work[:n], work[n : n + 3], work[n + 3 : n + 6], work[n + 6 : n + 9]
     sensed, curved, rest = work[n + 9 : n + 12], work[n + 12 : n + 19], work[n + 19 : n + 28]
     none: Array = work[:0]
-    mean: Array = work[n + 28]
+    mean: Array = work[n + 28, :n]
     for i in range(n):
         P[i, i] += half_noise[i]
     _factor(P, root, CURVED, n)
@@ -232,9 +238,9 @@ def _predict(
         if j >= MOTION:
             TT[j, j] = decay[j]
 
-    multiply(own, root, TT, 0, VEL, none, TT)
-    multiply(moved, root, TT, VEL, MOTION, none, TT)
-    multiply(sensed, root, TT, MOTION, n, none, TT)
+    multiply(own, root, TT, 0, VEL, none, TT, n)
+    multiply(moved, root, TT, VEL, MOTION, none, TT, n)
+    multiply(sensed, root, TT, MOTION, n, none, TT, n)
     per_spread, half, weight = 1 / spread, 0.5 * T, math.sqrt(excess)
     fx, fy, fz = per_spread * push_n[0], per_spread * push_n[1], per_spread * push_n[2]
     for k in range(CURVED):  # rows a_j, then b_j / s, then that of c
@@ -264,8 +270,8 @@ def _predict(
         mean[i] = per_spread * (curved[3, i] + curved[4, i] + curved[5, i])
         curved[6, i] = weight * mean[i]
 
-    multiply(rest, Phi, P, CURVED, columns, own, root)
-    multiply(P[:MOTION], rest, TT, CURVED, n, curved, curved)
+    multiply(rest, Phi, P, CURVED, columns, own, root, n)
+    multiply(P[:MOTION], rest, TT, CURVED, n, curved, curved, n)
     for i in range(1, MOTION):
         for j in range(i):
             P[i, j] = P[j, i]
@@ -323,19 +329,19 @@ def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
 
 
 @embedded
-def _points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> Array:
-    """`remove` of 0, of + and of - ``spread`` times each row of ``root``: rows (10 + n,) of q_nb, v_n, lla, x."""
+def points_into(found: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> None:
+    """`points` for kernels: rows of q_nb, v_n, lla, x into ``found`` (2 columns + 1, FURTHER + n)."""
     if len(root) == CURVED and len(x) == USUAL:
-        return _spread_out(q_nb, v_n, lla, x, root, spread, CURVED, USUAL)
-    return _spread_out(q_nb, v_n, lla, x, root, spread, len(root), len(x))
+        _points(found, q_nb, v_n, lla, x, root, spread, CURVED, USUAL)
+    else:
+        _points(found, q_nb, v_n, lla, x, root, spread, len(root), len(x))
 
 
 @inlined
-def _spread_out(
-    q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float, columns: int, n: int
-) -> Array:  # fmt: skip
-    """`_points`, with sizes that may be known when it is compiled."""
-    found = np.empty((2 * columns + 1, FURTHER + n))
+def _points(
+    found: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float, columns: int, n: int
+) -> None:  # fmt: skip
+    """`points_into`, with sizes that may be known when it is compiled: `remove` of 0, of + and of - spread times L."""
     per_north, per_east = _per_metre(lla[0], lla[2])
     for i in range(4):
         found[0, i] = q_nb[i]
@@ -363,18 +369,18 @@ def _spread_out(
         for i in range(MOTION, n):
             d = spread * column[i]
             ahead[FURTHER + i], behind[FURTHER + i] = x[i] - d, x[i] + d
-    return found
 
 
 def points(q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> Points:
     """The candidates for the truth around an estimate along the columns of L in ``root`` (columns, n): see `factor`."""
-    found = _points(q_nb, v_n, lla, x, root, spread)
+    found = np.empty((2 * len(root) + 1, FURTHER + len(x)))
+    points_into(found, q_nb, v_n, lla, x, root, spread)
     return Points(found[:, :4], found[:, 4:7], found[:, 7:FURTHER], found[:, FURTHER:])
 
 
 @embedded
 def innovate(
-    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float
+    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, work: Array, spread: float, excess: float
 ) -> tuple[Array, Array, Array, float]:
     """(nu, S, W, nis) of a measurement ``z`` (m,) with variances ``R`` from ``Z`` (2 k + 1, m) at the points.
 
@@ -383,26 +389,24 @@ def innovate(
     H P there are those that have the slopes which the points found, H L_j = -a_j.
 
     nu = z - mean; S = H P H' + diag(R) and what the curvature adds to R; S = D D', D lower triangular; W = D^-1 (H P,
-    -nu) (m, n + 1 or wider) for `correct`; nis = nu' S^-1 nu, NaN when rounding has left S not positive definite.
+    -nu) (m, n + 1 or wider) for `correct`; nis = nu' S^-1 nu, NaN when rounding has left S not positive definite. All
+    three arrays are parts of ``work``, a `scratch`.
     """
     if len(P) == USUAL and len(z) == USUAL_ROWS and len(root) == CURVED:
-        return _innovate(P, Z, z, R, root, H, spread, excess, USUAL, USUAL_ROWS, CURVED)
-    return _innovate(P, Z, z, R, root, H, spread, excess, len(P), len(z), len(root))
+        return _innovate(P, Z, z, R, root, H, work, spread, excess, USUAL, USUAL_ROWS, CURVED)
+    return _innovate(P, Z, z, R, root, H, work, spread, excess, len(P), len(z), len(root))
 
 
 @inlined
 def _innovate(
-    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, spread: float, excess: float, n: int, m: int,
-    curved: int,
+    P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, work: Array, spread: float, excess: float, n: int,
+    m: int, curved: int,
 ) -> tuple[Array, Array, Array, float]:  # fmt: skip
     """`innovate`, with sizes that may be known when it is compiled."""
-    wide, last = max(m, LANES), 2 * curved
-    both = np.empty((m + 1, wide))
-    S, nu = both[:m], both[m]
-    work = np.empty((4 * m + n + 2 * last + 2, max(n + 1, wide)))
-    W, HP, L, inverse = work[:m], work[m : 2 * m], work[2 * m : 3 * m], work[3 * m : 4 * m]
-    rows, none = work[4 * m :, :wide], work[:0]
-    HT, left, right = rows[:n], rows[n : n + last + 1], rows[n + last + 1 :]
+    wide, last, room = max(m, LANES), 2 * curved, work[n + 29 :]  # what is before it is for the others
+    W, HP, L, inverse = room[:m], room[m : 2 * m], room[2 * m : 3 * m], room[3 * m : 4 * m]
+    S, nu, rows, none = room[4 * m : 5 * m], room[5 * m], room[5 * m + 1 :], work[:0]
+    HT, left, right = rows[:n], rows[n : n + last + 1], rows[n + last + 1 : n + 2 * last + 2]
     per_spread = 1 / spread
     half = 0.5 * per_spread
     for i in range(m):
@@ -420,12 +424,12 @@ def _innovate(
             HT[j, i] = H[i, j]
     # of the rows of P, what lies along the first columns is replaced: by the slope less the linear share
     share = right[:curved]
-    multiply(share, root, HT, curved, n, none, HT)
+    multiply(share, root, HT, curved, n, none, HT, wide)
     for k in range(curved):
         for i in range(m):
             share[k, i] = left[k, i] - share[k, i]
-    multiply(HP, H, P, curved, n, share, root)
-    multiply(S, HP, HT, curved, n, left, right)
+    multiply(HP, H, P, curved, n, share, root, n)
+    multiply(S, HP, HT, curved, n, left, right, wide)
     for i in range(m):
         HP[i, n] = -nu[i]
         S[i, i] += R[i]
@@ -451,7 +455,7 @@ def _innovate(
         c = math.sqrt(L[i, i])
         for k in range(i + 1):
             inverse[i, k] *= c
-    multiply(W, inverse, HP, 0, m, none, HP[:, : n + 1])
+    multiply(W, inverse, HP, 0, m, none, HP, n + 1)
     nis = 0.0
     for i in range(m):
         nis += W[i, n] * W[i, n]
@@ -477,8 +481,8 @@ def correct(P: Array, W: Array, work: Array) -> Array:
 @inlined
 def _correct(P: Array, W: Array, work: Array, n: int, m: int) -> Array:
     """`correct`, with sizes that may be known when it is compiled."""
-    taken = work[: n + 1]
-    multiply(taken, W, W, 0, 0, W[:m], W[:m, :n])
+    taken = work.ravel()[: (n + 1) * n].reshape((n + 1, n))
+    multiply(taken, W, W, 0, 0, W, W, n)
     left, less = P.ravel(), taken.ravel()
     mean: Array = taken[n]
     for i in range(n * n):
@@ -521,7 +525,8 @@ def update(
     root = factor(P, len(P) if H is None else CURVED)
     Z = h(points(q_nb, v_n, lla, x, root, scaling.spread))
     slope = np.zeros((len(z), len(P))) if H is None else H
-    nu, S, W, nis = innovate(P, Z, z, R, root, slope, scaling.spread, scaling.excess)
+    work = scratch(len(P), len(z), len(root))
+    nu, S, W, nis = innovate(P, Z, z, R, root, slope, work, scaling.spread, scaling.excess)
     if nis <= threshold:
-        remove(q_nb, v_n, lla, x, correct(P, W, scratch(len(P))))
-    return nu, S, nis
+        remove(q_nb, v_n, lla, x, correct(P, W, work))
+    return nu.copy(), S.copy(), nis

@@ -331,15 +331,16 @@ def _unscented_periods(
     Phi, FT, x = np.zeros((9, n)), np.zeros((9, n)), np.zeros(n)
     decay, half, push = np.ones(n), np.full(n, 1e-12), sums[2].sum(axis=1)
     Z, z = np.zeros((7, len(R))), np.zeros(len(R))
+    root, points = np.empty((3, n)), np.empty((7, unscented.FURTHER + n))
     covariance, start = P.ravel(), P0.ravel()
     for _ in range(count):
         for i in range(len(start)):
             covariance[i] = start[i]
         transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
         unscented.remove(q_nb, v_n, lla, x, unscented.predict(P, Phi, decay, half, work, push, T, spread, excess))
-        root = unscented.factor(P, unscented.CURVED)
-        unscented._points(q_nb, v_n, lla, x, root, spread)
-        _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+        unscented.factor_into(root, P)
+        unscented.points_into(points, q_nb, v_n, lla, x, root, spread)
+        _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, work, spread, excess)
         unscented.remove(q_nb, v_n, lla, x, unscented.correct(P, W, work))
 
 

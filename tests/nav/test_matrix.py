@@ -9,8 +9,8 @@ from nav.samples import Array
 
 
 @njit
-def product(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array) -> None:
-    multiply(out, A, B, first, stop, C, D)
+def product(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array, columns: int) -> None:
+    multiply(out, A, B, first, stop, C, D, columns)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 5, 9])
@@ -22,7 +22,7 @@ def test_is_the_sum_of_both_products(rows, columns, first, stop, terms):
     A, B = rng.normal(size=(rows, 4)), rng.normal(size=(4, columns))
     C, D = rng.normal(size=(terms, rows + 2)), rng.normal(size=(terms, columns))
     wide = np.full((rows, columns + 3), 7.0)
-    product(wide, A, B, first, stop, C, D)
+    product(wide, A, B, first, stop, C, D, columns)
     expected = A[:, first:stop] @ B[first:stop] + C[:, :rows].T @ D
     np.testing.assert_allclose(wide[:, :columns], expected, rtol=1e-12, atol=1e-13)
     assert (wide[:, columns:] == 7.0).all()
@@ -41,5 +41,5 @@ def test_sums_one_term_after_the_other():
                 expected[i, j] += A[i, k] * B[k, j]
             for k in range(3):
                 expected[i, j] += C[k, i] * D[k, j]
-    product(out, A, B, 2, 15, C, D)
+    product(out, A, B, 2, 15, C, D, 17)
     np.testing.assert_array_equal(out, expected)

@@ -80,7 +80,7 @@ def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     H, R, z = rng.normal(size=(m, n)), rng.uniform(0.1, 1, m), rng.normal(size=m)
     root = unscented.factor(P, k)
     Z = -ONE.spread * alpha * np.vstack([np.zeros(n), root, -root]) @ H.T  # truth = estimate - error
-    nu, S, W, nis = unscented.innovate(P, Z, z, R, root, H, scaling.spread, scaling.excess)
+    nu, S, W, nis = unscented.innovate(P, Z, z, R, root, H, unscented.scratch(n, m, k), scaling.spread, scaling.excess)
     S_linear, S_inverse, HP, nis_linear = kalman.innovate(P, H, R, z)
     np.testing.assert_allclose(nu, z, atol=1e-10)
     np.testing.assert_allclose(S, S_linear, rtol=1e-10)
@@ -112,7 +112,7 @@ def test_a_dead_state_changes_nothing():
         given = np.pad(decay, (0, dead), constant_values=1.0), np.pad(half, (0, dead))
         mean = unscented.predict(P_here, Phi, *given, work, push_n, 0.7, ONE.spread, ONE.excess)[:15].copy()
         predicted, root = P_here.copy(), unscented.factor(P_here, 3)
-        nu, S, W, nis = unscented.innovate(P_here, Z, z, R, root, H_here, ONE.spread, ONE.excess)
+        nu, S, W, nis = unscented.innovate(P_here, Z, z, R, root, H_here, work, ONE.spread, ONE.excess)
         found = unscented.correct(P_here, W, work)
         return mean, predicted[:15, :15], nu, S, W[:, :15], nis, found[:15], P_here[:15, :15]
 
@@ -150,7 +150,8 @@ def test_curved_measurement_is_the_weighted_sum():
     z, R = np.array([0.3, 0.4, 0.5]), np.array([0.01, 0.02, 0.03])
     root = unscented.factor(P, n)
     Z = h(unscented.points(q, v, lla, x, root, scaling.spread))
-    nu, S, W, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), scaling.spread, scaling.excess)
+    work = unscented.scratch(n, 3, n)
+    nu, S, W, _ = unscented.innovate(P, Z, z, R, root, np.zeros((3, n)), work, scaling.spread, scaling.excess)
     HP = np.linalg.cholesky(S) @ W[:, :n]
 
     c = scaling.spread**2
@@ -399,7 +400,7 @@ def hostile(updates):
         mean = unscented.predict(P, Phi, decay, half, work, pushes[i], 1.0, ONE.spread, ONE.excess)
         root = unscented.factor(P, 3)
         Z = numbers[i] if i % 10 == 0 else numbers[i] * 1e-6
-        _, _, W, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], ONE.spread, ONE.excess)
+        _, _, W, nis = unscented.innovate(P, Z, numbers[i, 0], R, root, slopes[i], work, ONE.spread, ONE.excess)
         found = unscented.correct(P, W, work)
         if i == 0:
             assert np.isfinite(nis)
@@ -426,7 +427,8 @@ def _cycles(
 ):  # fmt: skip
     """`count` filter periods from the same start: transition, `predict`, and GNSS position and velocity."""
     n = len(P0)
-    P, Phi, FT, work = P0.copy(), np.zeros((9, n)), np.zeros((9, n)), np.empty((n + 29, n))
+    P, Phi, FT, work = P0.copy(), np.zeros((9, n)), np.zeros((9, n)), np.empty((100, n + 1))
+    root, points = np.empty((3, n)), np.empty((7, 10 + n))
     push = sums[2].sum(axis=1)
     for _ in range(count):
         P[:] = P0
@@ -434,9 +436,9 @@ def _cycles(
         shift = unscented.predict(P, Phi, decay, half, work, push, T, spread, excess)
         unscented.remove(q, v, lla, x, shift)
         if sigma_update:
-            root = unscented.factor(P, 3)
-            unscented._points(q, v, lla, x, root, spread)
-            _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, spread, excess)
+            unscented.factor_into(root, P)
+            unscented.points_into(points, q, v, lla, x, root, spread)
+            _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, work, spread, excess)
             unscented.correct(P, W, work)
         else:
             _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
