@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from nav._jit import inlined, njit
+from nav.matrix import multiply
 from nav.samples import Array
 
 
@@ -18,24 +19,16 @@ from nav.samples import Array
 def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
     """P <- T P T' + Q, where T = [Phi 0; 0 diag(decay)] in place on ``P`` (n, n).
 
-    ``Phi`` (r, c) holds the first r rows, zero beyond column c, a multiple of three; ``decay`` (n,) the diagonal of the
-    others (its first r entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise
-    adds over the step.
-    Adding one half before and one half after is the trapezoid of the integral that defines Q; ``work`` (r, n) is
-    scratch.
+    ``Phi`` (r, c) holds the first r rows, zero beyond column c; ``decay`` (n,) the diagonal of the others (its first r
+    entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise adds over the step.
+    Adding one half before and one half after is the trapezoid of the integral that defines Q; ``work`` (r, n) or larger
+    is scratch. At least eight states.
     """
     n = len(P)
     rows, columns = Phi.shape
     for i in range(n):
         P[i, i] += half_noise[i]
-    for i in range(rows):
-        for j in range(n):
-            work[i, j] = 0.0
-        for third in range(columns // 3):
-            k = 3 * third
-            a, b, c = Phi[i, k], Phi[i, k + 1], Phi[i, k + 2]
-            for j in range(n):
-                work[i, j] = work[i, j] + a * P[k, j] + b * P[k + 1, j] + c * P[k + 2, j]
+    multiply(work[:rows], Phi, P, 0, columns, work[:0], P, n)
     for i in range(rows):
         for j in range(i, rows):
             total = 0.0
