@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar, cast
 
 # Of numba, before it is loaded: LLVM's last level adds an eighth to the time of compilation, and no speed.
 os.environ.setdefault("NUMBA_OPT", "2")
@@ -18,24 +19,23 @@ R = TypeVar("R")
 
 
 @cache
-def _forget_stale(folder: Path, kernels: Path = Path(__file__).parent) -> None:
-    """Remove the cached kernels of ``folder`` if a source in it or in ``kernels`` is not what they were compiled from.
+def _sources(folder: Path) -> str:
+    """A digest of name, time and size of every source in ``folder`` and beside this one."""
+    sources = {*folder.glob("[!.]*.py"), *Path(__file__).parent.glob("[!.]*.py")}
+    states = [(source.name, source.stat().st_mtime_ns, source.stat().st_size) for source in sorted(sources)]
+    return hashlib.sha256(repr(states).encode()).hexdigest()
+
+
+def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
+    """Compile with an on-disk cache that is good while all sources are what they were.
 
     Numba looks at a kernel's own file only, and not at those of the kernels that are part of it: after an update of one
     file the others would go on with what it was.
     """
-    sources = sorted({*folder.glob("*.py"), *kernels.glob("*.py")})
-    now = "".join(f"{source.name} {source.stat().st_mtime_ns} {source.stat().st_size}\n" for source in sources)
-    stamp = folder / "__pycache__" / "kernels.txt"
-    try:
-        if stamp.exists() and stamp.read_text() == now:
-            return
-        stamp.parent.mkdir(exist_ok=True)
-        for index in stamp.parent.glob("*.nbi"):
-            index.unlink(missing_ok=True)
-        stamp.write_text(now)
-    except OSError:
-        return  # a folder that cannot be written to: numba caches elsewhere, and it is not updated in place
+    compiled: Any = numba.njit(cache=True, **options)(function)
+    index = compiled._cache._cache_file
+    index._source_stamp = index._source_stamp, _sources(Path(function.__code__.co_filename).parent)
+    return cast("Callable[P, R]", compiled)
 
 
 def njit(function: Callable[P, R]) -> Callable[P, R]:
@@ -46,9 +46,7 @@ def njit(function: Callable[P, R]) -> Callable[P, R]:
 
     fastmath stays off: reordered sums would make results depend on the machine's vector width.
     """
-    _forget_stale(Path(function.__code__.co_filename).parent)
-    compiled = numba.njit(cache=True, no_cfunc_wrapper=True)(function)  # type: ignore[call-overload]
-    return cast("Callable[P, R]", compiled)
+    return _compiled(function, no_cfunc_wrapper=True)
 
 
 def embedded(function: Callable[P, R]) -> Callable[P, R]:
@@ -56,7 +54,7 @@ def embedded(function: Callable[P, R]) -> Callable[P, R]:
 
     For a function that is called from Python as well, or from several kernels.
     """
-    return cast("Callable[P, R]", numba.njit(cache=True, forceinline=True)(function))
+    return _compiled(function, forceinline=True)
 
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
@@ -64,4 +62,4 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
     Compiled by itself first, it would be compiled twice.
     """
-    return cast("Callable[P, R]", numba.njit(cache=True, inline="always")(function))
+    return _compiled(function, inline="always")

@@ -37,6 +37,14 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
             P[i, j] = P[j, i] = total
         for j in range(rows, n):
             P[i, j] = work[i, j] * decay[j]
+    take_rest(P, decay, rows, n)
+    for i in range(n):
+        P[i, i] += half_noise[i]
+
+
+@inlined
+def take_rest(P: Array, decay: Array, rows: int, n: int) -> None:
+    """The part of P <- T P T' that `predict` leaves when it has the first ``rows``: the states that decay alone."""
     for i in range(rows, n):
         for j in range(rows):
             P[i, j] = P[j, i]
@@ -44,8 +52,6 @@ def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) 
             for j in range(rows, n):
                 P[i, j] *= decay[i]
                 P[j, i] = P[i, j] if j != i else P[i, j] * decay[i]
-    for i in range(n):
-        P[i, i] += half_noise[i]
 
 
 @njit

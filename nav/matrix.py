@@ -16,6 +16,7 @@ from nav.samples import Array
 # isort: split
 from llvmlite import ir
 from numba.core import cgutils, types
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 
 LANES = 8  # columns of a product that are summed at a time, so that it must have as many
@@ -30,6 +31,8 @@ def multiply(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D:
     ``A`` (r, stop or wider), ``B`` (stop or longer, columns or wider), ``C`` (k, r or wider), ``D`` (k, columns or
     wider), columns at least `LANES`; either product may be empty, and ``out`` is none of the factors.
     """
+    if columns < LANES:
+        raise ValueError("a product must have eight columns")
     rows, terms = len(out), len(C)
     for block in range((columns + LANES - 1) // LANES):
         column = min(LANES * block, columns - LANES)  # the last columns may be found twice, to the same bits
@@ -58,14 +61,17 @@ def _tile(
     terms: Any,
 ) -> Any:  # fmt: skip
     """Rows i, j and k of `multiply`, `LANES` columns from ``column`` on."""
+    for array in (out, A, B, C, D):
+        if array.ndim != 2 or array.dtype != types.float64 or array.layout == "F":
+            raise TypingError(f"a factor or product must have rows of float64, not be {array}")
     signature = types.void(out, i, j, k, column, A, B, first, stop, C, D, terms)
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        arrays = {k: _at(context, builder, signature.args[k], values[k]) for k in (0, 5, 6, 9, 10)}
+        arrays = {at: _at(context, builder, signature.args[at], values[at]) for at in (0, 5, 6, 9, 10)}
         rows, column = values[1:4], values[4]
         nothing, first_lane = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.VectorType(_LANE, LANES), [0] * LANES)
         nought = ir.Constant(_VECTOR, [0.0] * LANES)
-        sums = [cgutils.alloca_once_value(builder, nought) for _ in rows]  # type: ignore[no-untyped-call]
+        sums = [cgutils.alloca_once(builder, _VECTOR) for _ in rows]  # type: ignore[no-untyped-call]
         for total in sums:
             builder.store(nought, total)
 

@@ -482,7 +482,7 @@ def _propagate(
             for i in range(4):
                 before[i] = q_nb[i]
             step(q_nb, v_n, lla, angle, push, T)
-            _integrate(sums, before, q_nb, angle, push, T)
+            integrate(sums, before, q_nb, angle, push, T)
             elapsed[0] += T
             elapsed[1] += 1.0
         if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
@@ -494,7 +494,7 @@ def _propagate(
 
 
 @inlined
-def _integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
+def integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
     """Add one interval to the integrals of `error_model.transition`, with C_nb in its middle: of the mean quaternion.
 
     Written out in scalars: a matrix made for every increment would take as long as the strapdown.

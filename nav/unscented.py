@@ -43,8 +43,9 @@ from typing import NamedTuple
 import numpy as np
 
 from nav._jit import embedded, inlined, njit
-from nav.earth import radii_of, wrap_longitude
+from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
+from nav.kalman import take_rest
 from nav.matrix import LANES, multiply
 from nav.rotation import SMALL_ANGLE_SQUARED, rotation_coefficients
 from nav.samples import Array
@@ -52,6 +53,7 @@ from nav.samples import Array
 CURVED = 3  # error states in which the equations are not linear: the attitude's, which are the first
 USUAL, USUAL_ROWS = 15, 6  # states and rows of a measurement for which loops are compiled as well: half of the time
 FURTHER = 10  # numbers of a point before its further states: attitude, velocity, place
+OWN = 29  # rows of a `scratch` beyond n that are for `predict`
 HALF_TURN2 = math.pi**2
 GUARD = 1e-14  # of a variance, what rounding may have left of it at least
 TAKEN = 1 - GUARD  # of what a measurement takes from the covariance
@@ -190,8 +192,17 @@ def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
 
 
 def scratch(n: int, m: int = USUAL_ROWS, curved: int = CURVED) -> Array:
-    """Room to work in, again and again: n states, m rows of a measurement, points along ``curved`` columns of L."""
-    return np.empty((2 * n + 32 + 5 * m + 4 * curved, max(n, m, LANES) + 1))
+    """Room to work in, again and again: n states, m rows of a measurement, points along ``curved`` columns of L.
+
+    The first n + `OWN` rows are for `predict`, and after it for `correct`; the others are for `innovate`.
+    """
+    return np.empty((2 * n + OWN + 5 * m + 4 * curved + 3, max(n, m, LANES) + 1))
+
+
+@inlined
+def _check(work: Array, n: int, m: int, curved: int) -> None:
+    if len(work) < 2 * n + OWN + 5 * m + 4 * curved + 3 or work.shape[1] < max(n, m, LANES) + 1:
+        raise ValueError("too little room to work in: make it by `scratch`")
 
 
 @embedded
@@ -202,16 +213,18 @@ def predict(
     """Take ``P`` (n, n) in place over ``T`` seconds and return the mean error (n,) that arises, estimate minus truth.
 
     The first four arguments as in `kalman.predict`, with the Phi (9, columns) of `error_model.transition`; ``work`` is
-    a `scratch`, part of which is the mean; ``push_n`` (3,) is the integral of the specific force in n [m/s], the row
-    sums of the integral of C_nb diag(f_b); ``spread`` and ``excess`` are of `Scaling`. The mean must be subtracted from
-    the estimate.
+    a `scratch`, part of which is the mean until it is used again; ``push_n`` (3,) is the integral of the specific force
+    in n [m/s], the row sums of the integral of C_nb diag(f_b); ``spread`` and ``excess`` are of `Scaling`. The mean
+    must be subtracted from the estimate. Raises ValueError for too small a ``work``.
 
-    With T the whole transition and L_1 the three columns of L that have an attitude,
+    With half of the noise in P before and half added after, T the whole transition and L_1 the three columns of L that
+    have an attitude,
 
         P <- T (P - L_1 L_1') T' + sum a_j a_j' + sum b_j b_j' / s^2 + (beta - alpha^2) c c'
 
     of which P - L_1 L_1' has no rows of the attitude.
     """
+    _check(work, len(P), 0, 0)
     if len(P) == USUAL and Phi.shape[1] == USUAL:
         return _predict(P, Phi, decay, half_noise, work, push_n, T, spread, excess, USUAL, USUAL)
     return _predict(P, Phi, decay, half_noise, work, push_n, T, spread, excess, len(P), Phi.shape[1])
@@ -275,13 +288,7 @@ def _predict(
     for i in range(1, MOTION):
         for j in range(i):
             P[i, j] = P[j, i]
-    for i in range(MOTION, n):
-        for j in range(MOTION):
-            P[i, j] = P[j, i]
-        if decay[i] != 1.0:
-            for j in range(MOTION, n):
-                P[i, j] *= decay[i]
-                P[j, i] = P[i, j] if j != i else P[i, j] * decay[i]
+    take_rest(P, decay, MOTION, n)
     for i in range(n):
         P[i, i] += half_noise[i]
     return mean
@@ -307,14 +314,16 @@ def _turn_into(out: Array, q: Array, w: float, x: float, y: float, z: float) -> 
 @njit
 def _per_metre(lat: float, h: float) -> tuple[float, float]:
     """What a metre north is of latitude, and a metre east of longitude [rad/m]."""
-    sin2 = math.sin(lat) ** 2
-    R_M, R_N = radii_of(sin2)
-    return 1 / (R_M + h), 1 / ((R_N + h) * math.sqrt(1 - sin2))
+    R_M, R_N = radii(lat)
+    return 1 / (R_M + h), 1 / ((R_N + h) * math.cos(lat))
 
 
 @embedded
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
-    """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size."""
+    """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size.
+
+    ``q_nb`` is a unit quaternion but for rounding.
+    """
     x_n, y_n, z_n = error[PHI], error[PHI + 1], error[PHI + 2]
     w, half = _half_turn(x_n, y_n, z_n)
     _turn_into(q_nb, q_nb, w, half * x_n, half * y_n, half * z_n)
@@ -390,8 +399,9 @@ def innovate(
 
     nu = z - mean; S = H P H' + diag(R) and what the curvature adds to R; S = D D', D lower triangular; W = D^-1 (H P,
     -nu) (m, n + 1 or wider) for `correct`; nis = nu' S^-1 nu, NaN when rounding has left S not positive definite. All
-    three arrays are parts of ``work``, a `scratch`.
+    three arrays are parts of ``work``, a `scratch`. Raises ValueError when that is too small.
     """
+    _check(work, len(P), len(z), len(root))
     if len(P) == USUAL and len(z) == USUAL_ROWS and len(root) == CURVED:
         return _innovate(P, Z, z, R, root, H, work, spread, excess, USUAL, USUAL_ROWS, CURVED)
     return _innovate(P, Z, z, R, root, H, work, spread, excess, len(P), len(z), len(root))
@@ -403,7 +413,7 @@ def _innovate(
     m: int, curved: int,
 ) -> tuple[Array, Array, Array, float]:  # fmt: skip
     """`innovate`, with sizes that may be known when it is compiled."""
-    wide, last, room = max(m, LANES), 2 * curved, work[n + 29 :]  # what is before it is for the others
+    wide, last, room = max(m, LANES), 2 * curved, work[n + OWN :]
     W, HP, L, inverse = room[:m], room[m : 2 * m], room[2 * m : 3 * m], room[3 * m : 4 * m]
     S, nu, rows, none = room[4 * m : 5 * m], room[5 * m], room[5 * m + 1 :], work[:0]
     HT, left, right = rows[:n], rows[n : n + last + 1], rows[n + last + 1 : n + 2 * last + 2]
@@ -468,11 +478,11 @@ def correct(P: Array, W: Array, work: Array) -> Array:
 
     mean = W_P' w,  P <- P - TAKEN W_P' W_P,  with W = (W_P, w)
 
-    ``work`` is a `scratch`, part of which is the mean.
-
     which leaves as much as rounding may have taken too much; then the attitude's part is turned into the axes of the
-    corrected estimate, phi <- J_l(mean phi) (phi - mean phi).
+    corrected estimate, phi <- J_l(mean phi) (phi - mean phi). ``work`` is a `scratch`, part of which is the mean
+    until it is used again. Raises ValueError when that is too small.
     """
+    _check(work, len(P), 0, 0)
     if len(P) == USUAL and len(W) == USUAL_ROWS:
         return _correct(P, W, work, USUAL, USUAL_ROWS)
     return _correct(P, W, work, len(P), len(W))
@@ -483,7 +493,7 @@ def _correct(P: Array, W: Array, work: Array, n: int, m: int) -> Array:
     """`correct`, with sizes that may be known when it is compiled."""
     taken = work.ravel()[: (n + 1) * n].reshape((n + 1, n))
     multiply(taken, W, W, 0, 0, W, W, n)
-    left, less = P.ravel(), taken.ravel()
+    left, less = P.reshape(n * n), taken.reshape(n * n + n)
     mean: Array = taken[n]
     for i in range(n * n):
         left[i] -= TAKEN * less[i]

@@ -1,29 +1,37 @@
-"""Cached kernels go when a source that they may contain has changed."""
+"""Cached kernels are good only while all sources that they may contain are what they were."""
 
 import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
-from nav._jit import _forget_stale
+import nav
 
-
-def test_kernels_are_forgotten_with_any_source_they_may_contain(tmp_path):
-    forget = _forget_stale.__wrapped__
-    folder, kernels = tmp_path / "folder", tmp_path / "kernels"
-    for place in (folder, kernels):
-        place.mkdir()
-        (place / "module.py").write_text("a = 1\n")
-    index = folder / "__pycache__" / "module.f-1.py311.nbi"
-    forget(folder, kernels)
-    index.write_bytes(b"")
-    forget(folder, kernels)
-    assert index.exists()
-    for changed in (folder / "module.py", kernels / "module.py"):
-        index.write_bytes(b"")
-        os.utime(changed, ns=(1, 1))
-        forget(folder, kernels)
-        assert not index.exists()
+SCRIPT = """
+from nav import earth
+earth.radii(0.5)
+print(sum(earth.radii.stats.cache_hits.values()), sum(earth.radii.stats.cache_misses.values()))
+"""
 
 
-def test_a_folder_that_cannot_be_written_to_is_left(tmp_path):
-    (tmp_path / "module.py").write_text("a = 1\n")
-    (tmp_path / "__pycache__").write_text("a file in the way of the folder")
-    _forget_stale.__wrapped__(tmp_path, tmp_path)
+def test_a_change_of_any_source_compiles_anew(tmp_path):
+    """`radii` contains `radii_of` of its own file; a change of another file of `nav` may be one of what it contains."""
+    source = Path(nav.__file__).parent
+    package = tmp_path / "nav"
+    shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def hits_and_misses():
+        run = subprocess.run(
+            [sys.executable, "-c", SCRIPT], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+        )
+        return run.stdout.split()
+
+    assert hits_and_misses() == ["0", "1"]
+    assert hits_and_misses() == ["1", "0"]
+    os.utime(package / "rotation.py", ns=(1, 1))
+    (package / ".#lock.py").symlink_to("nowhere")  # as editors leave them
+    assert hits_and_misses() == ["0", "1"]
+    assert hits_and_misses() == ["1", "0"]

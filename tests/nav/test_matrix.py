@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba.core.errors import TypingError
 
 from nav._jit import njit
 from nav.matrix import LANES, multiply
@@ -43,3 +44,16 @@ def test_sums_one_term_after_the_other():
                 expected[i, j] += C[k, i] * D[k, j]
     product(out, A, B, 2, 15, C, D, 17)
     np.testing.assert_array_equal(out, expected)
+
+
+def test_what_it_cannot_multiply_is_refused():
+    good, none = np.ones((9, 9)), np.ones((0, 9))
+    with pytest.raises(ValueError, match="eight columns"):
+        product(good.copy(), good, good, 0, 9, none, none, 7)
+    for bad in (
+        np.asfortranarray(np.ones((9, 8)).repeat(2, axis=1)),
+        np.ones((9, 9), int),
+        np.ones((9, 9), np.float32),
+    ):
+        with pytest.raises(TypingError, match="must have rows of float64"):
+            product(good.copy(), bad, good, 0, 9, none, none, 9)

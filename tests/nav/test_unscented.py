@@ -71,7 +71,7 @@ def test_points_are_the_columns_of_the_factor():
 
 
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
-@pytest.mark.parametrize(("m", "k"), [(1, 15), (3, 15), (6, 15), (6, 3)])
+@pytest.mark.parametrize(("m", "k"), [(1, 15), (3, 15), (6, 15), (6, 3), (9, 3), (20, 3)])
 def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     rng = np.random.default_rng(m)
     n = 15
@@ -118,6 +118,46 @@ def test_a_dead_state_changes_nothing():
 
     for own, other in zip(period(0), period(1), strict=True):
         np.testing.assert_allclose(own, other, rtol=1e-12, atol=1e-14)
+
+
+def test_time_update_is_its_formula():
+    """T (P - L_1 L_1') T' and the columns as `carry` takes them, by dense matrices: large angles, decaying states."""
+    rng, scaling, T = np.random.default_rng(12), Scaling(alpha=0.6), 0.8
+    n, s = 19, scaling.spread
+    scale = np.array([0.6] * 3 + [1.0] * 3 + [10.0] * 3 + [1e-3] * 3 + [0.05] * 3 + [2.0] * 4)
+    P = positive(rng, n, scale) / n
+    Phi = np.eye(9, 15) + 0.1 * rng.normal(size=(9, 15)) * np.outer(scale[:9], 1 / scale[:15])
+    decay, half, push_n = rng.uniform(0.5, 1.0, n), (0.1 * scale) ** 2, np.array([1.0, 2.0, -9.0])
+    whole = np.diag(decay)
+    whole[:9] = 0.0
+    whole[:9, :15] = Phi
+    start = P + np.diag(half)
+    root = np.linalg.cholesky(start)[:, :3]
+
+    def carried(e):
+        return np.concatenate([unscented.carry(e, Phi, push_n, T), decay[9:] * e[9:]])
+
+    ends = [(carried(s * e), carried(-s * e)) for e in root.T]
+    shift = sum(ahead + behind for ahead, behind in ends) / 2 / s**2
+    expected = whole @ (start - root @ root.T) @ whole.T + np.diag(half) + scaling.excess * np.outer(shift, shift)
+    for ahead, behind in ends:
+        odd, even = (ahead - behind) / 2 / s, (ahead + behind) / 2 / s
+        expected += np.outer(odd, odd) + np.outer(even, even)
+    mean = unscented.predict(P, Phi, decay, half, unscented.scratch(n), push_n, T, s, scaling.excess)
+    sigma = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(mean / sigma, shift / sigma, atol=1e-12)
+    np.testing.assert_allclose(P / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-11)
+    assert np.abs(shift / sigma).max() > 0.01
+    assert (P == P.T).all()
+
+
+def test_too_little_room_is_refused():
+    P, H, R = np.eye(15), np.ones((7, 15)), np.ones(7)
+    given = P, np.zeros((7, 7)), R, R, unscented.factor(P, 3), H
+    with pytest.raises(ValueError, match="make it by `scratch`"):
+        unscented.innovate(*given, unscented.scratch(15), 1.0, 1.0)
+    with pytest.raises(ValueError, match="make it by `scratch`"):
+        unscented.correct(P, np.ones((6, 16)), np.empty((10, 16)))
 
 
 def test_scaling_with_negative_weights_is_refused():
@@ -423,11 +463,11 @@ def test_positive_after_a_hundred_thousand_hostile_updates():
 
 @njit
 def _cycles(
-    count, P0, q, v, lla, x, driven, sums, T, decay, half, z, Z, R, H, spread, excess, sigma_update
+    count, work, P0, q, v, lla, x, driven, sums, T, decay, half, z, Z, R, H, spread, excess, sigma_update
 ):  # fmt: skip
     """`count` filter periods from the same start: transition, `predict`, and GNSS position and velocity."""
     n = len(P0)
-    P, Phi, FT, work = P0.copy(), np.zeros((9, n)), np.zeros((9, n)), np.empty((100, n + 1))
+    P, Phi, FT = P0.copy(), np.zeros((9, n)), np.zeros((9, n))
     root, points = np.empty((3, n)), np.empty((7, 10 + n))
     push = sums[2].sum(axis=1)
     for _ in range(count):
@@ -471,8 +511,10 @@ def test_cost_beside_the_strapdown():
             strapdown.propagate(q.copy(), v.copy(), lla.copy(), dtheta, dv, dt)
 
     def cycles(sigma_update):
-        _cycles(50, P, q.copy(), v.copy(), lla.copy(), x.copy(), model.driven, sums, 1.0, np.ones(n), np.full(n, 1e-12),
-                z, np.zeros((7, 6)), R, H, ONE.spread, ONE.excess, sigma_update)  # fmt: skip
+        _cycles(
+            50, unscented.scratch(n), P, q.copy(), v.copy(), lla.copy(), x.copy(), model.driven, sums, 1.0,
+            np.ones(n), np.full(n, 1e-12), z, np.zeros((7, 6)), R, H, ONE.spread, ONE.excess, sigma_update,
+        )  # fmt: skip
 
     second = fastest(strapdowns, 50)
     sigma, linear = (fastest(lambda update=update: cycles(update), 50) for update in (True, False))
