@@ -42,7 +42,6 @@ import numpy.typing as npt
 
 from nav._jit import inlined, njit
 from nav.earth import OMEGA_IE, gravity_of, radii_of
-from nav.matrix import multiply
 from nav.samples import Array
 
 Indices: TypeAlias = npt.NDArray[np.int64]
@@ -289,11 +288,15 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
             for j in range(3):
                 FT[row + i, start + j] = sign * sums[term, i, j]
 
-    multiply(Phi, FT, FT, 0, MOTION, FT[:0], FT, mixing)
     for i in range(MOTION):
         for j in range(mixing):
-            Phi[i, j] = 0.5 * Phi[i, j] + FT[i, j]
+            Phi[i, j] = FT[i, j]
         Phi[i, i] += 1.0
+        for k in range(MOTION):
+            half = 0.5 * FT[i, k]
+            if half != 0.0:
+                for j in range(mixing):
+                    Phi[i, j] += half * FT[k, j]
 
 
 @inlined
