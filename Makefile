@@ -23,7 +23,7 @@ lint: $(VENV)/.ready
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.bench
-	$(BIN)/testbed bench
+	$(BIN)/python tests/bench
 
 setup: $(VENV)/.ready
 

@@ -20,9 +20,11 @@ R = TypeVar("R")
 
 @cache
 def _sources(folder: Path) -> str:
-    """A digest of name, time and size of every source in ``folder`` and beside this one."""
-    sources = {*folder.glob("[!.]*.py"), *Path(__file__).parent.glob("[!.]*.py")}
-    states = [(source.name, source.stat().st_mtime_ns, source.stat().st_size) for source in sorted(sources)]
+    """A digest of name, time and size of every source in the package of ``folder`` and in this one."""
+    while (folder.parent / "__init__.py").exists():
+        folder = folder.parent
+    sources = {*folder.rglob("[!.]*.py"), *Path(__file__).parent.rglob("[!.]*.py")}
+    states = [(str(source), source.stat().st_mtime_ns, source.stat().st_size) for source in sorted(sources)]
     return hashlib.sha256(repr(states).encode()).hexdigest()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from testbed.loop import RunResult, run
+    from testbed.loop.loop import RunResult, run
     from testbed.scenario import Scenario
 
 __all__ = ["RunResult", "Scenario", "run"]
@@ -19,7 +19,7 @@ def __getattr__(name: str) -> Any:
 
         return Scenario
     if name in ("run", "RunResult"):
-        import testbed.loop
+        import testbed.loop.loop
 
-        return getattr(testbed.loop, name)
+        return getattr(testbed.loop.loop, name)
     raise AttributeError(f"module 'testbed' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | watch | bench``.
+"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | watch``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     import xarray
     from rich.console import Console
 
-    from testbed.control import Recorded
-    from testbed.loop import Publisher, RunResult
+    from testbed.loop.loop import Publisher, RunResult
+    from testbed.loop.requests import Recorded
     from testbed.scenario import Scenario
 
 EXIT_FAILED, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
@@ -185,9 +185,9 @@ def check(
     ] = False,
 ) -> None:
     """Fly scenarios side by side, and hold their metrics against [expect] and golden ones; exit code 1 on failure."""
-    from testbed import check as checks
-    from testbed import progress
     from testbed.data import write_file
+    from testbed.many import check as checks
+    from testbed.many import progress
 
     if golden is not None and not golden.is_dir() and not update:
         raise UserError(f"--golden {golden}: no such folder: make it with --update")
@@ -224,7 +224,8 @@ def check(
 @app.command()
 def report(run_file: RunFile) -> None:
     """Write figures and report.html again from a run file, beside it."""
-    from testbed import metrics, record
+    from testbed.record import recorder as record
+    from testbed.score import metrics
 
     dataset = record.load(run_file)
     computed = metrics.compute(dataset)
@@ -241,7 +242,7 @@ def export(
     out: Annotated[Path | None, typer.Option(metavar="PATH", help="Where to; beside the run file.")] = None,
 ) -> None:
     """Turn a run file into CSV or MATLAB."""
-    from testbed.export import export as write
+    from testbed.record.export import export as write
 
     print(write(run_file, format.value, out))
 
@@ -258,8 +259,9 @@ def campaign(
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
 ) -> None:
     """Fly a scenario with many seeds."""
-    from testbed import campaign as campaigns
-    from testbed import campaign_report, progress
+    from testbed.many import campaign as campaigns
+    from testbed.many import progress
+    from testbed.report import campaign as campaign_report
 
     varied = parse_vary(vary or [])
     folder = out or RUNS / f"{Path(scenario).stem}_campaign"
@@ -294,7 +296,7 @@ def papers(
 ) -> None:
     """Reproduce the papers: every claim beside what comes out here; exit code 1 if one is missed."""
     from testbed import papers as library
-    from testbed import progress
+    from testbed.many import progress
 
     found = library.find(ids or [])
     with (
@@ -323,17 +325,6 @@ def watch(
     if not (math.isfinite(speed) and speed > 0):
         raise UserError(f"--speed {speed:g}: the factor must be above 0, such as 10")
     show(source, _console(), speed)
-
-
-@app.command()
-def bench() -> None:
-    """Measure speed, each figure as a ratio within the same run; exit code 1 if a bound was missed."""
-    from testbed import bench as benchmarks
-
-    missed = benchmarks.main()
-    if missed:
-        print(f"testbed: bench: bound missed by {', '.join(missed)}", file=sys.stderr)
-        raise typer.Exit(EXIT_FAILED)
 
 
 def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:
@@ -397,7 +388,8 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
 
 def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
     """Scenario, folder, seed and requests for running a record again."""
-    from testbed import control, record
+    from testbed.loop import requests as control
+    from testbed.record import recorder as record
     from testbed.scenario import Scenario
 
     dataset = record.load(run_file)
@@ -457,7 +449,7 @@ def _connect(
             given = ", ".join(f"--mavlink-{name}" for name, value in options.items() if value)
             raise UserError(f"{given}: there is no link: add --mavlink URL, or leave it out")
         return []
-    from testbed.loop import shown_estimator
+    from testbed.loop.loop import shown_estimator
     from testbed.mavlink import MavlinkPublisher, log_path
 
     shown_estimator(scenario, estimator)
@@ -478,7 +470,8 @@ def _fly(
     realtime: float | None = None,
     replay: Sequence[tuple[float, Recorded]] = (),
 ) -> RunResult:
-    from testbed import keyboard, loop, progress
+    from testbed.loop import keyboard, loop
+    from testbed.many import progress
 
     with (
         _keeping(f"the record so far is {folder / 'run.nc'}"),
@@ -504,8 +497,8 @@ def _fly(
 
 
 def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool) -> None:
-    from testbed import report as reports
-    from testbed import visibility
+    from testbed.report import page as reports
+    from testbed.score import observability as visibility
 
     console = _console()
     console.print(reports.summary_table(metrics))
@@ -521,7 +514,7 @@ def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: 
 def _lost(result: RunResult) -> bool:
     """Whether the flight got out of control; if so, it is said."""
     if result.failure:
-        from testbed.metrics import column
+        from testbed.score.metrics import column
 
         t = column(result.dataset, "truth/time")[-1]
         print(f"testbed: the flight ended after {t:.0f} s: {result.failure}", file=sys.stderr)

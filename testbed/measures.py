@@ -1,7 +1,7 @@
 """Every metric there is: its name, which way is better, and how much it may differ from a golden value.
 
-Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.metrics`; ``flight.*`` are of the aircraft and
-``run.*`` of the machine.
+Names are ``<estimator>.<quantity>_<statistic>_<unit>``, by `testbed.score.metrics`; ``flight.*`` are of the aircraft
+and ``run.*`` of the machine.
 
 Tolerances. A run gives the same bits again on the same machine. On another, the last bits of sines, of exponentials
 and of matrix products differ. Measured by running all shipped scenarios with numpy, OpenBLAS, glibc and LLVM held to

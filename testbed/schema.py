@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Heading: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 
 
 class Section(BaseModel):

@@ -14,7 +14,7 @@ import typer
 
 import testbed.__main__ as cli
 from testbed import Scenario, run
-from testbed.flight import modes_table
+from testbed.motion.flight import modes_table
 from testbed.sensors import imu
 from testbed.sensors.faults import CHANNELS, FaultConfig
 
@@ -36,7 +36,7 @@ SCRIPTS = [line[1:] for line in LINES if line[0] == "python"]
 
 def test_there_is_something_to_test() -> None:
     assert {command[0] for command in COMMANDS} == {
-        "scenarios", "run", "check", "report", "export", "campaign", "papers", "watch", "bench"
+        "scenarios", "run", "check", "report", "export", "campaign", "papers", "watch"
     }  # fmt: skip
     assert SCRIPTS
     assert blocks("toml")

@@ -1,7 +1,7 @@
 """What a vehicle answers when stations ask: parameters, the mission, commands, versions, times, files, logs.
 
 Every request gets an answer, also when it is no: stations that hear nothing wait and ask again. What concerns the run
-becomes a request of `testbed.control`. What is never done here is denied, what is unknown is unsupported, as
+becomes a request of `testbed.loop.requests`. What is never done here is denied, what is unknown is unsupported, as
 https://mavlink.io/en/messages/common.html#MAV_RESULT has it.
 """
 
@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from testbed import control
+from testbed.loop import requests as control
 from testbed.mavlink import messages, mission
 from testbed.mavlink.encode import Encoder, Fields, Voice
 from testbed.mavlink.identity import Identity

@@ -33,7 +33,7 @@ from nav.samples import (
 )
 from testbed.mavlink.encode import Fields, boot_ms, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.identity import Identity
-from testbed.truth import TruthBlock
+from testbed.motion.table import TruthBlock
 
 S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
 Point: TypeAlias = tuple[float, float, float]

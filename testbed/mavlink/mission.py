@@ -15,10 +15,11 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from nav.earth import position_difference_n
-from testbed import guidance
-from testbed.kinematic import Kinematic
 from testbed.mavlink.encode import latitude_e7, longitude_e7
-from testbed.scenario import FlightTruth, KinematicTruth, Scenario
+from testbed.motion import guidance
+from testbed.motion.kinematic import Kinematic
+from testbed.motion.sections import FlightTruth, KinematicTruth
+from testbed.scenario import Scenario
 from testbed.sensors.gnss import displaced
 
 _MOST_SEGMENTS = 1000  # of one leg; where a longer one ends makes no difference on a map

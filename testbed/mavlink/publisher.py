@@ -14,8 +14,8 @@ import numpy as np
 
 from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, Estimate, ImuSamples, Sample, Status, UpdateReport
-from testbed.control import Request, settings
-from testbed.loop import patience
+from testbed.loop.loop import patience
+from testbed.loop.requests import Request, settings
 from testbed.mavlink import messages, mission
 from testbed.mavlink.answers import Answers, Talk
 from testbed.mavlink.encode import Encoder, microseconds
@@ -25,9 +25,9 @@ from testbed.mavlink.messages import Point, Snapshot
 from testbed.mavlink.parameters import Parameters
 from testbed.mavlink.signing import Signing
 from testbed.mavlink.stream import BESIDE_VEHICLES, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
+from testbed.motion.table import TruthBlock
 from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig
-from testbed.truth import TruthBlock
 
 HEARD_A_TURN = 4096  # bytes that are taken from each link at a time; the rest waits, or is lost
 HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s

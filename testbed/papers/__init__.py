@@ -26,7 +26,7 @@ from testbed.scenario import Scenario
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from testbed.progress import Tell
+    from testbed.many.progress import Tell
 
 RESULTS = "papers.json"
 IDS = tuple(sorted(module.name for module in pkgutil.iter_modules(__path__)))

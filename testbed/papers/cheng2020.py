@@ -19,11 +19,11 @@ from nav.error_model import PAPERS, ErrorModel, ImuModel, Indices
 from nav.observability import Segment, analyse, continuous, derivatives, in_units, stripped
 from nav.rotation import quat_from_euler
 from nav.samples import Array
-from testbed import metrics
 from testbed.data import write_file
-from testbed.loop import run
+from testbed.loop.loop import run
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.scenario import Scenario
+from testbed.score import metrics
 
 SEEDS = range(1, 11)
 SHORT_S, LONG_S, STRAIGHT_S = 1000, 10_800, 300

@@ -23,13 +23,14 @@ from nav.horizon import FusionHorizon
 from nav.ins import Ins
 from nav.local_filter import ISOLATED
 from nav.samples import Array, Estimate
-from testbed import estimators, metrics, sensors
+from testbed import estimators, sensors
 from testbed.data import write_file
-from testbed.loop import motion, run
-from testbed.metrics import column
+from testbed.loop.loop import motion, run
+from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
-from testbed.report import AXIS_COLOURS, COLOURS, FAULT
-from testbed.truth import TruthBlock
+from testbed.report.page import AXIS_COLOURS, COLOURS, FAULT
+from testbed.score import metrics
+from testbed.score.metrics import column
 
 if TYPE_CHECKING:
     import xarray

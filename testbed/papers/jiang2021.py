@@ -17,10 +17,12 @@ import numpy as np
 from nav.ahrs import Ahrs
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, Sample
-from testbed import estimators, loop, metrics, sensors
+from testbed import estimators, sensors
 from testbed.data import write_file
+from testbed.loop import loop
+from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
-from testbed.truth import TruthBlock
+from testbed.score import metrics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -191,7 +193,7 @@ def draw(runs: Sequence[dict[Case, Flown]], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from testbed.report import COLOURS, SHADE
+    from testbed.report.page import COLOURS, SHADE
 
     run = runs[0]
     figure = Figure(figsize=(9.0, 7.2), dpi=100, layout="constrained")

@@ -20,10 +20,11 @@ import numpy as np
 
 from nav.detection import ChiSquare, Detector, Glr, Reset, Sprt, eq20, exponential, glr_false_alarm
 from nav.samples import Array
-from testbed import loop, metrics
 from testbed.data import write_file
+from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
-from testbed.report import COLOURS, FAULT
+from testbed.report.page import COLOURS, FAULT
+from testbed.score import metrics
 from testbed.sensors.noise import stream
 
 P = 1e-3  # false alarms and missed ones, per look

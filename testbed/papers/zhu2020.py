@@ -19,11 +19,12 @@ from nav.earth import position_difference_n
 from nav.federated import Federated, weights_by_covariance, weights_eq13
 from nav.samples import Array
 from nav.weighting import inflation
-from testbed import estimators, loop, sensors
+from testbed import estimators, sensors
 from testbed.data import write_file
-from testbed.metrics import attitude_error
+from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.scenario import Scenario
+from testbed.score.metrics import attitude_error
 from testbed.sensors.faults import Faults
 from testbed.sensors.noise import stream
 
@@ -256,7 +257,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from testbed.report import COLOURS, SHADE
+    from testbed.report.page import COLOURS, SHADE
 
     seeds = len(results) // len(RUNS)
     first = {run: results[k * seeds] for k, run in enumerate(RUNS)}

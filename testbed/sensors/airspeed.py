@@ -10,11 +10,11 @@ from pydantic import Field, model_validator
 
 from nav.earth import SEA_LEVEL_DENSITY
 from nav.samples import AirspeedSample
+from testbed.motion.table import TruthBlock
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import PERCENT
-from testbed.truth import TruthBlock
 
 REFERENCE_EAS = 25.0  # [m/s], where `AirspeedErrors` turns pressure into speed
 

@@ -8,10 +8,10 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from nav.samples import BarometerSample
+from testbed.motion.table import TruthBlock
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
-from testbed.truth import TruthBlock
 
 GRADES: dict[str, dict[str, Any]] = {
     "perfect": {},

@@ -17,12 +17,12 @@ from nav._jit import njit
 from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
 from nav.rotation import quat_rotate
 from nav.samples import Array, FixType, GnssSample
+from testbed.motion.table import TruthBlock
 from testbed.schema import Section
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
-from testbed.truth import TruthBlock
 
 NO_FIX_DOP = 99.99  # what receivers report when they have none
 REPORTED_AT_LEAST = 1e-3  # accuracy is reported in whole millimetres, never as none at all [m], [m/s]

@@ -17,6 +17,7 @@ from scipy.linalg import expm
 from nav._jit import njit
 from nav.rotation import dcm_from_quat, quat_from_euler
 from nav.samples import Array, ImuSamples
+from testbed.motion.table import TruthBlock
 from testbed.schema import Section
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
@@ -34,7 +35,6 @@ from testbed.sensors.units import (
     G,
     LeverArm,
 )
-from testbed.truth import TruthBlock
 
 Triple: TypeAlias = tuple[float, float, float]
 Angle: TypeAlias = Annotated[float, Field(ge=-360, le=360)]

@@ -15,11 +15,11 @@ from nav._jit import njit
 from nav.rotation import quat_conjugate, quat_rotate
 from nav.samples import Array, MagnetometerSample
 from testbed.errors import UserError
+from testbed.motion.table import TruthBlock
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, MICROTESLA, PERCENT
-from testbed.truth import TruthBlock
 
 NANOTESLA = 1e-9
 WMM_YEARS = (2010, 2030)  # covered by the models that pygeomag carries, five years each

@@ -11,11 +11,11 @@ from pydantic import Field, model_validator
 from nav.earth import quat_en, quat_ie
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, StarSample
+from testbed.motion.table import TruthBlock
 from testbed.sensors.grades import with_grade
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import InterruptedTiming, Interruptions, Schedule
 from testbed.sensors.units import ARCSEC
-from testbed.truth import TruthBlock
 
 GRADES: dict[str, dict[str, Any]] = {
     "perfect": {},

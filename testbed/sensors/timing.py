@@ -14,10 +14,10 @@ from pydantic import AfterValidator, Field
 
 from nav.samples import Array
 from testbed.errors import UserError
+from testbed.motion.table import TruthBlock
 from testbed.schema import Section
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.units import PERCENT
-from testbed.truth import TruthBlock
 
 TICK_TOLERANCE = 1e-6  # of a tick: what 1/3 Hz and 0.1 s lose as decimal numbers
 

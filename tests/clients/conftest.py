@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from programs import ROOT, START_S, Program, free_port
+from worlds.programs import ROOT, START_S, Program, free_port
 
 CLIENTS = ROOT / ".venv-clients"
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from programs import START_S, Program
+from worlds.programs import START_S, Program
 
 from testbed import Scenario
 

@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pymap3d
 import pytest
-from programs import ROOT, START_S, Program
+from worlds.programs import ROOT, START_S, Program
 
 from testbed import Scenario
 

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from programs import START_S
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mav
+from worlds.programs import START_S
 
 from testbed import Scenario
 

@@ -9,8 +9,8 @@ import allantools
 import numpy as np
 import pytest
 
-from testbed.kinematic import Kinematic
-from testbed.scenario import KinematicStart
+from testbed.motion.kinematic import Kinematic
+from testbed.motion.sections import KinematicStart
 from testbed.sensors.imu import GRADES, Imu, ImuConfig
 
 RATE_HZ = 50.0

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from nav.local_filter import ISOLATED
-from testbed import Scenario, estimators, metrics, run
+from testbed import Scenario, estimators, run
+from testbed.score import metrics
 
 SEEDS = 10
 HEALTHY = ["fault=[]", "sensors.gnss1.denied=[]", "sensors.gnss2.denied=[]", "expect={}"]

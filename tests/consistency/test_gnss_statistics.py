@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from nav.earth import position_difference_n
-from testbed.kinematic import Kinematic
-from testbed.scenario import KinematicStart
+from testbed.motion.kinematic import Kinematic
+from testbed.motion.sections import KinematicStart
 from testbed.sensors.gnss import GRADES, Gnss, GnssConfig
 
 RATE_HZ = 0.2

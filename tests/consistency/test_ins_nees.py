@@ -8,8 +8,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, FIELD_N, airspeed, barometer, error, feed, flight, gnss, imu, magnetometer
 from scipy.stats import chi2
+from worlds.ins import CONSUMER, FIELD_N, airspeed, barometer, error, feed, flight, gnss, imu, magnetometer
 
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig

@@ -17,7 +17,7 @@ from nav.earth import position_difference_n, radii
 from nav.error_model import ImuModel
 from nav.ins import Ins, InsConfig
 from nav.samples import FixType, GnssSample, ImuSamples
-from testbed.truth import increments
+from testbed.motion.table import increments
 
 DEG = math.pi / 180
 DT, SECONDS = 0.01, 3600

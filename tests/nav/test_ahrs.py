@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ahrs_world import (
+from scipy.spatial.transform import Rotation
+from worlds.ahrs import (
     DEG,
     DEGPH,
     DT,
@@ -21,7 +22,6 @@ from ahrs_world import (
     run,
     tilted,
 )
-from scipy.spatial.transform import Rotation
 
 from nav import ahrs as module
 from nav.ahrs import BIAS, PHI, STATES, Ahrs, AhrsConfig
@@ -572,9 +572,9 @@ def test_half_an_hour_without_gnss(plan):
 
     from testbed import sensors
     from testbed.estimators import imu_model
-    from testbed.flight import Flight
-    from testbed.guidance import Leg
-    from testbed.scenario import FlightTruth
+    from testbed.motion.flight import Flight
+    from testbed.motion.guidance import Leg
+    from testbed.motion.sections import FlightTruth
 
     seconds = 1800.0
     wind = {"from_deg": 250.0, "speed_mps": 5.0, "turbulence": "light"}

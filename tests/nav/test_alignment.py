@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
 from scipy.stats import chi2
+from worlds.ins import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
 
 from nav.alignment import AidSigmas, Alignment
 from nav.error_model import ImuModel

@@ -5,10 +5,10 @@ import functools
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, DEG, DT, error, feed, flight, gnss, imu
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from test_federated import DETECTORS, differ, field, fly, horizontal, named, ramp, three, true_start, world
+from worlds.federated import DETECTORS, differ, field, fly, horizontal, named, ramp, three, true_start, world
+from worlds.ins import CONSUMER, DEG, DT, error, feed, flight, gnss, imu
 
 from nav.alignment import InitialState
 from nav.detection import Never

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from ins_world import (
+from worlds.ins import (
     CONSUMER,
     DT,
     FIELD_N,

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from ins_world import (
+from worlds.ins import (
     CONSUMER,
     DEG,
     DT,

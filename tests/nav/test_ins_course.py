@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, DEG, DT, FIELD_N, airspeed, error, feed, flight, gnss, imu
 from scipy.spatial.transform import Rotation
+from worlds.ins import CONSUMER, DEG, DT, FIELD_N, airspeed, error, feed, flight, gnss, imu
 
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
+from worlds.ins import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
 
 from nav.alignment import InitialState
 from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr

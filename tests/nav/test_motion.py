@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from ahrs_world import DEG, DT, SPEED, TURN, imu, level_flight
 from scipy.spatial.transform import Rotation
+from worlds.ahrs import DEG, DT, SPEED, TURN, imu, level_flight
 
 from nav.motion import LowDynamics, TrueAirspeed, TurnDetector, acceleration_n
 from nav.samples import ImuSamples

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from ins_world import flight
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from worlds.ins import flight
 
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import Block, ErrorModel, ImuModel, markov, transition

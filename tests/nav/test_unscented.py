@@ -5,10 +5,10 @@ import time
 
 import numpy as np
 import pytest
-from ins_world import flight
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
+from worlds.ins import flight
 
 from nav import error_model, kalman, strapdown, unscented
 from nav._jit import njit

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from ins_world import CONSUMER, flight, imu
+from worlds.ins import CONSUMER, flight, imu
 
 from nav.samples import ImuSamples
 from nav.voting import Voter

@@ -1,0 +1,1 @@
+"""What a run is made of: the reference motion, increments and samples."""

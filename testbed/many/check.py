@@ -1,0 +1,413 @@
+"""Regression: scenarios flown side by side, their metrics held against `[expect]` and against golden ones.
+
+Golden metrics are what came out when somebody last looked: one JSON file for each scenario, one metric a line. They
+say nothing of right or wrong; `[expect]` does. What is compared, and how closely, is in `testbed.measures`.
+
+Every run is flown by a worker process. One that dies takes the scenario that it flew with it and no other.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import multiprocessing
+import os
+import re
+import signal
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree import ElementTree
+
+from testbed import measures
+from testbed.data import data_dir, remove_derived, write_file
+from testbed.errors import UserError
+from testbed.loop import loop
+from testbed.report import page as report
+from testbed.scenario import Bounds, Scenario
+from testbed.score import observability as visibility
+from testbed.score.metrics import column
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from testbed.many.progress import Tell
+
+GOLDEN = Path("tests/golden")  # of a checkout; they are not shipped
+_ANEW = "delete it, and make it again with `testbed check --update`"
+DIGITS = 4  # of a golden metric; tolerances are a hundred times that
+QUIET = ("kept", "same")  # the verdicts that nobody has to read
+SOUND = (*QUIET, "better", "updated")  # and all that are no failure
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One metric beside what it should be, and the verdict: what follows from [expect], or from a golden value.
+
+    The former is kept or exceeded; the latter same, better, worse, or changed where no way is better; missing when the
+    run has none, new when there is no golden value, updated when the golden value has been written anew.
+    """
+
+    metric: str
+    should: str
+    now: float | None
+    verdict: str
+    golden: bool
+
+    @property
+    def sound(self) -> bool:
+        """Whether it is no failure."""
+        return self.verdict in SOUND
+
+    def __str__(self) -> str:
+        now = "none" if self.now is None else f"{self.now:.4g}"
+        return f"{self.metric} is {now}, not {self.should}: {self.verdict}"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A scenario to fly, where its record goes, and what to hold it against; ``golden`` is None when there is none."""
+
+    name: str
+    scenario: Scenario
+    folder: Path
+    golden: Mapping[str, float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a scenario: ``failure`` says why there is nothing, or no whole flight, to judge; wall time [s]."""
+
+    task: Task
+    rows: Sequence[Row] = ()
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    failure: str = ""
+    wall_s: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The scenario's."""
+        return self.task.name
+
+    @property
+    def failed(self) -> bool:
+        """Whether anything is wrong."""
+        return bool(self.failure) or not all(row.sound for row in self.rows)
+
+    def __str__(self) -> str:
+        parts = [self.failure.splitlines()[0]] if self.failure else []
+        for golden, what in ((False, "of [expect]"), (True, "of golden metrics")):
+            verdicts = [row.verdict for row in self.rows if row.golden == golden]
+            counts = [f"{verdicts.count(verdict)} {verdict}" for verdict in dict.fromkeys(sorted(verdicts))]
+            parts += [f"{what} {', '.join(counts)}"] if counts else []
+        if not self.failure and not any(row.golden for row in self.rows):
+            parts.append("no golden metrics to compare with")
+        verdict = "FAILED" if self.failed else "passed"
+        kept = f"; kept in {self.task.folder}" if self.failed and self.task.folder.exists() else ""
+        return f"{self.name}: {verdict} in {self.wall_s:.0f} s: {'; '.join(parts)}{kept}"
+
+
+def shipped() -> list[str]:
+    """The names of the shipped scenarios. Those of the papers are judged over many seeds, by `testbed papers`."""
+    return sorted(path.stem for path in data_dir("scenarios").glob("*.toml"))
+
+
+def tasks(names: Sequence[str], out: Path, golden: Path | None, update: bool = False) -> list[Task]:
+    """What to fly for these scenarios, into folders of ``out``, with golden metrics of the folder ``golden``.
+
+    To ``update`` golden metrics is to fly without. Raises UserError when a scenario or a golden file is wrong, when
+    there are two of one name, or nothing to check.
+    """
+    made: dict[str, Task] = {}
+    for given in names:
+        scenario, name = Scenario.load(given), Path(given).stem
+        if name in made:
+            raise UserError(f"{given}: there is another scenario of that name among these: check one at a time")
+        known = read_golden(golden / f"{name}.json") if golden is not None else None
+        if not scenario.expect and known is None and not update:
+            raise UserError(f"{given}: has no [expect] and no golden metrics, so there is nothing to check: add some")
+        made[name] = Task(name, scenario, out / name, None if update else known)
+    return list(made.values())
+
+
+def read_golden(path: Path) -> dict[str, float] | None:
+    """The golden metrics of a file; None when there is no such file. Raises UserError when it can't be read."""
+    try:
+        found = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: {error}: {_ANEW}") from None
+    if not isinstance(found, dict) or not all(
+        type(value) in (int, float) and math.isfinite(value) for value in found.values()
+    ):
+        raise UserError(f"{path}: is no table of metrics: {_ANEW}")
+    return found
+
+
+def update(outcomes: Sequence[Outcome], folder: Path) -> list[Outcome]:
+    """Bring the golden metrics in ``folder`` up to date with these runs; those that failed leave theirs as they are.
+
+    A value that is the same within its tolerance stays: the difference between two versions of a file is what somebody
+    should look at, and small steps in one direction add up until they are seen.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    return [outcome if outcome.failed else _update(outcome, folder / f"{outcome.name}.json") for outcome in outcomes]
+
+
+def _update(outcome: Outcome, path: Path) -> Outcome:
+    golden = read_golden(path) or {}
+    rows = [
+        row if row.verdict == "same" else replace(row, verdict="updated")
+        for row in against_golden(golden, outcome.metrics)
+    ]
+    changed = {row.metric: row.now for row in rows if row.verdict == "updated"}
+    merged = {key: value for key, value in golden.items() if key not in changed}
+    merged |= {key: _rounded(now) for key, now in changed.items() if now is not None}
+    if changed:
+        write_file(path, (json.dumps(merged, indent=1, sort_keys=True, allow_nan=False) + "\n").encode())
+    return replace(outcome, rows=[*outcome.rows, *rows])
+
+
+def _rounded(value: float) -> float:
+    return value if value == round(value) else float(f"{value:.{DIGITS}g}")
+
+
+def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> list[Row]:
+    """Each expected metric beside its bounds. One that is missing, or NaN, exceeds them."""
+    return [
+        Row(
+            key, str(bounds), metrics.get(key), "kept" if bounds.hold(metrics.get(key, math.nan)) else "exceeded", False
+        )
+        for key, bounds in expect.items()
+    ]  # fmt: skip
+
+
+def against_golden(golden: Mapping[str, float], metrics: Mapping[str, float]) -> list[Row]:
+    """Each metric beside its golden value, those of the machine left out."""
+    rows = []
+    for key in sorted(golden.keys() | metrics.keys()):
+        if key.startswith("run."):
+            continue
+        before, now = golden.get(key), metrics.get(key)
+        if before is None:
+            rows.append(Row(key, "none", now, "new", True))
+        else:
+            measure = measures.find(key) or measures.Measure(measures.Aim.NONE)
+            verdict = "missing" if now is None else measure.verdict(before, now)
+            rows.append(Row(key, f"{before:.4g}", now, verdict, True))
+    return rows
+
+
+def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outcome:
+    """Fly one scenario and judge it. The record stays when it failed, with a report; otherwise nothing does.
+
+    ``tell`` hears the share of the run that is done.
+    """
+    started = time.perf_counter()
+    try:
+        result = loop.run(task.scenario, out=task.folder, progress=lambda now: tell(now.t / now.duration))
+        failure = loop.NEVER_CLOSED if loop.NEVER_CLOSED in result.remarks else ""
+        if result.failure:
+            t = column(result.dataset, "truth/time")[-1]
+            failure = f"the flight ended after {t:.0f} s: {result.failure}"
+        rows = judge(task.scenario.expect, result.metrics)
+        if task.golden is not None:
+            rows += against_golden(task.golden, result.metrics)
+        outcome = Outcome(task, rows, result.metrics, failure, time.perf_counter() - started)
+    except Exception as error:
+        return Outcome(task, failure=_told(error), wall_s=time.perf_counter() - started)
+    if not outcome.failed:
+        clear(task.folder)
+        return outcome
+    try:
+        seen = visibility.of_run(result.dataset)
+        report.write_report(result.dataset, result.metrics, task.folder, seen)
+    except Exception as error:
+        return replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
+    return outcome
+
+
+def _told(error: Exception) -> str:
+    """What an error says; where it comes from too, unless it is a user's mistake."""
+    if isinstance(error, UserError):
+        return str(error)
+    return f"{type(error).__name__}: {error}\n{traceback.format_exc()}"
+
+
+def clear(folder: Path) -> None:
+    """Remove what a run left in its folder, and the folder when nothing else is in it."""
+    with suppress(OSError):
+        remove_derived(folder)
+        (folder / "run.nc").unlink(missing_ok=True)
+        folder.rmdir()
+
+
+# --- the workers
+
+
+@dataclass(slots=True)
+class _Worker:
+    """A process that flies one task after the other, at its end of a pipe."""
+
+    process: BaseProcess
+    task: Task
+    share: float = 0.0  # of the task that is done
+
+    @classmethod
+    def hire(cls, task: Task) -> tuple[Connection, _Worker]:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        # Whoever waits for the workers decides what an interrupt means: what is ignored here is ignored there too.
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            process.start()
+        finally:
+            signal.signal(signal.SIGINT, before)
+        theirs.close()
+        worker = cls(process, task)
+        worker.give(ours, task)
+        return ours, worker
+
+    def give(self, connection: Connection, task: Task | None) -> None:
+        """The next task, or no more. One that has died meanwhile is found out when it does not answer."""
+        if task is not None:
+            self.task, self.share = task, 0.0
+        with suppress(OSError):
+            connection.send(task)
+
+    def died(self) -> Outcome:
+        self.process.join()
+        code = self.process.exitcode or 0
+        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        return Outcome(self.task, failure=f"its process ended {how}: out of memory, or a crash outside Python?")
+
+
+def _serve(connection: Connection) -> None:
+    """Fly tasks as they come, in a process of one core, until there is none, or nobody listens any more."""
+    with suppress(EOFError, OSError):
+        while (task := connection.recv()) is not None:
+            connection.send(fly(task, connection.send))
+
+
+def fly_all(given: Sequence[Task], tell: Tell | None = None, processes: int | None = None) -> list[Outcome]:
+    """Fly all tasks, as many at a time as there are cores, or ``processes``; their outcomes in the order given."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the workers: what they multiply is small
+    most = processes or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    # The longest first, so that no core has much to do when the others have finished.
+    waiting = deque(sorted(given, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator))))
+    total_s = sum(task.scenario.duration_s for task in given)
+    done: dict[str, Outcome] = {}
+    crew: dict[Connection, _Worker] = {}
+
+    def say() -> None:
+        if tell is not None:
+            flown_s = sum(one.task.scenario.duration_s for one in done.values())
+            flown_s += sum(worker.share * worker.task.scenario.duration_s for worker in crew.values())
+            names = ", ".join(worker.task.name for worker in crew.values())
+            tell(flown_s / total_s, f"{len(done)} of {len(given)} scenarios  {names}")
+
+    try:
+        while waiting or crew:
+            while waiting and len(crew) < most:
+                connection, worker = _Worker.hire(waiting.popleft())
+                crew[connection] = worker
+            for connection in [one for one in wait(list(crew)) if isinstance(one, Connection)]:
+                worker = crew[connection]
+                try:
+                    said = connection.recv()
+                except (EOFError, OSError):
+                    said = worker.died()
+                if isinstance(said, float):
+                    worker.share = said
+                    continue
+                done[said.name] = said
+                if waiting and worker.process.is_alive():
+                    worker.give(connection, waiting.popleft())
+                else:
+                    _dismiss(connection, crew.pop(connection))
+            say()
+    finally:
+        for connection, worker in crew.items():
+            worker.process.kill()
+            _dismiss(connection, worker)
+            clear(worker.task.folder)
+    return [done[task.name] for task in given]
+
+
+def _dismiss(connection: Connection, worker: _Worker) -> None:
+    worker.give(connection, None)
+    worker.process.join()
+    worker.process.close()
+    connection.close()
+
+
+# --- telling
+
+
+def table(outcomes: Iterable[Outcome], verbose: bool = False) -> Table | None:
+    """The metrics that are worth reading, all of them if ``verbose``; None when there is none."""
+    from rich.table import Table
+
+    rows = Table("scenario", "metric", "should be", "is", "change", "verdict")
+    rows.columns[1].no_wrap = True
+    for name, row in ((outcome.name, row) for outcome in outcomes for row in outcome.rows):
+        if not verbose and row.verdict in QUIET:
+            continue
+        verdict = row.verdict if row.verdict in QUIET else f"[{'green' if row.sound else 'bold red'}]{row.verdict}[/]"
+        now = "missing" if row.now is None else f"{row.now:.4g}"
+        rows.add_row(name, row.metric, row.should, now, _change(row), verdict)
+    return rows if rows.row_count else None
+
+
+def _change(row: Row) -> str:
+    """By how much it is off its golden value."""
+    golden = float(row.should) if row.golden and row.should != "none" else 0.0
+    return "" if row.now is None or not golden else f"{100 * (row.now / golden - 1):+.1f} %"
+
+
+_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def junit(outcomes: Sequence[Outcome]) -> bytes:
+    """All outcomes as JUnit XML: a suite for each scenario; a case for the flight, [expect], and each estimator."""
+    root = ElementTree.Element("testsuites", name="testbed check")
+    for outcome in outcomes:
+        suite = ElementTree.SubElement(root, "testsuite", name=outcome.name, time=f"{outcome.wall_s:.3f}")
+        flight = ElementTree.SubElement(suite, "testcase", classname=outcome.name, name="flight")
+        flight.set("time", f"{outcome.wall_s:.3f}")
+        if outcome.failure:
+            _complaint(flight, "error", outcome.failure.splitlines()[0], outcome.failure)
+        for group, found in itertools.groupby(outcome.rows, _group):
+            rows = list(found)
+            case = ElementTree.SubElement(suite, "testcase", classname=outcome.name, name=group, time="0")
+            bad = [str(row) for row in rows if not row.sound]
+            if bad:
+                _complaint(case, "failure", f"{len(bad)} of {len(rows)} metrics", "\n".join(bad))
+        _count(suite, suite)
+    _count(root, root)
+    ElementTree.indent(root)
+    return b'<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(root, encoding="unicode").encode() + b"\n"
+
+
+def _group(row: Row) -> str:
+    return f"golden {row.metric.partition('.')[0]}" if row.golden else "expect"
+
+
+def _complaint(case: ElementTree.Element, kind: str, message: str, text: str) -> None:
+    complaint = ElementTree.SubElement(case, kind, message=_NOT_XML.sub("?", message), type=kind)
+    complaint.text = _NOT_XML.sub("?", text)
+
+
+def _count(element: ElementTree.Element, below: ElementTree.Element) -> None:
+    for name, path in (("tests", "testcase"), ("failures", "failure"), ("errors", "error")):
+        element.set(name, str(len(list(below.iter(path)))))

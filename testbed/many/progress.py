@@ -1,0 +1,65 @@
+"""How far something long has come: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeAlias
+
+from rich.progress import BarColumn, Progress, TextColumn
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from testbed.loop import loop
+
+PLAIN_LINES = 10  # for the whole
+PLAIN_EVERY_S = 5.0  # wall time
+
+Tell: TypeAlias = Callable[[float, str], None]
+
+
+@contextmanager
+def shown(console: Console, title: str) -> Iterator[Tell]:
+    """A function to be told the fraction done and what is going on, shown on ``console`` while the context lasts."""
+    if not console.is_terminal:
+        yield _plain(console)
+        return
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[text]}", markup=False),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=1.0, text="starting; the first time, kernels are compiled")
+        yield lambda fraction, text: bar.update(task, completed=fraction, text=text)
+
+
+def _plain(console: Console) -> Tell:
+    shown = 0
+    last_line = time.monotonic()
+
+    def tell(fraction: float, text: str) -> None:
+        nonlocal shown, last_line
+        reached = int(fraction * PLAIN_LINES + 1e-9)  # a tenth of the whole is none in binary
+        if reached <= shown and time.monotonic() - last_line < PLAIN_EVERY_S:
+            return
+        shown = reached
+        last_line = time.monotonic()
+        console.print(f"{100.0 * fraction:3.0f} %  {text}", markup=False, highlight=False, soft_wrap=True)
+
+    return tell
+
+
+def of_run(now: loop.Progress) -> tuple[float, str]:
+    """The fraction of a run that is done; simulated time, real-time factor and what is going on."""
+    factor = f"{now.realtime_factor:.3g} × real time"
+    return now.t / now.duration, f"{_clock(now.t)} of {_clock(now.duration)}  {factor}  {now.activity}"
+
+
+def _clock(seconds: float) -> str:
+    """Minutes and seconds, with hours where there are any."""
+    minutes, s = divmod(int(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}:{m:02d}:{s:02d}" if hours else f"{m:02d}:{s:02d}"

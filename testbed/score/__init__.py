@@ -1,0 +1,1 @@
+"""What a record is worth: errors against truth, consistency, observability."""

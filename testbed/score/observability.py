@@ -1,0 +1,241 @@
+"""Which states of each estimator can be seen, and when, along the way that a recorded run took.
+
+The filters are built from the run's scenario as they were for it. Truth gives the motion; the record says which looks
+each of them used (`UpdateReport`), so that whatever kept one away, an outage, a fault, the range of a transponder or
+an isolation, keeps it away here: it shows nothing. See `nav.observability.looked_at`, whose prior is the estimator's
+own 1-sigma once aligned.
+
+A federated filter is judged as one filter with the common states and the aids of all its locals: by what can be seen
+at all. What one local filter sees of its own is less.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from nav.ahrs import LEVEL, MAGNETIC_HEADING, STATES, Ahrs, transition
+from nav.alignment import InitialState
+from nav.detection import ChiSquareGate
+from nav.earth import earth_rate_n, isa_pressure
+from nav.error_model import MOTION
+from nav.federated import Federated
+from nav.ins import AIDS, Ins
+from nav.local_filter import (
+    Aid,
+    AirspeedAid,
+    BarometerAid,
+    BodyVelocityAid,
+    GnssAid,
+    LocalFilter,
+    MagnetometerAid,
+    PositionFixAid,
+    StarAid,
+)
+from nav.observability import Visibility, flown, looked_at
+from nav.reference import Reference
+from nav.rotation import dcm_from_quat
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    BodyVelocitySample,
+    FixType,
+    GnssSample,
+    MagnetometerSample,
+    PositionSample,
+    Sample,
+    StarSample,
+    Status,
+)
+from testbed import estimators
+from testbed.errors import UserError
+from testbed.scenario import Scenario
+from testbed.score import metrics as scores
+from testbed.score.metrics import column
+
+if TYPE_CHECKING:
+    import xarray
+
+SEGMENTS = 60  # of a run at most
+SHORTEST_S = 5.0  # of a segment
+LOOK_S = 5.0  # given to a derivative to show
+KNOWN = 1e-9  # sigma of what is told to have no error, of its unit
+
+
+class _Way(NamedTuple):
+    """N segments with edges ``t`` (N + 1,), truth at their middles, and the 1-sigma of the motion at the start (9,)."""
+
+    t: Array
+    middle: Array  # (N,) [s]
+    q_nb: Array
+    v_n: Array
+    lla: Array
+    airspeed: Array
+    f_b: Array
+    omega_b: Array
+    sigma: Array
+
+
+def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
+    """Visibility of each estimator that was ever aligned; none of a record whose scenario is no longer read."""
+    try:
+        overrides = json.loads(dataset.attrs.get("overrides", "[]"))
+        scenario = Scenario.parse(str(dataset.attrs["scenario"]), overrides)
+    except (KeyError, ValueError, UserError):
+        return {}
+    found = {}
+    for name, running in estimators.build(scenario, scenario.seed).items():
+        way = _way(dataset, name) if name in scores.names(dataset) else None
+        if way is None:
+            continue
+        match running.horizon.estimator:
+            case Ahrs() as ahrs:
+                found[name] = _of_ahrs(dataset, name, way, ahrs)
+            case Ins() as ins:
+                # An INS calls the one sensor of a kind by the kind, the record by its name.
+                named: dict[str, str] = {scenario.sensors[one].kind: one for one in running.sensors}
+                aids = {named[kind]: ins.config.aid_of(kind) for kind in AIDS if kind in ins.config.aids}
+                found[name] = _of_filter(dataset, name, way, ins, aids | {aid.sensor: aid for aid in ins.config.others})
+            case Federated() as federated:
+                watched = [watched.aid for local in federated.config.locals for watched in local.sensors]
+                found[name] = _of_filter(dataset, name, way, federated, {aid.sensor: aid for aid in watched})
+    return found
+
+
+def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
+    """The way from where the estimator was aligned, None when it never was, or only at the end."""
+    own, t = f"estimators/{name}", column(dataset, "truth/time")
+    aligned = np.flatnonzero(column(dataset, f"{own}/status") & Status.ALIGNED)
+    start = float(column(dataset, f"{own}/time")[aligned[0]]) if len(aligned) else np.inf
+    if t[-1] - start < 2 * SHORTEST_S:
+        return None
+    edges = np.linspace(start, t[-1], min(SEGMENTS, int((t[-1] - start) / SHORTEST_S)) + 1)
+    row = np.searchsorted(t, (edges[:-1] + edges[1:]) / 2)
+    lla = np.column_stack([column(dataset, f"truth/{key}")[row] for key in ("lat", "lon", "h")])
+    q_nb, v_n, airspeed, dv, dtheta = (
+        column(dataset, f"truth/{key}")[row] for key in ("q_nb", "v_n", "airspeed", "dv", "dtheta")
+    )
+    interval = (t[row] - t[row - 1])[:, None]
+    sigma = np.concatenate(
+        [column(dataset, f"{own}/sigma_{what}_n")[aligned[0]] for what in ("attitude", "velocity", "position")]
+    )
+    return _Way(edges, t[row], q_nb, v_n, lla, airspeed, dv / interval, dtheta / interval, sigma)
+
+
+def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, int], sensor: str = "") -> Array:
+    """The largest weight (N, m) of each axis of a look in each segment, 0 without any; of one ``sensor`` of several.
+
+    Where a look was used in part, the record says how many axes were left out but not which: they are taken for those
+    that were the furthest from what was expected.
+    """
+    aid, m = part
+    best = np.zeros((len(edges) - 1, m))
+    if aid not in scores.aids(dataset, name):
+        return best
+    own = f"estimators/{name}/innovations/{aid}"
+    total = column(dataset, f"{own}/weight")
+    mine = total > 0
+    if sensor:
+        mine &= column(dataset, f"{own}/sensor").astype(str) == sensor
+    total = total[mine]
+    weight = np.repeat(total[:, None], m, axis=1)
+    cut = scores.refused(total, column(dataset, f"{own}/reason")[mine].astype(str))
+    if cut.any():
+        nu, S = (column(dataset, f"{own}/{what}")[mine][cut] for what in ("innovation", "S"))
+        order = np.argsort(np.argsort(-np.abs(nu) / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), axis=1), axis=1)
+        weight[cut] = np.where(order < np.round(m * (1 - total[cut]))[:, None], 0.0, 1.0)
+    segment = np.searchsorted(edges, column(dataset, f"{own}/sample_time")[mine]) - 1
+    np.maximum.at(best, np.clip(segment, 0, len(best) - 1), weight)
+    return best
+
+
+def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visibility:
+    level, heading = (_used(dataset, name, way.t, part) for part in ((LEVEL, 2), (MAGNETIC_HEADING, 1)))
+    compensated = "airspeed" in ahrs.config.aids
+    F, looks = np.zeros((len(level), STATES, STATES)), []
+    for k, q_nb in enumerate(way.q_nb):
+        F[k, :3] = transition(dcm_from_quat(q_nb), earth_rate_n(float(way.lla[k, 0])), 1.0) - np.eye(3, STATES)
+        levelling = (*ahrs.level_look(way.omega_b[k], compensated), level[k])
+        looks.append(_stacked([levelling, (*ahrs.heading_look, heading[k])], STATES))
+    names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
+    prior = np.concatenate([way.sigma[:3], np.full(3, ahrs.config.imu.gyro_bias_sigma)])
+    return looked_at(names, way.t, F, looks, np.maximum(prior, KNOWN), LOOK_S)
+
+
+def _of_filter(
+    dataset: xarray.DataTree, name: str, way: _Way, estimator: Ins | Federated, aids: Mapping[str, Aid]
+) -> Visibility:
+    """Of one filter with these aids, by the names of their sensors."""
+    inner = LocalFilter(estimator.config.imu, list(aids.values()), ChiSquareGate(0.0))
+    reference = Reference([inner.model], [1.0], 1, estimator.field_n)
+    parts = [
+        (sensor, aid, part[0], _used(dataset, name, way.t, part, sensor))
+        for sensor, aid in aids.items()
+        for part in aid.parts
+    ]
+    accuracy = {
+        sensor: _accuracy(dataset, sensor) for sensor, aid, _, used in parts if isinstance(aid, GnssAid) and used.any()
+    }
+    looks = []
+    for k in range(len(way.middle)):
+        lat, lon, h = way.lla[k].tolist()
+        initial = InitialState(float(way.middle[k]), lat, lon, h, way.v_n[k], way.q_nb[k], np.eye(MOTION))
+        state = reference.start(initial)
+        state.rates[0] = way.omega_b[k]
+        found = []
+        for sensor, aid, part, used in parts:
+            if used[k].any():
+                sample = _sample(aid, initial, reference, float(way.airspeed[k]), accuracy.get(sensor))
+                look = inner.look(reference, state, aid, part, sample)
+                if look is not None:  # there is no course at rest
+                    found.append((look.H, look.R, used[k]))
+        looks.append(_stacked(found, inner.model.size))
+    prior = np.concatenate([way.sigma, inner.model.sigma[MOTION:]])
+    return flown(
+        inner.model, way.t, way.q_nb, way.v_n, way.lla, way.f_b, way.omega_b, looks, np.maximum(prior, KNOWN), LOOK_S
+    )
+
+
+def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array]:
+    """Which 1-sigma of position and of velocity (3,) it usually reports."""
+    position, velocity = (column(dataset, f"sensors/{receiver}/sigma_{what}_n") for what in ("position", "velocity"))
+    return np.nanmedian(position, axis=0), np.nanmedian(velocity, axis=0)
+
+
+def _stacked(looks: Sequence[tuple[Array, Array, Array]], n: int) -> tuple[Array, Array]:
+    """H (m, n) and 1-sigma of the noise (m,) of those axes of all ``looks`` (H, R, weight) that were used."""
+    H = np.vstack([np.zeros((0, n)), *(H for H, _, _ in looks)])
+    R, weight = (np.concatenate([[], *values]) for values in ([R for _, R, _ in looks], [w for *_, w in looks]))
+    used = weight > 0
+    return H[used], np.sqrt(np.maximum(R[used], KNOWN**2) / weight[used])
+
+
+def _sample(
+    aid: Aid, here: InitialState, reference: Reference, airspeed: float, accuracy: tuple[Array, Array] | None
+) -> Sample:
+    """What the aid's sensor would say here without error; a receiver, with its usual ``accuracy``."""
+    t = here.t
+    match aid:
+        case GnssAid():
+            assert accuracy is not None
+            return GnssSample(
+                t, t, here.lat, here.lon, here.h, here.v_n, *accuracy, FixType.FIX_3D, 12, 0.9, 1.4, aid.sensor
+            )
+        case BarometerAid():
+            return BarometerSample(t, t, float(isa_pressure(here.h)), aid.sensor)
+        case MagnetometerAid():
+            place = np.array([here.lat, here.lon, here.h])
+            return MagnetometerSample(t, t, reference.field_n(place), aid.sensor)
+        case AirspeedAid():
+            return AirspeedSample(t, t, airspeed, aid.sensor)
+        case BodyVelocityAid():
+            return BodyVelocitySample(t, t, np.zeros(3), aid.sensor)
+        case StarAid():
+            return StarSample(t, t, np.array([1.0, 0.0, 0.0, 0.0]), aid.sensor)
+        case PositionFixAid():
+            return PositionSample(t, t, here.lat, here.lon, here.h, aid.sensor)
+    raise TypeError(f"no sample of {aid!r}")

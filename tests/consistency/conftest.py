@@ -1,6 +1,0 @@
-"""The simulated world of the filters' tests serves here too."""
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "nav"))

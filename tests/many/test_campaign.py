@@ -1,0 +1,551 @@
+"""Campaigns: the same numbers however they are flown, nothing lost when something dies, honest statistics."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import LocalCluster
+from typer.testing import CliRunner
+from worlds import synthetic_run
+
+from testbed import Scenario, run
+from testbed.__main__ import app
+from testbed.errors import UserError
+from testbed.loop import loop
+from testbed.many import campaign as campaigns
+from testbed.many.campaign import Combination, Failure, Outcome, Progress, campaign
+from testbed.motion.kinematic import Kinematic
+from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
+from testbed.report import campaign as campaign_report
+from testbed.score import metrics
+
+AT_REST = """
+title = "At rest, some of it without GNSS"
+seed = 11
+duration_s = 80
+
+[truth]
+source = "kinematic"
+rate_hz = 50
+start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 500 }
+
+[sensors.imu]
+grade = "mems-industrial"
+rate_hz = 50
+[sensors.gnss]
+rate_hz = 5
+denied = [[70, 75]]
+[sensors.barometer]
+rate_hz = 5
+[sensors.magnetometer]
+rate_hz = 5
+
+[[estimator]]
+name = "ins"
+aids = ["gnss", "barometer", "magnetometer"]
+"""
+
+
+@pytest.fixture
+def at_rest(tmp_path: Path) -> Path:
+    path = tmp_path / "at_rest.toml"
+    path.write_text(AT_REST)
+    return path
+
+
+def in_this_process(workers: int) -> LocalCluster:
+    """A cluster whose workers are threads of this process, so that tests can reach into them."""
+    return LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=False,
+        protocol="tcp",
+        host="127.0.0.1",
+        dashboard_address=None,
+        scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+    )
+
+
+@pytest.fixture(scope="module")
+def threads() -> Iterator[str]:
+    with in_this_process(1) as cluster:
+        yield cluster.scheduler_address
+
+
+def same(one: Outcome, other: Outcome) -> bool:
+    """Whether two outcomes hold the same bits."""
+    return (
+        one.seed == other.seed
+        and dict(one.metrics) == dict(other.metrics)
+        and one.history.keys() == other.history.keys()
+        and all(np.array_equal(one.history[k], other.history[k], equal_nan=True) for k in one.history)
+    )
+
+
+def flown_here(path: Path, seed: int, overrides: tuple[str, ...] = ()) -> Outcome:
+    """What a campaign should have of one run, flown in this process by the plain loop, truth and all."""
+    result = run(Scenario.load(path, overrides), seed=seed)
+    metrics = {k: v for k, v in result.metrics.items() if not k.startswith("run.")}
+    return Outcome(0, seed, metrics, campaigns._history(result.dataset))
+
+
+class Counter:
+    """Stands for the loop's run: counts the seeds flown, and fails for some of them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, failing: set[int] = frozenset()) -> None:  # type: ignore[assignment]
+        self.seeds: list[int] = []
+        self.failing = failing
+        self._run = loop.run
+        monkeypatch.setattr(loop, "run", self)
+
+    def __call__(self, scenario: Scenario, *, seed: int, **options: Any) -> Any:
+        self.seeds.append(seed)
+        if seed in self.failing:
+            raise ArithmeticError("the filter blew up")
+        return self._run(scenario, seed=seed, **options)
+
+
+# --- replay
+
+
+def test_replay_gives_the_stored_rows(tmp_path: Path) -> None:
+    start = SimpleNamespace(lat_deg=10.0, lon_deg=179.0, alt_m=5.0, heading_deg=1.0, pitch_deg=2.0, roll_deg=3.0)
+    save_motion(Kinematic(start, 50.0), 1001, tmp_path / "truth")
+    direct, replay = Kinematic(start, 50.0), Replay(tmp_path / "truth")
+    assert replay.rate_hz == 50.0
+    for ticks in (1, 7, 500, 493):
+        one, other = direct.advance(ticks), replay.advance(ticks)
+        assert one.tick == other.tick
+        for name in COLUMNS:
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), strict=True)
+    assert len(replay.advance(1)) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["truth"]
+
+
+def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
+    class Ends:
+        rate_hz = 10.0
+
+        def __init__(self) -> None:
+            self.left = 30
+            self.failure = "control lost"
+
+        def advance(self, ticks: int) -> TruthBlock:
+            n = min(ticks, self.left)
+            self.left -= n
+            return TruthBlock.empty(30 - self.left - n, n)
+
+        def activity(self) -> str:
+            return ""
+
+    save_motion(Ends(), 100, tmp_path / "truth")
+    replay = Replay(tmp_path / "truth")
+    assert (len(replay.advance(30)), replay.failure) == (30, "")
+    assert (len(replay.advance(70)), replay.failure) == (0, "control lost")
+
+
+def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
+    overrides = ["duration_s=30", "truth.wind.turbulence=none"]
+    scenario = Scenario.load("u_turn", overrides)
+    save_motion(loop.motion(scenario, scenario.seed), 30 * 200 + 1, tmp_path / "truth")
+    direct = run(scenario, seed=5)
+    replayed = run(scenario, seed=5, source=Replay(tmp_path / "truth"))
+    for node in direct.dataset.subtree:
+        for name, variable in node.variables.items():
+            np.testing.assert_array_equal(variable.values, replayed.dataset[node.path][name].values)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "shared"),
+    [
+        (["truth.wind.turbulence=none"], True),
+        ([], False),
+        (["truth.wind.turbulence_seed=3"], True),
+        (["truth.wind.turbulence=none", "autopilot.feedback=ins"], False),
+    ],
+)
+def test_truth_is_shared_when_the_seed_does_not_move_it(overrides: list[str], shared: bool) -> None:
+    assert campaigns._seed_leaves_motion(Scenario.load("u_turn", overrides)) is shared
+
+
+def test_truth_is_not_shared_when_it_is_varied(at_rest: Path) -> None:
+    here, there = (Scenario.load(at_rest, [f"truth.start.alt_m={alt}"]) for alt in (500, 600))
+    assert campaigns._same_motion(here, Scenario.load(at_rest, ["sensors.gnss.rate_hz=1"]))
+    assert not campaigns._same_motion(here, there)
+    on_truth, on_estimate = (Scenario.load("u_turn", [f"autopilot.feedback={name}"]) for name in ("truth", "ins"))
+    assert not campaigns._same_motion(on_truth, on_estimate)
+
+
+# --- the same numbers, however flown
+
+
+def test_two_workers_give_what_one_process_gives(at_rest: Path, tmp_path: Path) -> None:
+    told: list[Progress] = []
+    result = campaign(at_rest, 3, out=tmp_path / "out", workers=2, progress=told.append)
+    assert not result.failures
+    assert [outcome.seed for outcome in result.outcomes] == [11, 12, 13]
+    assert (tmp_path / "out" / "truth" / "t.npy").exists()  # so this compares replay with direct, too
+    for outcome in result.outcomes:
+        assert same(outcome, flown_here(at_rest, outcome.seed))
+    assert (told[0].done, told[-1].done, told[-1].total) == (0, 3, 3)
+    assert not same(result.outcomes[0], result.outcomes[1])
+
+
+def command(*arguments: str) -> tuple[int, str, str]:
+    """Exit code, output and messages of the command line."""
+    result = CliRunner().invoke(app, ["campaign", *arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_varied_values_and_files(at_rest: Path, tmp_path: Path, threads: str) -> None:
+    out = tmp_path / "out"
+    vary = ("--vary", "sensors.gnss.rate_hz=1,5", "--vary", "sensors.gnss.denied=[[68, 72]],[]")
+    code, text, progress = command(str(at_rest), "--runs", "1", *vary, "--scheduler", threads, "--out", str(out))
+    assert code == 0
+    assert "4/4" in progress
+    assert "[[68, 72]]" in text
+    assert "horizontal rms [m]" in text
+    lines = (out / "campaign.csv").read_text().splitlines()
+    assert len(lines) == 1 + 4
+    assert lines[0].startswith("sensors.gnss.rate_hz,sensors.gnss.denied,seed,ins.")
+    stored = json.loads((out / "campaign.json").read_text())
+    assert stored["combinations"][1] == {"sensors.gnss.rate_hz": "1", "sensors.gnss.denied": "[]"}
+    assert {row["combination"] for row in stored["spreads"]} == {0, 1, 2, 3}
+    assert sorted(path.name for path in out.glob("*.png")) == [
+        "distribution_sensors_gnss_denied.png",
+        "distribution_sensors_gnss_rate_hz.png",
+        "errors.png",
+        "nees.png",
+    ]
+    reloaded = campaigns._load(out, 1, 11)
+    assert reloaded is not None
+    assert same(reloaded, flown_here(at_rest, 11, ("sensors.gnss.rate_hz=1", "sensors.gnss.denied=[]")))
+
+
+# --- nothing is lost
+
+
+def test_interrupted_campaign_carries_on(
+    at_rest: Path, tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    flown = Counter(monkeypatch)
+
+    def interrupt(now: Progress) -> None:
+        if now.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        campaign(at_rest, 4, scheduler=threads, out=out, progress=interrupt)
+    assert not (out / "campaign.json").exists()
+    kept = {int(path.stem.split("_s")[1]) for path in (out / "runs").glob("*.json")}
+    assert 1 <= len(kept) <= 2
+    damaged = out / "runs" / f"c000_s{min(kept):06d}.npz"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    time.sleep(1.0)  # until the worker is done with the run it was flying
+
+    flown.seeds.clear()
+    result = campaign(at_rest, 4, scheduler=threads, out=out)
+    assert sorted(flown.seeds) == sorted({11, 12, 13, 14} - kept | {min(kept)})
+    again = next(outcome for outcome in result.outcomes if outcome.seed == min(kept))
+    assert same(again, flown_here(at_rest, again.seed))
+
+    flown.seeds.clear()
+    more = campaign(at_rest, 5, scheduler=threads, out=out)
+    assert flown.seeds == [15]
+    assert len(more.outcomes) == 5
+
+
+def test_failing_run_is_reported_and_stops_no_other(
+    at_rest: Path, tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    flown = Counter(monkeypatch, failing={12})
+    code, _, messages = command(str(at_rest), "--runs", "3", "--scheduler", threads, "--out", str(out))
+    assert code == 1
+    assert "seed 12: ArithmeticError: the filter blew up" in messages
+    stored = json.loads((out / "campaign.json").read_text())
+    assert stored["runs"] == 2
+    assert [f["seed"] for f in stored["failures"]] == [12]
+    assert "in __call__" in stored["failures"][0]["traceback"]
+
+    flown.seeds.clear()
+    flown.failing = set()
+    result = campaign(at_rest, 3, scheduler=threads, out=out)
+    assert flown.seeds == [12]
+    assert not result.failures
+
+
+def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Falls(Kinematic):
+        def __init__(self) -> None:
+            start = {
+                "lat_deg": 10.0,
+                "lon_deg": 9.0,
+                "alt_m": 5.0,
+                "heading_deg": 1.0,
+                "pitch_deg": 2.0,
+                "roll_deg": 3.0,
+            }
+            super().__init__(SimpleNamespace(**start), 200.0)
+            self.failure = "control lost: bank -90 deg"
+
+        def advance(self, ticks: int) -> TruthBlock:
+            return super().advance(ticks if self._tick < 200 else 0)
+
+    monkeypatch.setattr(loop, "motion", lambda scenario, seed: Falls())
+    result = campaign("u_turn", 2, scheduler=threads, out=tmp_path / "gusty")
+    assert not result.outcomes
+    assert [f.message for f in result.failures] == ["the flight ended early: control lost: bank -90 deg"] * 2
+    with pytest.raises(UserError, match="control lost"):
+        campaign("u_turn", 2, overrides=["truth.wind.turbulence=none"], scheduler=threads, out=tmp_path / "calm")
+    assert not (tmp_path / "calm" / "truth").exists()
+
+
+def dask(*arguments: str) -> subprocess.Popen[bytes]:
+    """A scheduler or worker of its own, as a user would start it."""
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "dask", *arguments]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+@pytest.mark.slow
+def test_killed_worker_loses_nothing(at_rest: Path, tmp_path: Path) -> None:
+    address = f"tcp://127.0.0.1:{free_port()}"
+    scheduler = dask("scheduler", "--host", address, "--no-dashboard")
+    worker = ("worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path))
+    workers = [dask(*worker), dask(*worker)]
+    overrides = ["duration_s=200"]
+    told: list[Progress] = []
+
+    def kill_half_way(now: Progress) -> None:
+        told.append(now)
+        if now.done >= 4 and workers[0].poll() is None:
+            workers[0].send_signal(signal.SIGKILL)
+            workers[0].wait()
+
+    try:
+        wait_for(address)
+        result = campaign(
+            at_rest, 8, overrides=overrides, scheduler=address, out=tmp_path / "out", progress=kill_half_way
+        )
+    finally:
+        for process in (*workers, scheduler):
+            process.terminate()
+            process.wait()
+    assert not result.failures
+    assert workers[0].returncode == -signal.SIGKILL
+    assert told[-1].done == 8
+    assert [outcome.seed for outcome in result.outcomes] == list(range(11, 19))
+    for outcome in result.outcomes:
+        assert same(outcome, flown_here(at_rest, outcome.seed, tuple(overrides)))
+
+
+def wait_for(address: str) -> None:
+    """Until both workers are there, so that one of them can be killed at its work."""
+    from distributed import Client
+
+    deadline = time.monotonic() + 30.0
+    while True:
+        try:
+            campaigns._require_scheduler(address)
+            break
+        except UserError:
+            assert time.monotonic() < deadline
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(2, timeout=30)
+
+
+# --- what a user may get wrong
+
+
+def test_folder_of_another_campaign(at_rest: Path, tmp_path: Path, threads: str) -> None:
+    out = tmp_path / "out"
+    campaign(at_rest, 1, scheduler=threads, out=out)
+    with pytest.raises(UserError, match="different overrides: choose another folder with --out"):
+        campaign(at_rest, 1, overrides=["duration_s=79"], scheduler=threads, out=out)
+    at_rest.write_text(AT_REST + "# changed\n")
+    with pytest.raises(UserError, match="different scenario text"):
+        campaign(at_rest, 1, scheduler=threads, out=out)
+    (out / "setup.json").write_text("{")
+    with pytest.raises(UserError, match=r"setup\.json: is damaged"):
+        campaign(at_rest, 1, scheduler=threads, out=out)
+    (out / "setup.json").unlink()
+    with pytest.raises(UserError, match="has runs but no"):
+        campaign(at_rest, 1, scheduler=threads, out=out)
+
+
+def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="can't write here"):
+        campaign(at_rest, 1, out=tmp_path / "file" / "out")
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        ({"seed": ["1", "2"]}, "use --runs"),
+        ({"sensors.gnss.rate_hz": ["1", "1"]}, "each value once"),
+        ({"sensors.gnss.rate_hz": []}, "each value once"),
+        ({"sensors.gnss.rate_hz": ["5", "7"]}, "does not divide"),
+        ({"sensors.gnss.speed": ["5"]}, "unknown key"),
+    ],
+)
+def test_wrong_varied_values(at_rest: Path, tmp_path: Path, vary: dict[str, list[str]], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        campaign(at_rest, 2, vary=vary, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("address", ["localhost", "nonsense://here:1", "tcp://127.0.0.1:port"])
+def test_scheduler_address_that_is_none(at_rest: Path, tmp_path: Path, address: str) -> None:
+    with pytest.raises(UserError, match="give an address like tcp://host:8786"):
+        campaign(at_rest, 1, scheduler=address, out=tmp_path / "out")
+
+
+def test_scheduler_that_does_not_answer(at_rest: Path, tmp_path: Path) -> None:
+    started = time.monotonic()
+    with pytest.raises(UserError, match="nothing answers there"):
+        campaign(at_rest, 1, scheduler=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
+    assert time.monotonic() - started < 6.0
+
+
+def test_scheduler_without_workers(at_rest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(campaigns, "WORKER_WAIT_S", 0.5)
+    with in_this_process(0) as cluster, pytest.raises(UserError, match="has no workers"):
+        campaign(at_rest, 1, scheduler=cluster.scheduler_address, out=tmp_path / "out")
+
+
+# --- statistics
+
+
+def test_nees_bounds_are_those_of_the_tables() -> None:
+    # Chi-square with 150 degrees of freedom: 117.985 and 185.800 at 2.5 and 97.5 % (NIST/SEMATECH e-Handbook, 1.3.6.7.4
+    # gives 100: 74.222 and 129.561).
+    np.testing.assert_allclose(campaign_report.nees_bounds(50) * 150, [117.985, 185.800], atol=1e-3)
+    # Three degrees of freedom for a single run: 0.216 and 9.348.
+    np.testing.assert_allclose(campaign_report.nees_bounds(1) * 3, [0.216, 9.348], atol=1e-3)
+
+
+def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float = 1.0) -> Outcome:
+    """A run of a filter whose covariance is too small by the square of ``claim``."""
+    error = rng.normal(size=(400, 3))
+    history = {
+        "time": np.arange(400.0),
+        "outage": np.r_[np.zeros(100), np.ones(100), np.zeros(200)],
+        "ins.error": np.hypot(error[:, 0], error[:, 1]),
+        "ins.sigma": np.full(400, math.sqrt(2.0)),
+        "ins.nees": np.where(np.arange(400) < 10, np.nan, (error**2).sum(axis=1) / 3 * claim**2),
+    }
+    metrics = {
+        "ins.position_horizontal_max_m": 1.0 + seed,
+        "ins.position_horizontal_rms_m": float(seed),
+        "ins.false_alarms_per_h": float(seed % 2),
+    }
+    metrics |= {"ins.detection_delay_s.jump": 0.1 * seed, "ins.coverage.jump": 1 - 0.01 * seed}
+    if seed != 4:
+        metrics["ins.recovery_s"] = 10.0 - seed
+    return Outcome(combination, seed, metrics, history)
+
+
+def made_up_campaign(tmp_path: Path, values: list[str], runs: int = 30) -> campaigns.CampaignResult:
+    scenario: Any = SimpleNamespace(estimator=[SimpleNamespace(name="ins", attitude_only=False)])
+    combinations = [Combination({"wind": value} if value else {}, scenario) for value in values]
+    rng = np.random.default_rng(2)
+    outcomes = [made_up(i, seed, rng, 1.0 + i) for i in range(len(values)) for seed in range(runs)]
+    statistics = campaign_report.statistics(combinations, outcomes)
+    return campaigns.CampaignResult(tmp_path, combinations, outcomes, [Failure(0, 99, "lost")], statistics)
+
+
+def test_statistics(tmp_path: Path) -> None:
+    statistics = made_up_campaign(tmp_path, ["0", "5"]).statistics
+    first, second = statistics.consistency
+    assert first.nees == pytest.approx(1.0, abs=0.05)
+    assert first.inside == pytest.approx(0.95, abs=0.04)
+    assert first.lower < 1.0 < first.upper
+    assert second.nees == pytest.approx(4.0, abs=0.2)
+    assert second.inside == 0.0
+    assert first.false_alarms_per_h == pytest.approx(0.5)
+    rms = next(s for s in statistics.spreads if s.metric == "position_horizontal_rms_m")
+    assert (rms.median, rms.worst, rms.worst_seed, rms.runs) == (14.5, 29.0, 29, 30)
+    assert rms.p95 == pytest.approx(0.95 * 29)
+    recovery = next(s for s in statistics.spreads if s.metric == "recovery_s")
+    assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
+    delay = next(s for s in statistics.spreads if s.metric == "detection_delay_s.jump")
+    assert (delay.worst, delay.worst_seed) == (pytest.approx(2.9), 29)
+    coverage = next(s for s in statistics.spreads if s.metric == "coverage.jump")  # little is bad
+    assert (coverage.worst, coverage.worst_seed) == (pytest.approx(0.71), 29)
+    assert coverage.p95 == pytest.approx(1 - 0.95 * 0.29)
+    shown = "".join(str(cell) for cell in campaign_report.tables(made_up_campaign(tmp_path, ["0"]))[0].columns[1].cells)
+    assert "jump: detected after \\[s]" in shown
+
+
+def test_history_is_the_error_once_a_second() -> None:
+    dataset = synthetic_run.dataset(100.0, denied=((40.0, 50.0),))
+    history = campaigns._history(dataset)
+    np.testing.assert_allclose(history["time"], np.arange(101.0))
+    np.testing.assert_array_equal(np.flatnonzero(history["outage"]), np.arange(40, 51))  # the fix comes at 50.1 s
+    assert np.flatnonzero(np.isfinite(history["ins.error"]))[0] == 5
+    assert np.flatnonzero(np.isfinite(history["ins.nees"]))[0] == 65
+    errors = metrics.errors(dataset, "ins")
+    row = int(np.argmin(np.abs(errors.t - 77.0)))
+    assert history["ins.error"][77] == pytest.approx(math.hypot(*errors.position[row, :2]))
+    assert history["ins.sigma"][77] == pytest.approx(math.sqrt(2.0))
+
+
+@pytest.mark.parametrize("values", [[""], ["0", "5"], ["0", "1", "2", "3", "4", "5", "6"]])
+def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
+    result = made_up_campaign(tmp_path, values, runs=5)
+    drawn = campaign_report.figures(result)
+    assert set(drawn) == {"errors", "nees", "distribution" if values == [""] else "distribution_wind"}
+    for figure in drawn.values():
+        figure.canvas.draw()
+    panels = drawn["nees"].axes
+    assert panels[0].get_ylabel() == "position NEES / dof"
+    assert len(panels[0].get_lines()) == 1 + len(values)
+
+
+def test_nothing_flown_draws_nothing(tmp_path: Path) -> None:
+    result = made_up_campaign(tmp_path, [""], runs=0)
+    campaign_report.save(result)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["campaign.csv", "campaign.json"]
+    assert json.loads((tmp_path / "campaign.json").read_text())["failures"][0]["message"] == "lost"
+
+
+def test_outages_that_differ_between_runs_are_not_shaded(tmp_path: Path) -> None:
+    result = made_up_campaign(tmp_path, [""], runs=2)
+    assert campaign_report._outages(result) == [(100.0, 200.0)]
+    result.outcomes[1].history["outage"][150:] = 1.0
+    assert campaign_report._outages(result) == []
+
+
+def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
+    result = made_up_campaign(tmp_path, [""], runs=3)
+    history = result.outcomes[0].history
+    result.outcomes[0] = Outcome(0, 0, result.outcomes[0].metrics, {k: v[:150] for k, v in history.items()})  # type: ignore[index]
+    mean, runs = campaign_report.nees_mean(result.outcomes, "ins")
+    assert (runs[149], runs[150], len(mean)) == (3, 2, 400)
+    assert np.isfinite(mean[10:]).all()
+    assert campaign_report._outages(result) == [(100.0, 200.0)]
+    drawn = campaign_report.figures(result)["errors"]
+    assert drawn.axes[0].get_lines()[0].get_xdata()[-1] == 399.0

@@ -1,0 +1,186 @@
+"""The airframe: trims, modes, propulsion, actuators. Oracles are textbook formulas on the published derivatives."""
+
+from __future__ import annotations
+
+import math
+from array import array
+
+import numpy as np
+import pytest
+
+from testbed.motion.flight import CALM, FOOT, POUND, Aircraft, modes, modes_table
+from testbed.motion.guidance import climb_limit, descent_limit
+from testbed.motion.sections import Start
+
+AIRSPEEDS = [20.0, 22.5, 25.0, 27.5, 30.0, 32.5, 35.0]
+# Wing area, span, chord [m], mass [kg], inertias [kg m^2].
+S, B, C, MASS = 0.55, 2.8956, 0.189941, 13.5
+JX, JY, JZ, JXZ = 0.8244, 1.135, 1.759, 0.1204
+
+
+@pytest.fixture(scope="module")
+def aircraft() -> Aircraft:
+    return Aircraft("loiter", 200.0)
+
+
+def level(alt: float, airspeed: float) -> Start:
+    return Start(lat_deg=0.0, lon_deg=0.0, alt_m=alt, heading_deg=0.0, airspeed_mps=airspeed)
+
+
+def values(aircraft: Aircraft, *names: str) -> list[float]:
+    return [aircraft.fdm[name] for name in names]
+
+
+def climbing(aircraft: Aircraft, airspeed: float, alt: float, seconds: float, rate: float = 0.0) -> None:
+    """Fly on the inner loops with the altitude command rising at ``rate``."""
+    for tick in range(round(seconds * 20)):
+        aircraft.command(0.0, alt + rate * tick / 20, rate, airspeed)
+        aircraft.run(10, array("d"))
+
+
+@pytest.mark.parametrize("airspeed", AIRSPEEDS)
+@pytest.mark.parametrize("alt", [50.0, 800.0])
+def test_trims(aircraft: Aircraft, airspeed: float, alt: float) -> None:
+    aircraft.start(level(alt, airspeed), CALM)
+    accelerations = values(aircraft, *(f"accelerations/{axis}dot-ft_sec2" for axis in "uvw"))
+    angular = values(aircraft, *(f"accelerations/{axis}dot-rad_sec2" for axis in "pqr"))
+    assert np.abs(accelerations).max() * FOOT < 0.02
+    assert np.abs(angular).max() < 0.02
+    assert aircraft.fdm["velocities/vt-fps"] * FOOT == pytest.approx(airspeed, abs=0.05)
+    assert aircraft.fdm["position/geod-alt-ft"] * FOOT == pytest.approx(alt, abs=1e-3)
+    elevator, throttle = values(aircraft, "fcs/elevator-pos-rad", "fcs/throttle-pos-norm")
+    assert abs(elevator) < 0.9 * 0.52
+    assert 0.1 < throttle < 0.8
+    # Lift carries the weight: an independent sum of the published lift curve below the stall.
+    alpha = aircraft.fdm["aero/alpha-rad"]
+    q = 0.5 * aircraft.fdm["atmosphere/rho-slugs_ft3"] * 515.378818 * airspeed**2
+    lift = q * S * (0.23 + 5.6106 * alpha + 0.13 * elevator)
+    thrust = aircraft.fdm["propulsion/engine/thrust-lbs"] * 4.4482216
+    assert lift + thrust * math.sin(alpha) == pytest.approx(MASS * 9.80, rel=0.03)
+
+
+def test_mass_and_inertia_are_the_published_ones(aircraft: Aircraft) -> None:
+    aircraft.start(level(800.0, 25.0), CALM)
+    mass, *inertia = values(aircraft, "inertia/mass-slugs", *(f"inertia/i{a}-slugs_ft2" for a in ("xx", "yy", "zz")))
+    assert mass * 14.593903 == pytest.approx(MASS, rel=1e-3)
+    assert np.array(inertia) * 1.3558179 == pytest.approx([JX, JY, JZ], rel=1e-3)
+
+
+@pytest.mark.parametrize("airspeed", AIRSPEEDS)
+def test_modes_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
+    found = {mode.name: mode for mode in modes(airspeed, 0.0)}
+    for mode in found.values():
+        assert mode.eigenvalue.real < 0
+    assert found["spiral"].time_constant > 15  # slow, or there would be too much dihedral
+    q, half = 0.5 * 1.225 * airspeed**2, 2 * airspeed
+    # Roll subsidence, p alone.
+    assert found["roll"].eigenvalue.real == pytest.approx(-0.5051 * q * S * B**2 / half / JX, rel=0.2)
+    # Short period, second order in (alpha, q).
+    z_w = -q * S * 5.6106 / (MASS * airspeed)
+    m_alpha, m_q, m_adot = (q * S * C / JY * k for k in (-2.7397, -38.2067 * C / half, -10.3796 * C / half))
+    short = found["short period"]
+    assert abs(short.eigenvalue) == pytest.approx(math.sqrt(z_w * m_q - m_alpha), rel=0.2)
+    assert -2 * short.eigenvalue.real == pytest.approx(-(z_w + m_q + m_adot), rel=0.2)
+    # Lanchester's phugoid.
+    assert abs(found["phugoid"].eigenvalue) == pytest.approx(math.sqrt(2) * 9.8 / airspeed, rel=0.2)
+    # Dutch roll as weathercock oscillation.
+    n_beta = 0.0726 * q * S * B / JZ
+    assert abs(found["Dutch roll"].eigenvalue) == pytest.approx(math.sqrt(n_beta), rel=0.35)
+    assert 0.05 < found["Dutch roll"].damping < 0.7
+
+
+def test_modes_table_is_complete() -> None:
+    table = modes_table([25.0]).splitlines()
+    assert len(table) == 2 + 5
+    assert all(row.count("|") == 7 for row in table)
+
+
+def test_short_period_and_phugoid_are_seen_in_flight(aircraft: Aircraft) -> None:
+    """The linearisation against a flight of the bare airframe: kicked in pitch, hands off."""
+    aircraft = Aircraft("loiter", 200.0)
+    aircraft.start(level(800.0, 25.0), CALM)
+    fdm = aircraft.fdm
+    for surface, travel in {"aileron": 0.35, "elevator": 0.52, "rudder": 0.35}.items():
+        fdm[f"fcs/{surface}-cmd-norm"] = fdm[f"fcs/{surface}-pos-rad"] / travel
+    fdm["fcs/throttle-cmd-norm"] = fdm["fcs/throttle-pos-norm"]
+    fdm["ap/engaged"], fdm["ap/hold"] = 0.0, -1.0
+    fdm["fcs/elevator-cmd-norm"] -= 0.03
+    aircraft.run(200, array("d"))
+    fdm["fcs/elevator-cmd-norm"] += 0.03
+    speed = []
+    for _ in range(200 * 40):
+        fdm.run()
+        speed.append(fdm["velocities/vt-fps"])
+    swing = np.array(speed) - np.mean(speed)
+    crossings = np.flatnonzero((swing[:-1] < 0) & (swing[1:] >= 0)) / 200
+    phugoid = next(mode for mode in modes(25.0) if mode.name == "phugoid")
+    assert np.diff(crossings).mean() == pytest.approx(phugoid.period, rel=0.1)
+
+
+def test_thrust_falls_with_airspeed(aircraft: Aircraft) -> None:
+    """At the same throttle, in the same air."""
+    thrusts = []
+    for airspeed in (20.0, 25.0, 30.0, 35.0):
+        aircraft.start(level(100.0, airspeed), CALM)
+        aircraft.linearise()  # freezes the airframe and hands the throttle over
+        aircraft.fdm["fcs/throttle-cmd-norm"] = 0.8
+        aircraft.run(1000, array("d"))
+        thrusts.append(aircraft.fdm["propulsion/engine/thrust-lbs"] * 4.4482216)
+        for integrator, number in {"rate/rotational": 3, "rate/translational": 3}.items():
+            aircraft.fdm[f"simulation/integrator/{integrator}"] = number
+        aircraft.fdm["simulation/integrator/position/rotational"] = 7
+        aircraft.fdm["simulation/integrator/position/translational"] = 4
+    assert np.all(np.diff(thrusts) < -2.0)
+    assert 10 < thrusts[-1] < thrusts[0] < 60
+
+
+def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
+    """Full throttle at low altitude: power and fuel flow of the published table within a fifth."""
+    fdm = aircraft.fdm
+    aircraft.start(level(30.0, 35.0), CALM)
+    climbing(aircraft, 60.0, 30.0, 8.0)
+    rpm, hp, pps = values(
+        aircraft, "propulsion/engine/engine-rpm", "propulsion/engine/power-hp", "propulsion/engine/fuel-flow-rate-pps"
+    )
+    assert fdm["fcs/throttle-pos-norm"] == 1.0
+    assert 6500 < rpm < 8500
+    power = np.interp(rpm, [6000, 7000], [1193.81, 1429.42]) / 745.7
+    assert hp == pytest.approx(power, rel=0.2)
+    assert pps * POUND * 3600 == pytest.approx(np.interp(rpm, [6000, 7000], [0.337, 0.408]), rel=0.2)
+
+
+def test_climbs_as_the_plan_check_believes(aircraft: Aircraft) -> None:
+    for airspeed, alt in [(21.0, 100.0), (25.0, 100.0), (32.0, 100.0), (27.0, 2500.0), (34.0, 2500.0)]:
+        for rate in (climb_limit(airspeed, alt), -descent_limit(airspeed, alt)):
+            aircraft.start(level(alt, airspeed), CALM)
+            climbing(aircraft, airspeed, alt, 40.0, rate)
+            height, speed, throttle = values(
+                aircraft, "position/geod-alt-ft", "velocities/vt-fps", "fcs/throttle-pos-norm"
+            )
+            assert height * FOOT - (alt + rate * 40) == pytest.approx(0.0, abs=2.0)
+            assert speed * FOOT == pytest.approx(airspeed, abs=1.5)
+            assert throttle < 0.99
+
+
+def test_actuators_lag_and_keep_to_rate_and_travel(aircraft: Aircraft) -> None:
+    aircraft = Aircraft("loiter", 200.0)
+    aircraft.start(level(800.0, 25.0), CALM)
+    fdm = aircraft.fdm
+    fdm["ap/engaged"], fdm["ap/hold"] = 0.0, -1.0
+    fdm.run()
+
+    def respond(command: float) -> np.ndarray:
+        fdm["fcs/aileron-cmd-norm"] = command
+        seen = []
+        for _ in range(60):
+            fdm.run()
+            seen.append(fdm["fcs/aileron-pos-rad"])
+        return np.array(seen)
+
+    respond(0.0)
+    large = respond(5.0)
+    assert large.max() == pytest.approx(0.35)
+    assert np.diff(large).max() == pytest.approx(3.5 / 200, rel=1e-6)
+    respond(0.0)
+    small = respond(0.02) / (0.02 * 0.35)
+    assert small[7] == pytest.approx(1 - math.exp(-25 * 8 / 200), abs=0.08)  # a lag of 40 ms

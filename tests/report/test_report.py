@@ -1,0 +1,173 @@
+"""The report is written for every kind of run, holds all that it shows, and loses no peak."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_hex
+from rich.console import Console
+from worlds import synthetic_run
+from worlds.synthetic_run import Errors, circle, scenario
+
+from testbed.data import is_result
+from testbed.errors import UserError
+from testbed.record.recorder import Recorder
+from testbed.report import page as report
+from testbed.score import metrics
+from testbed.sensors.faults import FaultTruth
+
+DENIED = ((40.0, 70.0),)
+BAD = Errors(drift_mps=300.0)
+RUNS: dict[str, dict[str, Any]] = {
+    "outage": {"duration_s": 120.0, "estimators": {"ins": Errors(), "dead_reckoning": BAD}, "denied": DENIED},
+    "no outage": {"duration_s": 100.0},
+    "no gnss": {"duration_s": 100.0, "gnss": False},
+    "never aligned": {"duration_s": 20.0, "estimators": {"ins": Errors(aligned_after=1e9)}},
+    "short": {"duration_s": 6.0},
+    "shortest": {"duration_s": 0.0},
+    "turns nan": {"duration_s": 100.0, "estimators": {"ins": Errors(nan_from=80.0)}},
+    "no estimator": {"duration_s": 20.0, "estimators": {}},
+    "denied to the end": {"duration_s": 100.0, "denied": ((70.0, 1e9),)},
+}
+
+
+def printed(found: dict[str, float]) -> str:
+    out = io.StringIO()
+    Console(file=out, width=160).print(report.summary_table(found))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> None:
+    run = synthetic_run.dataset(**RUNS[kind])
+    found = metrics.compute(run)
+    page = report.write_report(run, found, tmp_path)
+    text = page.read_text(encoding="utf-8")
+    images = sorted(p.name for p in tmp_path.glob("*.png"))
+    assert {"flight.png", "ground_track.png"} <= set(images)
+    assert all(is_result(path.name) for path in tmp_path.iterdir()), "the next run would leave it there"
+    assert text.count("data:image/png;base64,") == len(images)
+    assert not re.findall(r"(?:src|href)='(?!data:)", text)
+    assert "A made-up circle" in text
+    assert ("never aligned" in text) == (kind in ("never aligned", "shortest"))
+    assert printed(found)
+    if kind == "outage":
+        for name in ("ins", "dead_reckoning"):
+            for what in ("position_errors", "motion_errors", "biases", "innovations"):
+                assert f"{name}_{what}.png" in images
+        assert {"comparison.png", "attitude.png", "wind.png", "nees.png"} <= set(images)
+
+
+def test_a_body_at_rest(tmp_path: Path) -> None:
+    recorder = Recorder(None, scenario(100.0), 1)
+    truth = circle(100.0)
+    for name in ("lat", "lon", "h"):
+        getattr(truth, name)[:] = getattr(truth, name)[0]
+    truth.v_n[:] = 0.0
+    truth.airspeed[:] = 0.0
+    synthetic_run.record(recorder, truth, {"ins": Errors()})
+    page = report.write_report(recorder.dataset(), {}, tmp_path)
+    images = {path.name for path in tmp_path.glob("*.png")}
+    assert {"flight.png", "ground_track.png", "ins_position_errors.png"} <= images
+    assert page.read_text(encoding="utf-8").count("data:image/png;base64,") == len(images)
+
+
+def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
+    recorder = Recorder(None, scenario(120.0), 1)
+    named = {"jump": ("gnss", 80.0), "rise": ("barometer", 85.0), "unseen": ("airspeed", 70.0)}
+    recorder.faults([FaultTruth(n, s, "x", "step", t, t + 20, 3.0, "m") for n, (s, t) in named.items()])
+    synthetic_run.record(recorder, circle(120.0), {"ins": Errors(aligned_after=0.0)})
+    run = recorder.dataset()
+    for aid, weight in (("gnss_position", 0.0), ("barometer", 1.0)):
+        reports = run[f"estimators/ins/innovations/{aid}"]
+        t = reports["sample_time"].values
+        reports["weight"].values[(t > 82 - 1e-6) & (t < 105)] = weight
+    found = metrics.compute(run)
+    page = report.write_report(run, found, tmp_path).read_text()
+    rows = re.findall(r"<tr><td>(.*?)</td></tr>", page)
+    cells = {row.partition(":")[0]: row.split("</td><td>")[1:] for row in rows if ": " in row}
+    assert cells["jump"] == ["ins", "2.0", "90%", "5.0", "yes"]  # velocity was used all the time, position was not
+    assert cells["rise"] == ["ins", "missed", "0%", "0.0", "no"]
+    assert cells["unseen"][0] == "none looked"
+    assert "gnss x step 3 m, 80 to 100 s" in page
+    table = report.fault_table(found)
+    out = io.StringIO()
+    Console(file=out, width=160).print(table)
+    assert re.search(r"jump\W+ins\W+2\.0\W+90%", out.getvalue())
+    assert "detected after [s]" in out.getvalue()
+    assert report.fault_table({"ins.position_horizontal_rms_m": 1.0}) is None
+    figure = report.innovations(report._Run(run), "ins")
+    assert figure is not None
+    shaded = [
+        ax.get_title(loc="left").partition(":")[0]
+        for ax in figure.axes
+        for patch in ax.patches
+        if to_hex(patch.get_facecolor()).upper() == report.FAULT
+    ]
+    assert shaded == ["gnss_position", "gnss_velocity", "barometer"]
+
+
+def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
+    run = synthetic_run.dataset(300.0)
+    clean = report._imu_error(report._Run(run), "ins")
+    increments = run["sensors/imu/dtheta"].values
+    increments[200 * 100 : 200 * 100 + 3] = [[np.nan] * 3, [np.inf, 0, 0], [1e300, 0, 0]]
+    broken = report._imu_error(report._Run(run), "ins")
+    assert clean is not None
+    assert broken is not None
+    apart = np.abs(broken[0] - 100.0) > 31
+    np.testing.assert_allclose(broken[1][apart], clean[1][apart], atol=1e-9)
+    assert np.isnan(broken[1][np.abs(broken[0] - 100.0) < 29]).all()
+
+
+def test_table_sets_gnss_and_outage_side_by_side() -> None:
+    found = metrics.compute(synthetic_run.dataset(**RUNS["outage"])) | {"run.wall_s": 2.0, "run.realtime_factor": 60.0}
+    text = printed(found)
+    assert "horizontal position error, RMS [m]" in text
+    assert "60 times real time" in text
+    row = next(line for line in text.splitlines() if "horizontal position error, largest" in line)
+    cells = [float(c) for c in row.split("│")[2:6]]
+    keys = [f"{n}.{p}position_horizontal_max_m" for n in ("ins", "dead_reckoning") for p in ("", "outage_")]
+    np.testing.assert_allclose(cells, [found[key] for key in keys], rtol=0.01)
+
+
+def test_an_interrupted_run_says_so(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run.nc", scenario(60.0), 1)
+    recorder.truth(circle(20.0))
+    text = report.write_report(recorder.dataset(), {}, tmp_path).read_text(encoding="utf-8")
+    recorder.close()
+    assert "did not end" in text
+
+
+def test_thinning_keeps_every_peak_and_every_gap() -> None:
+    t = np.arange(100_000.0)
+    y = np.random.default_rng(0).normal(size=t.size)
+    y[12_345], y[77_777] = 50.0, -50.0
+    y[40_000:50_000] = np.nan
+    t_thin, y_thin = report.thin(t, y)
+    assert len(t_thin) <= 2.2 * report.BINS
+    assert (np.diff(t_thin) >= 0).all()
+    assert {12_345.0, 77_777.0} <= set(t_thin)
+    inside = (t_thin > 40_200) & (t_thin < 49_800)
+    assert inside.any()
+    assert np.isnan(y_thin[inside]).all()
+    np.testing.assert_array_equal(y_thin, y[t_thin.astype(int)])
+
+
+def test_scenario_text_cannot_break_the_page(tmp_path: Path) -> None:
+    recorder = Recorder(None, scenario(5.0), 1)
+    recorder.truth(circle(5.0))
+    recorder.event(1.0, "info", "</table><script>alert(1)</script>")
+    text = report.write_report(recorder.dataset(), {}, tmp_path).read_text(encoding="utf-8")
+    assert "<script>" not in text
+
+
+def test_unwritable_folder_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="can't write the report"):
+        report.write_report(synthetic_run.dataset(5.0), {}, tmp_path / "file")

@@ -1,0 +1,74 @@
+"""Barometer and airspeed."""
+
+import numpy as np
+import pytest
+from worlds.sensor_truth import RATE_HZ, lively, still
+
+from testbed.sensors.airspeed import Airspeed, AirspeedConfig
+from testbed.sensors.barometer import Barometer, BarometerConfig
+
+
+def pressures(config, truth, seed=1, rate_hz=RATE_HZ):
+    return np.array([s.pressure for s in Barometer("barometer", config, rate_hz, seed).sense(truth)])
+
+
+def speeds(config, truth, seed=1, rate_hz=RATE_HZ):
+    return np.array([s.eas for s in Airspeed("airspeed", config, rate_hz, seed).sense(truth)])
+
+
+def test_perfect_barometer_is_truth_bit_for_bit():
+    truth = lively(1000)
+    samples = Barometer("barometer", BarometerConfig(grade="perfect", rate_hz=20.0, latency_s=0.02), RATE_HZ, 1).sense(
+        truth
+    )
+    assert [s.pressure for s in samples] == truth.pressure[::10].tolist()
+    assert [s.t for s in samples] == truth.t[::10].tolist()
+    np.testing.assert_allclose([s.t_arrival - s.t for s in samples], 0.02, atol=1e-12)
+
+
+def test_barometer_errors():
+    truth = still(200_000, 10.0)
+    noise = pressures(BarometerConfig(grade="perfect", noise_pa=2.0), truth, rate_hz=10.0) - 101_325
+    assert noise.std() == pytest.approx(2.0, rel=0.01)
+    drift = pressures(BarometerConfig(grade="perfect", drift_pa=10.0, drift_time_s=10.0), truth, rate_hz=10.0) - 101_325
+    assert drift.std() == pytest.approx(10.0, rel=0.1)  # 2000 correlation times: 2.2 %
+    assert np.corrcoef(drift[100:], drift[:-100])[0, 1] == pytest.approx(np.exp(-1), abs=0.1)
+    start = truth.rows(0, 1)
+    bias = [pressures(BarometerConfig(grade="perfect", bias_pa=50.0), start, s, 10.0)[0] - 101_325 for s in range(3000)]
+    assert np.std(bias) == pytest.approx(50.0, rel=0.05)
+    assert abs(np.mean(bias)) < 3.5 * 50 / np.sqrt(3000)
+
+
+def test_perfect_airspeed_is_equivalent_airspeed_along_the_tube():
+    truth = lively(1000)
+    expected = truth.airspeed * np.cos(truth.alpha) * np.cos(truth.beta) * np.sqrt(truth.density / 1.225)
+    np.testing.assert_allclose(speeds(AirspeedConfig(grade="perfect", rate_hz=20.0), truth), expected[::10], rtol=1e-14)
+
+
+def flying(n, rate_hz=RATE_HZ):
+    truth = still(n, rate_hz)
+    truth.airspeed[:] = 25.0
+    return truth
+
+
+def test_airspeed_errors():
+    truth = flying(50_000)
+    config = AirspeedConfig(grade="perfect", rate_hz=RATE_HZ, noise_pa=2.0)
+    assert speeds(config, truth).std() == pytest.approx(config.errors().noise, rel=0.02)
+    start = truth.rows(0, 1)
+    for config, sigma in [
+        (AirspeedConfig(grade="perfect", bias_pa=3.0), 3.0 / (1.225 * 25.0)),
+        (AirspeedConfig(grade="perfect", scale_percent=1.0), 0.005 * 25.0),
+    ]:
+        errors = np.array([speeds(config, start, seed)[0] - 25.0 for seed in range(3000)])
+        assert errors.std() == pytest.approx(sigma, rel=0.05)
+        assert config.errors().bias + 25.0 * config.errors().scale == pytest.approx(sigma)
+
+
+def test_no_negative_airspeed_and_no_nan_on_the_ground():
+    eas = speeds(AirspeedConfig(rate_hz=RATE_HZ), still(5000))
+    assert np.isfinite(eas).all()
+    assert eas.min() == 0.0
+    backwards = flying(10)
+    backwards.alpha[:] = np.pi
+    assert not speeds(AirspeedConfig(grade="perfect"), backwards).any()

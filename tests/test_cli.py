@@ -1,0 +1,410 @@
+"""The command line: what it prints, where it writes, and how it ends."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+import testbed.__main__ as cli
+from testbed.data import data_dir
+from testbed.errors import UserError
+from testbed.loop import loop
+from testbed.many import progress
+from testbed.motion import flight
+from testbed.record import recorder as record
+
+QUICK = ["--set", "duration_s=3", "--no-report"]
+PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "watch"}
+
+
+class Ended:
+    """How a command ended."""
+
+    def __init__(self, code: int, out: str, err: str) -> None:
+        self.code, self.out, self.err = code, out, err
+
+
+Testbed = Callable[..., Ended]
+
+
+@pytest.fixture
+def testbed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Testbed:
+    """Runs a command in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str | Path) -> Ended:
+        monkeypatch.setattr(sys, "argv", ["testbed", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        captured = capsys.readouterr()
+        return Ended(int(ended.value.code or 0), captured.out, captured.err)
+
+    return command
+
+
+def python(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=cwd, timeout=60)
+
+
+# --- what is there
+
+
+def test_help_names_every_command(testbed: Testbed) -> None:
+    shown = testbed("--help").out
+    assert {word for word in PROMISED if f"  {word}" in shown} == PROMISED
+
+
+def test_scenarios_lists_name_title_and_duration(testbed: Testbed) -> None:
+    shown = testbed("scenarios")
+    assert shown.code == 0
+    for path in data_dir("scenarios").glob("*.toml"):
+        assert path.stem in shown.out
+    assert "A U-turn with all sensors healthy" in shown.out
+    assert "200 s" in shown.out
+
+
+def test_version(testbed: Testbed) -> None:
+    shown = testbed("--version")
+    assert (shown.code, shown.out.split()[0]) == (0, "testbed")
+    assert shown.out.split()[1][0].isdigit()
+
+
+def test_start_up_imports_nothing_heavy() -> None:
+    code = """
+import sys, testbed.__main__ as cli
+sys.argv = ["testbed", "scenarios"]
+try:
+    cli.main()
+except SystemExit:
+    pass
+heavy = {"numpy", "numba", "scipy", "jsbsim", "pymavlink", "matplotlib", "xarray", "h5py", "distributed"}
+print("heavy:", sorted(heavy & sys.modules.keys()))
+"""
+    shown = python("-c", code).stdout
+    assert "u_turn" in shown
+    assert shown.splitlines()[-1] == "heavy: []"
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["scenarios"]])
+def test_start_up_is_quick(arguments: list[str]) -> None:
+    def processor_s() -> float:  # wall time says more of the machine's other work
+        times = os.times()
+        return times.children_user + times.children_system
+
+    before = processor_s()
+    python("-m", "testbed", *arguments)
+    assert processor_s() - before < 1.0
+
+
+# --- what goes wrong ends with one message and code 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["run", "uturn"], "testbed: uturn: no such file and no shipped scenario of that name: did you mean u_turn?"),
+        (["run", "none.toml"], "testbed: none.toml: no such file"),
+        (["run", "."], "testbed: .: is a folder"),
+        (["run", "u_turn", "--set", "seed"], "testbed: --set seed: give it as key=value"),
+        (["run", "u_turn", "--set", "sed=3"], "(--set sed=3): sed: unknown key: did you mean seed?"),
+        (["run", "u_turn", "--realtime", "0"], "testbed: --realtime 0: the factor must be above 0"),
+        (["run", "u_turn", "--realtime", "nan"], "testbed: --realtime nan: the factor must be above 0"),
+        (["run", "u_turn", "--seed", "-1"], "--seed"),
+        (["run", "u_turn", "--seed", "x"], "--seed"),
+        (["run", "u_turn", "--seed", "99999999999999999999"], "--seed"),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:a.tlog", "--estimator", "inz"],
+            "testbed: --estimator inz: the scenario has no such estimator: choose from ins",
+        ),
+        (["run", "u_turn", "--estimator", "inz"], "testbed: --estimator inz: the scenario has no such estimator"),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:a.tlog", "--set", "estimator=[]", "--set", "expect={}"],
+            "testbed: the scenario has no [[estimator]], so a link has nothing to show: add one",
+        ),
+        (
+            ["run", "u_turn", "--mavlink", "tlog:runs/u_turn/../u_turn/run.nc"],
+            "testbed: tlog:runs/u_turn/../u_turn/run.nc: a result of the run goes there: give the log another name",
+        ),
+        (["run", "u_turn", "--mavlink", "tlog:o/report.html", "--out", "o"], "a result of the run goes there"),
+        (["run", "u_turn", "--mavlink", "udp"], "testbed: udp: not a MAVLink address"),
+        (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-key", " "], "testbed: --mavlink-key: is empty"),
+        (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-identity", "apm"], "choose from px4, ardupilot"),
+        (["run", "u_turn", "--mavlink", "udpout:127.0.0.1:99999"], "testbed: udpout:127.0.0.1:99999: no port number"),
+        (["run", "u_turn", "--mavlink-readonly"], "testbed: --mavlink-readonly: there is no link: add --mavlink URL"),
+        (["run", "u_turn", "--bogus"], "No such option"),
+        (["run"], "Missing argument"),
+        (["check", "u_turn", "uturn"], "testbed: uturn: no such file"),
+        (["check", "u_turn", "./u_turn"], "testbed: ./u_turn: no such file"),
+        (["check", "u_turn", "u_turn"], "testbed: u_turn: there is another scenario of that name among these"),
+        (["check", "--golden", "none"], "testbed: --golden none: no such folder: make it with --update"),
+        (["check", "--update"], "testbed: --update: there is no tests/golden here: say with --golden DIR where"),
+        (["check", "u_turn", "--junit", "none/check.xml"], "testbed: --junit none/check.xml: there is no folder none"),
+        (["report", "none.nc"], "testbed: none.nc: no such file"),
+        (["report", "."], "testbed: .: is a folder"),
+        (["export", "none.nc", "--format", "csv"], "testbed: none.nc: no such file"),
+        (["export", "none.nc", "--format", "xls"], "'xls'"),
+        (["campaign", "u_turn", "--runs", "0"], "--runs"),
+        (["campaign", "u_turn", "--runs", "2", "--vary", "seed"], "testbed: --vary seed: give it as key=a,b,c"),
+        (["campaign", "u_turn", "--runs", "2", "--set", "sed=3"], "(--set sed=3): sed: unknown key"),
+        (["campaign", "uturn", "--runs", "2"], "testbed: uturn: no such file"),
+        (["fly"], "No such command"),
+    ],
+)
+def test_user_mistakes(testbed: Testbed, tmp_path: Path, arguments: list[str], says: str) -> None:
+    ended = testbed(*arguments)
+    assert ended.code == 2
+    assert says in ended.err
+    assert "Traceback" not in ended.err
+    assert list(tmp_path.iterdir()) == [], "something was written"
+
+
+def test_every_mistake_of_a_file_is_a_line(testbed: Testbed, tmp_path: Path) -> None:
+    text = (data_dir("scenarios") / "u_turn.toml").read_text("utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace("seed = 1", "seed = true").replace("lat_deg = 47", "lat_deg = 91"))
+    ended = testbed("run", "mine.toml")
+    assert ended.code == 2
+    assert ended.err.splitlines() == [
+        "testbed: mine.toml:6: seed: must be a whole number, not true",
+        "testbed: mine.toml:14: truth.start.lat_deg: must be less than 85, not 91.0",
+    ]
+
+
+def test_an_unwritable_folder_is_refused_before_the_run(testbed: Testbed, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for folder in ("file", "file/below", "/proc/testbed"):
+        ended = testbed("run", "u_turn", "--out", folder)
+        assert ended.code == 2
+        assert ended.err.startswith(f"testbed: {folder}: can't be written: ")
+        assert ended.err.endswith("choose another folder with --out\n")
+
+
+def test_a_port_in_use_leaves_nothing_behind(testbed: Testbed, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        url = f"tcpin:127.0.0.1:{taken.getsockname()[1]}"
+        ended = testbed("run", "u_turn", "--mavlink", url, "--mavlink", "tlog:runs/u_turn/run.tlog")
+    assert ended.code == 2
+    assert ended.err.startswith(f"testbed: {url}: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_damaged_record(testbed: Testbed, tmp_path: Path) -> None:
+    (tmp_path / "run.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(500))
+    (tmp_path / "text.nc").write_text("not a record")
+    for name in ("run.nc", "text.nc"):
+        ended = testbed("report", name)
+        assert ended.code == 2
+        assert ended.err.startswith(f"testbed: {name}: ")
+        assert len(ended.err.splitlines()) == 1
+
+
+def test_a_full_disk_is_a_message(testbed: Testbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device", "run.nc")
+
+    monkeypatch.setattr(loop, "run", full)
+    ended = testbed("run", "static_bench")
+    assert (ended.code, ended.err) == (2, "testbed: [Errno 28] No space left on device: 'run.nc'\n")
+
+
+def test_no_traceback_reaches_the_shell(tmp_path: Path) -> None:
+    ended = python("-m", "testbed", "run", "uturn", cwd=tmp_path)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert len(ended.stderr.splitlines()) == 1
+
+
+# --- running
+
+
+def test_run_writes_a_record_and_metrics(testbed: Testbed, tmp_path: Path) -> None:
+    ended = testbed("run", "static_bench", *QUICK)
+    assert ended.code == 0, ended.err
+    assert {"run.nc", "metrics.json"} <= {path.name for path in (tmp_path / "runs/static_bench").iterdir()}
+    assert "100 %  00:03 of 00:03" in ended.err
+    assert "ins" in ended.out
+
+
+def test_run_passes_everything_on(testbed: Testbed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: dict[str, Any] = {}
+
+    def run(scenario: Any, **options: Any) -> None:
+        asked.update(options, scenario=scenario)
+        raise UserError("enough")
+
+    monkeypatch.setattr(loop, "run", run)
+    ended = testbed("run", "u_turn", "--out", "a/b", "--seed", "9", "--realtime", "4", "--set", "duration_s=50")
+    assert (ended.code, ended.err) == (2, "testbed: enough\n")
+    assert (asked["seed"], asked["realtime"], asked["out"], asked["links"]) == (9, 4.0, Path("a/b"), [])
+    assert asked["scenario"].duration_s == 50.0
+    assert not (tmp_path / "a").exists(), "an empty folder was left behind"
+    for arguments in (["--realtime", "u_turn"], ["u_turn", "--realtime"], ["u_turn", "--realtime", "--seed", "3"]):
+        testbed("run", *arguments)
+        assert asked["realtime"] == 1.0
+
+
+def test_a_record_is_run_again(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("run", "static_bench", *QUICK, "--out", "first", "--seed", "7")
+    ended = testbed("run", "first/run.nc", "--no-report")
+    assert ended.code == 0, ended.err
+    again = tmp_path / "runs/first_again/run.nc"
+    assert str(again.relative_to(tmp_path)) in ended.out
+    first, second = record.load(tmp_path / "first/run.nc"), record.load(again)
+    assert first.identical(second)
+    ended = testbed("run", "first/run.nc", "--no-report", "--seed", "8", "--set", "duration_s=2", "--out", "other")
+    other = record.load(tmp_path / "other/run.nc")
+    assert (other.attrs["seed"], other["truth/time"].values[-1]) == (8, 2.0)
+    third = testbed("run", "other/run.nc", "--no-report", "--out", "third")
+    assert third.code == 0, "overrides are part of a record"
+    assert record.load(tmp_path / "third/run.nc").identical(other)
+
+
+def _spoilt(folder: Path, **attributes: str) -> Path:
+    """A record some of whose attributes are not what a run writes."""
+    import h5py
+
+    folder.mkdir()
+    path = folder / "mine.nc"
+    path.write_bytes((folder.parent / "first/run.nc").read_bytes())
+    with h5py.File(path, "r+") as file:
+        for name, value in attributes.items():
+            file.attrs[name] = value
+    return path
+
+
+def test_what_is_wrong_with_running_a_record_again(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("run", "static_bench", *QUICK, "--out", "first")
+    for arguments, says in (
+        (["first/run.nc", "--out", "first"], "first/run.nc: would be overwritten by its own rerun: choose another"),
+        (["nothing.nc"], "nothing.nc: no such file"),
+        (["first/run.nc", "--set", "sensors.gnss=3"], "sensors.gnss: must be a table, not 3"),
+        ([_spoilt(tmp_path / "a", overrides="[")], "a/mine.nc: damaged record"),
+        ([_spoilt(tmp_path / "b", scenario="title = 3")], "title: must be text"),
+        ([_spoilt(tmp_path / "c", versions="5")], "c/mine.nc: damaged record"),
+    ):
+        ended = testbed("run", *arguments)
+        assert ended.code == 2, arguments
+        assert says in ended.err
+        assert "Traceback" not in ended.err
+    assert (tmp_path / "first/run.nc").exists()
+    assert not (tmp_path / "runs").exists()
+    old = _spoilt(tmp_path / "d", versions='{"numpy": "0.1"}', complete="")
+    ended = testbed("run", old, "--no-report")
+    assert ended.code == 0, ended.err
+    assert "mine.nc: was made with numpy 0.1: bits may differ" in ended.err
+    assert "mine.nc: ends early; the rerun goes on to the scenario's end" in ended.err
+    assert (tmp_path / "runs/mine_again/run.nc").exists()
+
+
+def test_a_lost_flight_fails_and_keeps_its_record(
+    testbed: Testbed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(flight, "MAX_ROLL", math.radians(20.0))  # which the U-turn exceeds
+    ended = testbed("run", "u_turn", "--set", "duration_s=60", "--set", "plan[0].length_m=500", "--no-report")
+    assert ended.code == 1
+    assert re.fullmatch(
+        r"testbed: the flight ended after \d+ s: control lost: bank -?2\d deg, .*", ended.err.splitlines()[-1]
+    )
+    assert (tmp_path / "runs/u_turn/run.nc").exists()
+
+
+def test_an_interrupted_run_says_what_it_leaves(testbed: Testbed, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop, "run", interrupted)
+    ended = testbed("run", "u_turn")
+    assert (ended.code, ended.err) == (130, "testbed: interrupted: the record so far is runs/u_turn/run.nc\n")
+
+
+def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "testbed", "run", "static_bench", "--realtime", "50", "--no-report"]
+    # Tests that run in the background of a shell inherit that interrupts are ignored.
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=heed) as running:
+        assert running.stderr is not None
+        percent = int(running.stderr.readline().split("%")[0])  # under load a line comes before the first 10 %
+        running.send_signal(signal.SIGINT)
+        rest = running.stderr.read()
+    assert running.returncode == 130
+    assert rest.splitlines()[-1] == "testbed: interrupted: the record so far is runs/static_bench/run.nc"
+    assert "Traceback" not in rest
+    rows = record.load(tmp_path / "runs/static_bench/run.nc")["truth"].sizes["time"]
+    assert rows >= 30 * percent > 0  # at 10 Hz over 300 s
+
+
+def test_export_and_report_of_a_run(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("run", "static_bench", *QUICK, "--out", "out")
+    for form, made in (("csv", "run_csv"), ("mat", "run.mat")):
+        ended = testbed("export", "out/run.nc", "--format", form)
+        assert (ended.code, ended.out) == (0, f"out/{made}\n")
+        assert (tmp_path / "out" / made).exists()
+    (tmp_path / "out/run.nc").rename(tmp_path / "out/mine.nc")
+    (tmp_path / "out/metrics.json").unlink()  # as after a killed run
+    ended = testbed("report", "out/mine.nc")
+    assert ended.code == 0, ended.err
+    assert ended.out.splitlines()[-1] == "record: out/mine.nc"
+    assert (tmp_path / "out/report.html").stat().st_size > 10_000
+    assert "ins.aligned_s" in (tmp_path / "out/metrics.json").read_text("utf-8")
+
+
+def test_what_a_run_remarks_is_said(testbed: Testbed) -> None:
+    ended = testbed("run", "u_turn", "--set", "plan=[{leg='straight', length_m=200}]", "--no-report")
+    assert ended.code == 0
+    assert re.fullmatch(r"testbed: plan flown: the run ends at \d+ s of 200 s", ended.err.splitlines()[-1])
+
+
+# --- arguments and progress
+
+
+@pytest.mark.parametrize(
+    ("texts", "varied"),
+    [
+        ([], {}),
+        (["truth.wind.speed_mps=0, 5,10"], {"truth.wind.speed_mps": ["0", "5", "10"]}),
+        (["a=[[1,2]],[[3,4],[5,6]]", "b=x"], {"a": ["[[1,2]]", "[[3,4],[5,6]]"], "b": ["x"]}),
+        (["a={p=1,q=2},\"x,y\",'],'"], {"a": ["{p=1,q=2}", '"x,y"', "'],'"]}),
+    ],
+)
+def test_parse_vary(texts: Sequence[str], varied: dict[str, list[str]]) -> None:
+    assert cli.parse_vary(texts) == varied
+
+
+@pytest.mark.parametrize("texts", [["a"], ["a="], ["=1"], ["a=1,,2"], ["a=1,"], ["a=1", "a=2"]])
+def test_parse_vary_refuses(texts: Sequence[str]) -> None:
+    with pytest.raises(UserError, match=r"--vary a|--vary =1"):
+        cli.parse_vary(texts)
+
+
+def told(console: Console) -> None:
+    with progress.shown(console, "a title [with] brackets") as tell:
+        for k in range(101):
+            now = loop.Progress(36.0 * k, 3600.0, 87.65, "GNSS denied" if 30 <= k < 60 else "leg [2]")
+            tell(*progress.of_run(now))
+
+
+def test_progress_on_a_pipe_is_a_line_now_and_then() -> None:
+    out = io.StringIO()
+    told(Console(file=out))
+    lines = out.getvalue().splitlines()
+    assert [int(line.split("%")[0]) for line in lines] == list(range(10, 101, 10))
+    assert " 50 %  30:00 of 1:00:00  87.7 × real time  GNSS denied" in lines
+    assert lines[-1] == "100 %  1:00:00 of 1:00:00  87.7 × real time  leg [2]"
+
+
+def test_progress_on_a_terminal_is_a_bar() -> None:
+    out = io.StringIO()
+    told(Console(file=out, force_terminal=True, width=120))
+    assert "a title [with] brackets" in out.getvalue()
+    assert "1:00:00 of 1:00:00  87.7 × real time  leg [2]" in out.getvalue()
