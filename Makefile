@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CLIENTS := .venv-clients
+COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: run test test-all lint bench setup lock clean
@@ -22,7 +23,7 @@ lint: $(VENV)/.ready
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: $(VENV)/.bench
+bench: $(VENV)/.ready
 	$(BIN)/python tests/bench
 
 setup: $(VENV)/.ready
@@ -35,17 +36,19 @@ $(VENV)/.ready: pyproject.toml requirements.lock
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	@touch $@
 
-# The peers that the benchmark compares with; nothing else needs them.
-$(VENV)/.bench: $(VENV)/.ready requirements-bench.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-bench.lock
-	@touch $@
-
 # The ground stations that the slow tests connect, apart from the testbed's environment. Without what MAVProxy needs for
 # its windows only, hence --no-deps.
 $(CLIENTS)/.ready: requirements-clients.lock
 	$(PYTHON) -m venv $(CLIENTS)
 	$(CLIENTS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $<
 	@touch $@
+
+# After a change of the dependencies: what is locked stays as it is where it can; for newer versions, delete a lock first.
+lock:
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(COMPILE) --extra dev --extra docs --extra examples --output-file requirements.lock pyproject.toml
+	$(COMPILE) --group clients --no-deps --constraint requirements.lock --output-file requirements-clients.lock
 
 clean:
 	rm -rf $(VENV) $(CLIENTS) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
