@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import logging
 import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -28,13 +32,29 @@ def _sources(folder: Path) -> str:
     return hashlib.sha256(repr(states).encode()).hexdigest()
 
 
+def _keep_for_now() -> None:
+    """Keep kernels in a temporary folder, for this process and those that it starts, and say so."""
+    folder = tempfile.mkdtemp(prefix="navigation-testbed-kernels-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = folder
+    logging.getLogger("nav").warning(
+        "nav: compiled kernels can't be kept in %s or in the home folder: every start compiles them anew; "
+        "to keep them, set NUMBA_CACHE_DIR to a folder that can be written",
+        Path(__file__).parent,
+    )
+
+
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     """Compile with an on-disk cache that is good while all sources are what they were.
 
     Numba looks at a kernel's own file only, and not at those of the kernels that are part of it: after an update of one
     file the others would go on with what it was.
     """
-    compiled: Any = numba.njit(cache=True, **options)(function)
+    try:
+        compiled: Any = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # nowhere to keep it: neither beside the source nor in the user's home
+        _keep_for_now()
+        compiled = numba.njit(cache=True, **options)(function)
     index = compiled._cache._cache_file
     index._source_stamp = index._source_stamp, _sources(Path(function.__code__.co_filename).parent)
     return cast("Callable[P, R]", compiled)

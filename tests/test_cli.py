@@ -67,6 +67,20 @@ def test_help_names_every_command(testbed: Testbed) -> None:
     assert {word for word in PROMISED if f"  {word}" in shown} == PROMISED
 
 
+def test_alone_it_shows_its_help(testbed: Testbed) -> None:
+    ended = testbed()
+    shown = ended.out + ended.err
+    assert {word for word in PROMISED if f"  {word}" in shown} == PROMISED
+    assert "Traceback" not in shown
+
+
+@pytest.mark.parametrize("command", [(), *((name,) for name in sorted(PROMISED))])
+def test_h_is_help(testbed: Testbed, command: tuple[str, ...]) -> None:
+    short, long = testbed(*command, "-h"), testbed(*command, "--help")
+    assert short.code == 0
+    assert short.out == long.out
+
+
 def test_scenarios_lists_name_title_and_duration(testbed: Testbed) -> None:
     shown = testbed("scenarios")
     assert shown.code == 0
