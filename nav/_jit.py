@@ -36,7 +36,8 @@ def _keep_for_now() -> None:
     """Keep kernels in a temporary folder, for this process and those that it starts, and say so."""
     folder = tempfile.mkdtemp(prefix="navigation-testbed-kernels-")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = folder
+    config: Any = numba.config
+    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = folder
     logging.getLogger("nav").warning(
         "nav: compiled kernels can't be kept in %s or in the home folder: every start compiles them anew; "
         "to keep them, set NUMBA_CACHE_DIR to a folder that can be written",
