@@ -103,14 +103,26 @@ def turn_radius(ground_speed: float, bank: float) -> float:
     return ground_speed**2 / (GRAVITY * math.tan(bank))
 
 
-Direction: TypeAlias = Literal["left", "right"]
+Direction: TypeAlias = Annotated[Literal["left", "right"], Field(description="which way it goes round first")]
 Count: TypeAlias = Annotated[float, Field(gt=0, le=100_000)]
-Duration: TypeAlias = Annotated[float, Field(gt=0, le=1e6)]
+Duration: TypeAlias = Annotated[float, Field(gt=0, le=1e6, description="ends the leg this long after it began")]
 Length: TypeAlias = Annotated[float, Field(gt=0, le=300_000)]
-Radius: TypeAlias = Annotated[float, Field(gt=0, le=20_000), AfterValidator(_flyable_radius)]
-Altitude: TypeAlias = Annotated[float, AfterValidator(_flyable_altitude)]
-Speed: TypeAlias = Annotated[float, AfterValidator(_flyable_speed)]
-Rate: TypeAlias = Annotated[float, Field(gt=0)]
+Radius: TypeAlias = Annotated[
+    float,
+    Field(gt=0, le=20_000, description="of the circles; not below what the aircraft's bank limit allows"),
+    AfterValidator(_flyable_radius),
+]
+Altitude: TypeAlias = Annotated[
+    float,
+    Field(description="height above the ellipsoid to fly at, from the floor to the aircraft's ceiling"),
+    AfterValidator(_flyable_altitude),
+]
+Speed: TypeAlias = Annotated[
+    float,
+    Field(description="true airspeed to fly at, between the aircraft's stall margin and its fastest"),
+    AfterValidator(_flyable_speed),
+]
+Rate: TypeAlias = Annotated[float, Field(gt=0, description="vertical speed, always positive")]
 Bearing: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 
 
@@ -235,8 +247,8 @@ class HeadingTurn:
 class Waypoint(Section):
     """A place on the map."""
 
-    lat_deg: float = Field(gt=-85, lt=85)
-    lon_deg: float = Field(ge=-180, le=180)
+    lat_deg: float = Field(gt=-85, lt=85, description="geodetic latitude, WGS84")
+    lon_deg: float = Field(ge=-180, le=180, description="longitude, east positive")
 
 
 class _Leg(Section):
@@ -251,8 +263,8 @@ class Straight(_Leg):
     """Straight along the present course for a length, or to a place."""
 
     leg: Literal["straight"]
-    length_m: Length | None = None
-    to: Waypoint | None = None
+    length_m: Length | None = Field(default=None, description="ends the leg after this length; or give `to`")
+    to: Waypoint | None = Field(default=None, description="a place to fly to, where the leg ends; or give `length_m`")
     alt_m: Altitude | None = None
     airspeed_mps: Speed | None = None
 
@@ -272,9 +284,13 @@ class Turn(_Leg):
     """Turn the nose to a heading, the shorter way unless a direction is given, or by an angle, right positive."""
 
     leg: Literal["turn"]
-    to_deg: Bearing | None = None
-    by_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = None
-    direction: Direction | None = None
+    to_deg: Bearing | None = Field(default=None, description="true heading to turn to; or give `by_deg`")
+    by_deg: Annotated[float, Field(ge=-3600, le=3600)] | None = Field(
+        default=None, description="angle to turn by, right positive; or give `to_deg`"
+    )
+    direction: Direction | None = Field(
+        default=None, description="which way to turn to `to_deg`; the shorter way where it is left out"
+    )
     alt_m: Altitude | None = None
     airspeed_mps: Speed | None = None
 
@@ -302,7 +318,7 @@ class Climb(_Leg):
     """Climb to an altitude along the present course."""
 
     leg: Literal["climb"]
-    to_m: Altitude
+    to_m: Altitude = Field(description="height above the ellipsoid at which the leg ends")
     rate_mps: Rate = CLIMB_RATE
     airspeed_mps: Speed | None = None
 
@@ -319,7 +335,7 @@ class Descend(_Leg):
     """Descend to an altitude along the present course."""
 
     leg: Literal["descend"]
-    to_m: Altitude
+    to_m: Altitude = Field(description="height above the ellipsoid at which the leg ends")
     rate_mps: Rate = CLIMB_RATE
     airspeed_mps: Speed | None = None
 
@@ -336,7 +352,7 @@ class Airspeed(_Leg):
     """Change the true airspeed along the present course."""
 
     leg: Literal["airspeed"]
-    to_mps: Speed
+    to_mps: Speed = Field(description="true airspeed at which the leg ends")
     alt_m: Altitude | None = None
 
     def segments(self, here: Motion, course: float) -> Iterator[Segment]:
@@ -356,8 +372,13 @@ class Loiter(_Leg):
 
     leg: Literal["loiter"]
     radius_m: Radius
-    centre: Waypoint | None = None
-    turns: Count | None = None
+    centre: Waypoint | None = Field(
+        default=None, description="centre of the circle; without one the circle begins where the aircraft is"
+    )
+    turns: Count | None = Field(
+        default=None,
+        description="ends the leg after so many turns, counted from where the circle is reached; or give `duration_s`",
+    )
     duration_s: Duration | None = None
     direction: Direction = "left"
     alt_m: Altitude | None = None
@@ -380,9 +401,9 @@ class Racetrack(_Leg):
     """Two straights joined by half circles, from here along the present course. Counts laps, or lasts a time."""
 
     leg: Literal["racetrack"]
-    length_m: Length
+    length_m: Length = Field(description="length of each straight")
     radius_m: Radius
-    laps: Count | None = None
+    laps: Count | None = Field(default=None, description="ends the leg after so many laps; or give `duration_s`")
     duration_s: Duration | None = None
     direction: Direction = "left"
     alt_m: Altitude | None = None
@@ -411,7 +432,7 @@ class FigureEight(_Leg):
 
     leg: Literal["figure_eight"]
     radius_m: Radius
-    turns: Count | None = None
+    turns: Count | None = Field(default=None, description="ends the leg after so many eights; or give `duration_s`")
     duration_s: Duration | None = None
     direction: Direction = "left"
     alt_m: Altitude | None = None
@@ -435,8 +456,10 @@ class STurns(_Leg):
 
     leg: Literal["s_turns"]
     radius_m: Radius
-    turns: Annotated[int, Field(ge=1, le=1000)]
-    swing_deg: Annotated[float, Field(ge=10, le=120)] = 60.0
+    turns: Annotated[int, Field(ge=1, le=1000)] = Field(description="how many turns across the present course")
+    swing_deg: Annotated[float, Field(ge=10, le=120)] = Field(
+        default=60.0, description="how far the course leaves the present one, to either side"
+    )
     direction: Direction = "left"
     alt_m: Altitude | None = None
     airspeed_mps: Speed | None = None
@@ -457,7 +480,9 @@ class UTurn(_Leg):
     """Half a circle, back along a parallel course; without a radius at 25 deg of bank."""
 
     leg: Literal["u_turn"]
-    radius_m: Radius | None = None
+    radius_m: Radius | None = Field(
+        default=None, description="of the half circle; without one what 25 deg of bank give"
+    )
     direction: Direction = "left"
     alt_m: Altitude | None = None
     airspeed_mps: Speed | None = None

@@ -30,7 +30,7 @@ PIECES = 16  # of the spline in a quarter of a sinusoid: it keeps within 2e-7 of
 
 TO_REST = 12  # decimals of the speed [m/s] at knots: sums are rounded to it, so that a body that stops stands still
 
-Duration: TypeAlias = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
+Duration: TypeAlias = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S, description="how long the segment lasts")]
 GroundSpeed: TypeAlias = Annotated[float, Field(ge=0, le=1000)]
 Angle: TypeAlias = Annotated[float, Field(ge=-36_000, le=36_000)]
 
@@ -72,7 +72,9 @@ class Straight(_Segment):
     """Go on at the speed and course reached."""
 
     leg: Literal["straight"]
-    length_m: Annotated[float, Field(gt=0, le=1e8)] | None = None
+    length_m: Annotated[float, Field(gt=0, le=1e8)] | None = Field(
+        default=None, description="length of the segment; or give `duration_s`"
+    )
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
@@ -92,8 +94,10 @@ class Accelerate(_Segment):
     """Gain or lose speed along the track: with a steady acceleration, or within a time."""
 
     leg: Literal["accelerate"]
-    to_mps: GroundSpeed
-    accel_mps2: Annotated[float, Field(gt=0, le=MAX_ACCELERATION)] | None = None
+    to_mps: GroundSpeed = Field(description="speed over ground at its end; 0 comes to rest")
+    accel_mps2: Annotated[float, Field(gt=0, le=MAX_ACCELERATION)] | None = Field(
+        default=None, description="steady acceleration, or deceleration, always positive; or give `duration_s`"
+    )
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
@@ -117,9 +121,13 @@ class Turn(_Segment):
     """Turn the course by an angle, right positive, at constant speed: at a rate, on a radius, or within a time."""
 
     leg: Literal["turn"]
-    by_deg: Angle
-    rate_degps: Annotated[float, Field(gt=0, le=360)] | None = None
-    radius_m: Annotated[float, Field(gt=0, le=1e7)] | None = None
+    by_deg: Angle = Field(description="change of course, right positive")
+    rate_degps: Annotated[float, Field(gt=0, le=360)] | None = Field(
+        default=None, description="steady rate of turn; or give `radius_m` or `duration_s`"
+    )
+    radius_m: Annotated[float, Field(gt=0, le=1e7)] | None = Field(
+        default=None, description="radius of the steady part; or give `rate_degps` or `duration_s`"
+    )
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
@@ -142,8 +150,10 @@ class Climb(_Segment):
     """Climb by a height, or descend by a negative one, at constant speed over ground: at a rate, or within a time."""
 
     leg: Literal["climb"]
-    by_m: Annotated[float, Field(ge=-20_500, le=20_500)]
-    rate_mps: Annotated[float, Field(gt=0, le=500)] | None = None
+    by_m: Annotated[float, Field(ge=-20_500, le=20_500)] = Field(description="change of height, negative to descend")
+    rate_mps: Annotated[float, Field(gt=0, le=500)] | None = Field(
+        default=None, description="steady vertical speed, always positive; or give `duration_s`"
+    )
     duration_s: Duration | None = None
 
     @model_validator(mode="after")
@@ -173,10 +183,14 @@ class Weave(_Segment):
     """
 
     leg: Literal["weave"]
-    swing_deg: Angle
-    period_s: Annotated[float, Field(ge=1, le=LONGEST_S)]
-    swings: Annotated[int, Field(ge=1, le=1000)]
-    to_mps: GroundSpeed | None = None
+    swing_deg: Angle = Field(
+        description="from one end of the swing to the other, first to the right; negative: first to the left"
+    )
+    period_s: Annotated[float, Field(ge=1, le=LONGEST_S)] = Field(description="a swing there and one back")
+    swings: Annotated[int, Field(ge=1, le=1000)] = Field(description="how many swings, two to a period")
+    to_mps: GroundSpeed | None = Field(
+        default=None, description="speed in the middle of each swing; without it the speed stays"
+    )
 
     def knots(self, speed: float, blend: float) -> Knots:
         """One sine of the rate of turn per period, two of the acceleration."""
@@ -205,8 +219,8 @@ class Repeat(_Segment):
     """Do the ``last`` segments before it again, so many times."""
 
     leg: Literal["repeat"]
-    last: Annotated[int, Field(ge=1, le=1000)]
-    times: Annotated[int, Field(ge=1, le=100_000)]
+    last: Annotated[int, Field(ge=1, le=1000)] = Field(description="how many of the segments before this one")
+    times: Annotated[int, Field(ge=1, le=100_000)] = Field(description="how often they are done again")
 
 
 Segment: TypeAlias = Annotated[
@@ -218,8 +232,8 @@ Segment: TypeAlias = Annotated[
 class Sway(Section):
     """A sinusoid in roll or pitch, on top of the motion's own."""
 
-    amplitude_deg: float = Field(ge=0, le=60)
-    period_s: float = Field(ge=0.5, le=3600)
+    amplitude_deg: float = Field(ge=0, le=60, description="largest angle")
+    period_s: float = Field(ge=0.5, le=3600, description="of the sinusoid")
     phase_deg: float = Field(default=0.0, ge=-360, le=360, description="at the start of the run")
 
 
@@ -231,11 +245,20 @@ class Body(Section):
     ``pitch``. ``blend_s`` is the time that a manoeuvre takes to build up, and to fade.
     """
 
-    turns: Literal["banked", "flat"] = "flat"
-    blend_s: float = Field(default=1.0, ge=0.01, le=60)
-    drift_s: float = Field(default=0.0, ge=0, le=1)
-    roll: Sway | None = None
-    pitch: Sway | None = None
+    turns: Literal["banked", "flat"] = Field(
+        default="flat", description="banked as an aircraft, or flat as a vehicle or a ship"
+    )
+    blend_s: float = Field(
+        default=1.0, ge=0.01, le=60, description="time that a manoeuvre takes to build up, and to fade"
+    )
+    drift_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="flat: by how much the nose points further into a turn than the course, per rate of turn",
+    )
+    roll: Sway | None = Field(default=None, description="swaying about the forward axis; none: it does not")
+    pitch: Sway | None = Field(default=None, description="swaying about the right axis; none: it does not")
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,12 +41,14 @@ class AirspeedErrors:
 class AirspeedConfig(AidingTiming):
     """Keys of an airspeed sensor. ``grade`` sets the errors; each may be given to override it."""
 
-    kind: Literal["airspeed"] = "airspeed"
-    grade: Literal["perfect", "mems"] = "mems"
+    kind: Literal["airspeed"] = Field(
+        default="airspeed", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "mems"] = Field(default="mems", description="datasheet that presets every error below")
 
     scale_percent: float = Field(0.0, ge=0, le=50, description="of dynamic pressure: half of it in speed")
-    bias_pa: float = Field(0.0, ge=0, le=1e4)
-    noise_pa: float = Field(0.0, ge=0, le=1e4)
+    bias_pa: float = Field(0.0, ge=0, le=1e4, description="constant offset of the differential pressure")
+    noise_pa: float = Field(0.0, ge=0, le=1e4, description="white noise of the differential pressure")
 
     @model_validator(mode="before")
     @classmethod

@@ -37,13 +37,17 @@ class BarometerErrors:
 class BarometerConfig(AidingTiming):
     """Keys of a barometer. ``grade`` sets the errors; each may be given to override it."""
 
-    kind: Literal["barometer"] = "barometer"
-    grade: Literal["perfect", "mems"] = "mems"
+    kind: Literal["barometer"] = Field(
+        default="barometer", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "mems"] = Field(default="mems", description="datasheet that presets every error below")
 
-    bias_pa: float = Field(0.0, ge=0, le=1e5)
-    drift_pa: float = Field(0.0, ge=0, le=1e5)
-    drift_time_s: float = Field(1800.0, gt=0, le=1e6)
-    noise_pa: float = Field(0.0, ge=0, le=1e5)
+    bias_pa: float = Field(
+        0.0, ge=0, le=1e5, description="constant offset of the pressure; near the ground 12 Pa are a metre"
+    )
+    drift_pa: float = Field(0.0, ge=0, le=1e5, description="Gauss-Markov drift of the pressure")
+    drift_time_s: float = Field(1800.0, gt=0, le=1e6, description="correlation time of the drift")
+    noise_pa: float = Field(0.0, ge=0, le=1e5, description="white noise of the pressure")
 
     @model_validator(mode="before")
     @classmethod

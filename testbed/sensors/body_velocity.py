@@ -56,15 +56,19 @@ class BodyVelocityErrors:
 class BodyVelocityConfig(InterruptedTiming):
     """Keys of a body velocity sensor. ``grade`` sets errors, axes and rate; each may be given to override it."""
 
-    kind: Literal["body_velocity"] = "body_velocity"
-    grade: Literal["perfect", "odometer", "dvl", "doppler"] = "doppler"
-    rate_hz: float = Field(1.0, gt=0, le=10_000)
+    kind: Literal["body_velocity"] = Field(
+        default="body_velocity", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "odometer", "dvl", "doppler"] = Field(
+        default="doppler", description="datasheet that presets every error below"
+    )
+    rate_hz: float = Field(1.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
 
-    axes: tuple[Axis, ...] = Field(AXES, description="that are measured")
-    noise_mps: float = Field(0.0, ge=0, le=100)
-    correlated_mps: float = Field(0.0, ge=0, le=100)
-    correlation_time_s: float = Field(300.0, gt=0, le=1e6)
-    scale_percent: float = Field(0.0, ge=0, le=50)
+    axes: tuple[Axis, ...] = Field(AXES, description="body axes that are measured")
+    noise_mps: float = Field(0.0, ge=0, le=100, description="white noise per axis")
+    correlated_mps: float = Field(0.0, ge=0, le=100, description="Gauss-Markov error per axis")
+    correlation_time_s: float = Field(300.0, gt=0, le=1e6, description="of the Gauss-Markov error")
+    scale_percent: float = Field(0.0, ge=0, le=50, description="scale factor error per axis, constant")
 
     @model_validator(mode="before")
     @classmethod

@@ -96,9 +96,11 @@ GRADES: dict[str, dict[str, Any]] = {
 class Jammer(Section):
     """A transmitter on the ground inside whose radius the receiver hears nothing."""
 
-    lat_deg: float = Field(ge=-90, le=90)
-    lon_deg: float = Field(ge=-180, le=180)
-    radius_m: float = Field(gt=0, le=1e6)
+    lat_deg: float = Field(ge=-90, le=90, description="geodetic latitude, WGS84")
+    lon_deg: float = Field(ge=-180, le=180, description="longitude, east positive")
+    radius_m: float = Field(
+        gt=0, le=1e6, description="around it on the ground, inside which the receiver hears nothing"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,30 +125,46 @@ class GnssErrors:
 class GnssConfig(AidingTiming):
     """Keys of a GNSS receiver. ``grade`` sets the errors; each may be given to override it. Horizontal: per axis."""
 
-    kind: Literal["gnss"] = "gnss"
-    grade: Literal["perfect", "standalone", "sbas", "rtk"] = "standalone"
-    rate_hz: float = Field(5.0, gt=0, le=100)
+    kind: Literal["gnss"] = Field(
+        default="gnss", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "standalone", "sbas", "rtk"] = Field(
+        default="standalone", description="datasheet that presets every error below"
+    )
+    rate_hz: float = Field(5.0, gt=0, le=100, description="samples per second; divides the tick rate")
 
-    horizontal_white_m: float = Field(0.0, ge=0, le=1e4)
-    horizontal_correlated_m: float = Field(0.0, ge=0, le=1e4)
-    vertical_white_m: float = Field(0.0, ge=0, le=1e4)
-    vertical_correlated_m: float = Field(0.0, ge=0, le=1e4)
-    correlation_time_s: float = Field(300.0, gt=0, le=1e6)
-    horizontal_velocity_white_mps: float = Field(0.0, ge=0, le=100)
-    horizontal_velocity_correlated_mps: float = Field(0.0, ge=0, le=100)
-    vertical_velocity_white_mps: float = Field(0.0, ge=0, le=100)
-    vertical_velocity_correlated_mps: float = Field(0.0, ge=0, le=100)
-    velocity_correlation_time_s: float = Field(10.0, gt=0, le=1e6)
-    satellites: int = Field(12, ge=MIN_SATELLITES, le=60)
-    hdop: float = Field(0.9, gt=0, le=50)
-    vdop: float = Field(1.4, gt=0, le=50)
-    lever_arm_m: LeverArm = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
+    horizontal_white_m: float = Field(0.0, ge=0, le=1e4, description="white error of position, north and east each")
+    horizontal_correlated_m: float = Field(
+        0.0, ge=0, le=1e4, description="Gauss-Markov error of position, north and east each"
+    )
+    vertical_white_m: float = Field(0.0, ge=0, le=1e4, description="white error of height")
+    vertical_correlated_m: float = Field(0.0, ge=0, le=1e4, description="Gauss-Markov error of height")
+    correlation_time_s: float = Field(300.0, gt=0, le=1e6, description="of the Gauss-Markov errors of position")
+    horizontal_velocity_white_mps: float = Field(
+        0.0, ge=0, le=100, description="white error of velocity, north and east each"
+    )
+    horizontal_velocity_correlated_mps: float = Field(
+        0.0, ge=0, le=100, description="Gauss-Markov error of velocity, north and east each"
+    )
+    vertical_velocity_white_mps: float = Field(0.0, ge=0, le=100, description="white error of vertical velocity")
+    vertical_velocity_correlated_mps: float = Field(
+        0.0, ge=0, le=100, description="Gauss-Markov error of vertical velocity"
+    )
+    velocity_correlation_time_s: float = Field(10.0, gt=0, le=1e6, description="of the Gauss-Markov errors of velocity")
+    satellites: int = Field(12, ge=MIN_SATELLITES, le=60, description="usual number of satellites in use")
+    hdop: float = Field(0.9, gt=0, le=50, description="reported horizontal dilution of precision")
+    vdop: float = Field(1.4, gt=0, le=50, description="reported vertical dilution of precision")
+    lever_arm_m: LeverArm = Field(
+        (0.0, 0.0, 0.0), description="from the centre of gravity to the antenna, forward, right, down"
+    )
 
     reacquire_s: float = Field(0.0, ge=0, le=3600, description="from the end of denial to the first fix")
-    settle_factor: float = Field(2.0, ge=1, le=100, description="errors and reported accuracy at the first fix")
-    settle_s: float = Field(5.0, gt=0, le=3600, description="time constant of their return to normal")
+    settle_factor: float = Field(
+        2.0, ge=1, le=100, description="how many times larger errors and reported accuracy are at the first fix"
+    )
+    settle_s: float = Field(5.0, gt=0, le=3600, description="time constant with which they return to normal")
     denied: Windows = Field((), description="windows of simulated time without signals")
-    jammers: tuple[Jammer, ...] = ()
+    jammers: tuple[Jammer, ...] = Field(default=(), description="transmitters that deny signals near them")
 
     @model_validator(mode="before")
     @classmethod

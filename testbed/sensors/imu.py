@@ -231,49 +231,71 @@ class ImuConfig(Section):
     mpsprth m/s/sqrt(h), mgprth mg/sqrt(h), degphpk deg/h/K, degphpg deg/h/g.
     """
 
-    kind: Literal["imu"] = "imu"
-    grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = "mems-consumer"
-    rate_hz: float = Field(200.0, ge=5, le=10_000)
+    kind: Literal["imu"] = Field(default="imu", description="what the sensor is; the table's name where it is left out")
+    grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = Field(
+        default="mems-consumer", description="datasheet that presets every error below"
+    )
+    rate_hz: float = Field(200.0, ge=5, le=10_000, description="increments per second; divides the tick rate")
     turn_on: Literal["drawn", "exact"] = Field(
-        "drawn", description="exact: turn-on biases of just their 1 sigma, only the signs drawn"
+        "drawn", description="drawn from their sigma, or exactly as large as it, with only the signs drawn"
     )
 
-    gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5)
-    gyro_instability_degph: float = Field(0.0, ge=0, le=1e4)
-    gyro_instability_tau_s: float = Field(200.0, gt=0, le=1e6)
-    angle_random_walk_degprth: float = Field(0.0, ge=0, le=1e3)
-    gyro_rate_random_walk_degphprth: float = Field(0.0, ge=0, le=1e4)
-    gyro_scale_ppm: float = Field(0.0, ge=0, le=1e5)
-    gyro_scale_asymmetry_ppm: float = Field(0.0, ge=0, le=1e5)
-    gyro_misalignment_mrad: float = Field(0.0, ge=0, le=100)
-    gyro_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100)
-    gyro_g_sensitivity_degphpg: float = Field(0.0, ge=0, le=1e4)
-    gyro_temperature_degphpk: float = Field(0.0, ge=0, le=1e3)
-    gyro_range_degps: float | None = Field(None, gt=0, le=1e5)
-    gyro_resolution_degps: float = Field(0.0, ge=0, le=100)
-    gyro_bandwidth_hz: float | None = Field(None, gt=0, le=1e5)
+    gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5, description="constant bias of a run")
+    gyro_instability_degph: float = Field(
+        0.0, ge=0, le=1e4, description="in-run bias instability: the floor of the Allan deviation"
+    )
+    gyro_instability_tau_s: float = Field(200.0, gt=0, le=1e6, description="correlation time of the in-run bias")
+    angle_random_walk_degprth: float = Field(0.0, ge=0, le=1e3, description="white noise of the rate")
+    gyro_rate_random_walk_degphprth: float = Field(0.0, ge=0, le=1e4, description="random walk of the bias")
+    gyro_scale_ppm: float = Field(0.0, ge=0, le=1e5, description="scale factor error")
+    gyro_scale_asymmetry_ppm: float = Field(
+        0.0, ge=0, le=1e5, description="difference of the scale factor between positive and negative rates"
+    )
+    gyro_misalignment_mrad: float = Field(
+        0.0, ge=0, le=100, description="of the triad as a whole to the axes of the unit"
+    )
+    gyro_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100, description="of the axes to each other")
+    gyro_g_sensitivity_degphpg: float = Field(0.0, ge=0, le=1e4, description="bias per specific force")
+    gyro_temperature_degphpk: float = Field(0.0, ge=0, le=1e3, description="bias per kelvin of warming up")
+    gyro_range_degps: float | None = Field(None, gt=0, le=1e5, description="largest rate; none: no limit")
+    gyro_resolution_degps: float = Field(0.0, ge=0, le=100, description="least step of the output; 0: none")
+    gyro_bandwidth_hz: float | None = Field(None, gt=0, le=1e5, description="of the low-pass filter; none: no filter")
 
-    accel_turn_on_mg: float = Field(0.0, ge=0, le=1e3)
-    accel_instability_mg: float = Field(0.0, ge=0, le=1e3)
-    accel_instability_tau_s: float = Field(200.0, gt=0, le=1e6)
-    velocity_random_walk_mpsprth: float = Field(0.0, ge=0, le=1e3)
-    accel_random_walk_mgprth: float = Field(0.0, ge=0, le=1e3)
-    accel_scale_ppm: float = Field(0.0, ge=0, le=1e5)
-    accel_scale_asymmetry_ppm: float = Field(0.0, ge=0, le=1e5)
-    accel_misalignment_mrad: float = Field(0.0, ge=0, le=100)
-    accel_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100)
-    accel_temperature_mgpk: float = Field(0.0, ge=0, le=100)
-    accel_range_g: float | None = Field(None, gt=0, le=1e4)
-    accel_resolution_mg: float = Field(0.0, ge=0, le=1e3)
-    accel_bandwidth_hz: float | None = Field(None, gt=0, le=1e5)
+    accel_turn_on_mg: float = Field(0.0, ge=0, le=1e3, description="constant bias of a run")
+    accel_instability_mg: float = Field(
+        0.0, ge=0, le=1e3, description="in-run bias instability: the floor of the Allan deviation"
+    )
+    accel_instability_tau_s: float = Field(200.0, gt=0, le=1e6, description="correlation time of the in-run bias")
+    velocity_random_walk_mpsprth: float = Field(0.0, ge=0, le=1e3, description="white noise of the specific force")
+    accel_random_walk_mgprth: float = Field(0.0, ge=0, le=1e3, description="random walk of the bias")
+    accel_scale_ppm: float = Field(0.0, ge=0, le=1e5, description="scale factor error")
+    accel_scale_asymmetry_ppm: float = Field(
+        0.0, ge=0, le=1e5, description="difference of the scale factor between positive and negative forces"
+    )
+    accel_misalignment_mrad: float = Field(
+        0.0, ge=0, le=100, description="of the triad as a whole to the axes of the unit"
+    )
+    accel_nonorthogonality_mrad: float = Field(0.0, ge=0, le=100, description="of the axes to each other")
+    accel_temperature_mgpk: float = Field(0.0, ge=0, le=100, description="bias per kelvin of warming up")
+    accel_range_g: float | None = Field(None, gt=0, le=1e4, description="largest specific force; none: no limit")
+    accel_resolution_mg: float = Field(0.0, ge=0, le=1e3, description="least step of the output; 0: none")
+    accel_bandwidth_hz: float | None = Field(None, gt=0, le=1e5, description="of the low-pass filter; none: no filter")
 
-    vibration_mg: float = Field(0.0, ge=0, le=1e5, description="amplitude at one per rev and 6000 rpm")
-    vibration_degps: float = Field(0.0, ge=0, le=1e4, description="amplitude at one per rev and 6000 rpm")
+    vibration_mg: float = Field(
+        0.0, ge=0, le=1e5, description="engine vibration of the specific force: amplitude at one per rev and 6000 rpm"
+    )
+    vibration_degps: float = Field(
+        0.0, ge=0, le=1e4, description="engine vibration of the rate: amplitude at one per rev and 6000 rpm"
+    )
     self_heating_k: float = Field(0.0, ge=0, le=100, description="how much the unit warms up after power-on")
-    self_heating_tau_s: float = Field(300.0, gt=0, le=1e5)
+    self_heating_tau_s: float = Field(300.0, gt=0, le=1e5, description="time constant of warming up")
 
-    lever_arm_m: LeverArm = Field((0.0, 0.0, 0.0), description="from the centre of gravity, body")
-    mounting_deg: tuple[Angle, Angle, Angle] = Field((0.0, 0.0, 0.0), description="roll, pitch, heading of the unit")
+    lever_arm_m: LeverArm = Field(
+        (0.0, 0.0, 0.0), description="from the centre of gravity to the unit, forward, right, down"
+    )
+    mounting_deg: tuple[Angle, Angle, Angle] = Field(
+        (0.0, 0.0, 0.0), description="roll, pitch and heading of the unit in the aircraft"
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -139,14 +139,20 @@ class MagnetometerErrors:
 class MagnetometerConfig(AidingTiming):
     """Keys of a magnetometer. ``grade`` sets the errors; each may be given to override it."""
 
-    kind: Literal["magnetometer"] = "magnetometer"
-    grade: Literal["perfect", "mems"] = "mems"
+    kind: Literal["magnetometer"] = Field(
+        default="magnetometer", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "mems"] = Field(default="mems", description="datasheet that presets every error below")
 
-    noise_ut: float = Field(0.0, ge=0, le=1000)
+    noise_ut: float = Field(0.0, ge=0, le=1000, description="white noise per axis")
     hard_iron_ut: float = Field(0.0, ge=0, le=1000, description="constant offset per axis that calibration left")
-    soft_iron_percent: float = Field(0.0, ge=0, le=50, description="each element of the matrix that calibration left")
-    current_ut_per_a: float = Field(0.0, ge=0, le=100, description="stray field of the wiring per axis")
-    range_ut: float | None = Field(None, gt=0, le=1e6)
+    soft_iron_percent: float = Field(
+        0.0, ge=0, le=50, description="each element of the soft iron matrix that calibration left"
+    )
+    current_ut_per_a: float = Field(
+        0.0, ge=0, le=100, description="stray field of the wiring per axis and ampere of the aircraft's current"
+    )
+    range_ut: float | None = Field(None, gt=0, le=1e6, description="largest field per axis; none: no limit")
 
     @model_validator(mode="before")
     @classmethod

@@ -32,10 +32,10 @@ GRADES: dict[str, dict[str, Any]] = {
 class Transponder(Section):
     """Where the transponder is and how far it is heard, as the crow flies."""
 
-    lat_deg: float = Field(ge=-90, le=90)
-    lon_deg: float = Field(ge=-180, le=180)
-    alt_m: float = Field(0.0, ge=-12_000, le=10_000)
-    range_m: float = Field(gt=0, le=1e6)
+    lat_deg: float = Field(ge=-90, le=90, description="geodetic latitude, WGS84")
+    lon_deg: float = Field(ge=-180, le=180, description="longitude, east positive")
+    alt_m: float = Field(0.0, ge=-12_000, le=10_000, description="height above the ellipsoid")
+    range_m: float = Field(gt=0, le=1e6, description="distance up to which it is heard, as the crow flies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +52,23 @@ class PositionFixErrors:
 class PositionFixConfig(InterruptedTiming):
     """Keys of a position fix. ``grade`` sets errors and rate; each may be given to override it."""
 
-    kind: Literal["position_fix"] = "position_fix"
-    grade: Literal["perfect", "transponder", "terrain"] = "transponder"
-    rate_hz: float = Field(1.0, gt=0, le=10_000)
+    kind: Literal["position_fix"] = Field(
+        default="position_fix", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "transponder", "terrain"] = Field(
+        default="transponder", description="datasheet that presets every error below"
+    )
+    rate_hz: float = Field(1.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
 
     distribution: Literal["gaussian", "uniform"] = Field("gaussian", description="of the errors")
-    horizontal_m: float = Field(0.0, ge=0, le=1e4, description="per axis: 1 sigma, or the amplitude when uniform")
+    horizontal_m: float = Field(
+        0.0, ge=0, le=1e4, description="error north and east each: 1 sigma, or the amplitude when uniform"
+    )
     vertical_m: float = Field(0.0, ge=0, le=1e4, description="the same of height")
     height: bool = Field(True, description="whether height is measured")
-    transponder: Transponder | None = Field(None, description="out of whose range there is no fix; none: anywhere")
+    transponder: Transponder | None = Field(
+        None, description="out of whose range there is no fix; none: fixes everywhere"
+    )
 
     @model_validator(mode="before")
     @classmethod

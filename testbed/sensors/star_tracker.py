@@ -36,13 +36,19 @@ class StarTrackerErrors:
 class StarTrackerConfig(InterruptedTiming):
     """Keys of a star tracker. ``grade`` sets the errors; each may be given to override it."""
 
-    kind: Literal["star_tracker"] = "star_tracker"
-    grade: Literal["perfect", "standard"] = "standard"
-    rate_hz: float = Field(1.0, gt=0, le=10_000)
+    kind: Literal["star_tracker"] = Field(
+        default="star_tracker", description="what the sensor is; the table's name where it is left out"
+    )
+    grade: Literal["perfect", "standard"] = Field(
+        default="standard", description="datasheet that presets every error below"
+    )
+    rate_hz: float = Field(1.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
 
     boresight: Literal["forward", "right", "down"] = Field("down", description="the body axis that it looks along")
-    across_arcsec: float = Field(0.0, ge=0, le=36_000, description="about the two axes across the boresight")
-    boresight_arcsec: float = Field(0.0, ge=0, le=36_000, description="about the boresight, the poor one")
+    across_arcsec: float = Field(
+        0.0, ge=0, le=36_000, description="white noise about the two axes across the boresight"
+    )
+    boresight_arcsec: float = Field(0.0, ge=0, le=36_000, description="white noise about the boresight, the poor one")
 
     @model_validator(mode="before")
     @classmethod

@@ -54,7 +54,7 @@ def ticks_per_sample(name: str, rate_hz: float, tick_rate_hz: float) -> int:
 class AidingTiming(Section):
     """The timing keys that every aiding sensor has."""
 
-    rate_hz: float = Field(10.0, gt=0, le=10_000)
+    rate_hz: float = Field(10.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
     offset_s: float = Field(0.0, ge=0, le=3600, description="time of the first sample, a whole number of ticks")
     latency_s: float = Field(0.0, ge=0, le=10, description="from the time of validity to the time of arrival")
 

@@ -283,9 +283,15 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
 class _Fault(Section):
     """Keys of every ``[[fault]]``. Metrics and events know it by its name."""
 
-    name: str | None = Field(None, max_length=64)
-    sensor: str
-    window: tuple[float, float]
+    name: str | None = Field(
+        None,
+        max_length=64,
+        description="what metrics and events call it; sensor, channel and kind joined by _ where left out",
+    )
+    sensor: str = Field(description="name of the sensor that fails")
+    window: tuple[float, float] = Field(
+        description="start and end in seconds; afterwards the sensor is as if nothing had been"
+    )
 
     @field_validator("window")
     @classmethod
@@ -299,19 +305,23 @@ class _Fault(Section):
 
 
 class _OnChannel(_Fault):
-    channel: str
-    bearing_deg: float | None = Field(None, ge=-360, le=360, description="of channels without a direction of their own")
+    channel: str = Field(description="quantity that it acts on; the choice depends on the sensor")
+    bearing_deg: float | None = Field(
+        None, ge=-360, le=360, description="direction of the offset, for channels that have none of their own"
+    )
 
 
 class _Sized(_OnChannel):
-    unit: str | None = Field(None, description="the channel's first unit unless it is given; or sigma")
+    unit: str | None = Field(
+        None, description="of the size: the channel's first unit unless given, another that fits, or `sigma`"
+    )
 
 
 class Step(_Sized):
     """A constant offset."""
 
     kind: Literal["step"]
-    size: Size
+    size: Size = Field(description="the offset")
 
     def offset(self, tau: float) -> float:
         """What is added ``tau`` [s] after the start, in the fault's unit."""
@@ -322,7 +332,7 @@ class Ramp(_Sized):
     """An offset that grows by ``slope`` per second."""
 
     kind: Literal["ramp"]
-    slope: Size
+    slope: Size = Field(description="growth of the offset per second")
 
     def offset(self, tau: float) -> float:
         """What is added ``tau`` [s] after the start, in the fault's unit."""
@@ -333,7 +343,7 @@ class Quadratic(_Sized):
     """An offset of ``coefficient`` times the square of the seconds."""
 
     kind: Literal["quadratic"]
-    coefficient: Size
+    coefficient: Size = Field(description="the offset is this times the square of the seconds since the start")
 
     def offset(self, tau: float) -> float:
         """What is added ``tau`` [s] after the start, in the fault's unit."""
@@ -344,8 +354,8 @@ class Exponential(_Sized):
     """An offset that settles at ``size``."""
 
     kind: Literal["exponential"]
-    size: Size
-    time_constant_s: Seconds
+    size: Size = Field(description="offset at which it settles")
+    time_constant_s: Seconds = Field(description="after which 63 % of the offset are reached")
 
     def offset(self, tau: float) -> float:
         """What is added ``tau`` [s] after the start, in the fault's unit."""
@@ -356,8 +366,8 @@ class Sine(_Sized):
     """An oscillation of amplitude ``size``."""
 
     kind: Literal["sine"]
-    size: Size
-    period_s: Seconds
+    size: Size = Field(description="amplitude")
+    period_s: Seconds = Field(description="of the oscillation")
 
     def offset(self, tau: float) -> float:
         """What is added ``tau`` [s] after the start, in the fault's unit."""
@@ -368,36 +378,36 @@ class Spikes(_Sized):
     """Single samples that are off by ``size``, one every ``period_s``."""
 
     kind: Literal["spikes"]
-    size: Size
-    period_s: Seconds
+    size: Size = Field(description="how far a spike is off")
+    period_s: Seconds = Field(description="from one spike to the next")
 
 
 class Stuck(_Sized):
     """Always the same value."""
 
     kind: Literal["stuck"]
-    value: Size | None = Field(None, description="the last one before the window unless it is given")
+    value: Size | None = Field(None, description="what the sensor says; none: the last value before the window")
 
 
 class Noise(_OnChannel):
     """The stated 1-sigma is ``factor`` times as large."""
 
     kind: Literal["noise"]
-    factor: float = Field(ge=1, le=1e6)
+    factor: float = Field(ge=1, le=1e6, description="how many times larger the white noise makes the stated 1-sigma")
 
 
 class Scale(_OnChannel):
     """The value times ``factor``."""
 
     kind: Literal["scale"]
-    factor: Size
+    factor: Size = Field(description="what the value is multiplied by")
 
 
 class Delay(_OnChannel):
     """The value of ``delay_s`` ago, under the time of now."""
 
     kind: Literal["delay"]
-    delay_s: float = Field(gt=0, le=3600)
+    delay_s: float = Field(gt=0, le=3600, description="age of the value that is given for the present one")
 
 
 class Garbage(_OnChannel):
@@ -407,7 +417,7 @@ class Garbage(_OnChannel):
 
 
 class _Losing(_Fault):
-    channel: str | None = Field(None, description="of an IMU, whose other channels go on: gyro or accel; none: all")
+    channel: str | None = Field(None, description="of an IMU, whose other channels go on: `gyro` or `accel`; none: all")
 
 
 class Dropout(_Losing):
@@ -420,24 +430,26 @@ class Slow(_Losing):
     """One sample of every ``factor``; an IMU, which is asked all the same, repeats its last rates."""
 
     kind: Literal["slow"]
-    factor: int = Field(ge=2, le=10_000)
+    factor: int = Field(ge=2, le=10_000, description="of so many samples one is left; an IMU repeats its last rates")
 
 
 class Intermittent(_Losing):
     """Comes and goes: no samples during the first ``share`` of every ``period_s``."""
 
     kind: Literal["intermittent"]
-    period_s: Seconds
-    share: float = Field(0.5, gt=0, lt=1)
+    period_s: Seconds = Field(description="from one loss to the next")
+    share: float = Field(
+        0.5, gt=0, lt=1, description="of each period during which there are no samples, at its beginning"
+    )
 
 
 class DragOff(_Fault):
     """Spoofing: position and velocity are drawn away together, smoothly."""
 
     kind: Literal["drag_off"]
-    bearing_deg: float = Field(ge=-360, le=360)
-    velocity_mps: Size = 0.0
-    acceleration_mps2: Size = 0.0
+    bearing_deg: float = Field(ge=-360, le=360, description="true direction of the pull")
+    velocity_mps: Size = Field(default=0.0, description="at which the position leaves from the start of the window")
+    acceleration_mps2: Size = Field(default=0.0, description="by which that velocity grows")
 
 
 FaultConfig: TypeAlias = (
