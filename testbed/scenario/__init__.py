@@ -82,8 +82,15 @@ def _sensor(table: object) -> Section:
 class DetectorConfig(Section):
     """What judges the samples of a local filter; ``false_alarm`` is the probability per look (`nav.detection`)."""
 
-    kind: Literal["chi_square", "eraim", "sprt", "glr", "none"] = "chi_square"
-    false_alarm: float | None = Field(default=None, gt=0, lt=0.5)
+    kind: Literal["chi_square", "eraim", "sprt", "glr", "none"] = Field(
+        default="chi_square", description="how the samples are judged"
+    )
+    false_alarm: float | None = Field(
+        default=None,
+        gt=0,
+        lt=0.5,
+        description="probability per sample without a fault; none: 1e-3 of one look, 1e-6 of gathered evidence",
+    )
     mean: Literal["plain", "window", "exponential", "eq20"] = Field(
         default="exponential", description="sprt: of what it has gathered; eq20 as Zhou et al. 2025 print it"
     )
@@ -124,7 +131,7 @@ class PolicyConfig(Section):
     limit (`MahalanobisInflation`); ``sage_husa`` learns R from the residuals, and the detector judges by that.
     """
 
-    kind: Literal["inflate", "sage_husa"]
+    kind: Literal["inflate", "sage_husa"] = Field(description="weaken what is suspect, or learn the noise")
     false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="inflate: of the limit, probability per look")
     reject_above: float | None = Field(
         default=None, gt=0, description="inflate: squared distance to leave out; none: never"
@@ -146,21 +153,23 @@ class PolicyConfig(Section):
 class LocalConfig(Section):
     """One local filter of a federated estimator."""
 
-    name: str
-    aids: Annotated[tuple[str, ...], Field(min_length=1)]
+    name: str = Field(description="what reports and metrics call it")
+    aids: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        description="sensors whose samples it uses, by their names"
+    )
     share: float | None = Field(default=None, gt=0, le=1, description="of the information; all alike without")
     engine: Literal["linear", "unscented"] = Field(default="linear", description="derivatives or sigma points")
-    detector: DetectorConfig = DetectorConfig()
+    detector: DetectorConfig = Field(default=DetectorConfig(), description="what judges the samples")
     policy: PolicyConfig | None = Field(default=None, description="what it does to R; none: R is as told")
 
 
 class HandoverConfig(Section):
     """The state that somebody else's navigation hands over at the start, instead of alignment: its errors, 1 sigma."""
 
-    level_deg: float = Field(gt=0, le=20)
-    heading_deg: float = Field(gt=0, le=90)
-    velocity_mps: float = Field(gt=0, le=100)
-    position_m: float = Field(gt=0, le=1e4)
+    level_deg: float = Field(gt=0, le=20, description="error of roll and pitch each")
+    heading_deg: float = Field(gt=0, le=90, description="error of the heading")
+    velocity_mps: float = Field(gt=0, le=100, description="error of velocity per axis")
+    position_m: float = Field(gt=0, le=1e4, description="error of position per axis")
 
 
 class LevelConfig(Section):
@@ -169,10 +178,17 @@ class LevelConfig(Section):
     Defaults are those of Jiang et al. 2021 (`nav.motion.LowDynamics`, `nav.ahrs.AhrsConfig`).
     """
 
-    acceleration_mps2: float = Field(default=0.2, gt=0, le=10)
-    yaw_rate_degps: float = Field(default=0.5, gt=0, le=100)
-    roll_rate_degps: float = Field(default=2.0, gt=0, le=100)
-    test: Literal["norm", "vector"] = "norm"
+    acceleration_mps2: float = Field(default=0.2, gt=0, le=10, description="largest acceleration at which it levels")
+    yaw_rate_degps: float = Field(
+        default=0.5, gt=0, le=100, description="largest rate about the body's down axis at which it levels"
+    )
+    roll_rate_degps: float = Field(
+        default=2.0, gt=0, le=100, description="largest rate about the body's forward axis at which it levels"
+    )
+    test: Literal["norm", "vector"] = Field(
+        default="norm",
+        description="acceleration by the size of specific force less gravity, or by its vector less gravity",
+    )
     force_sigma_mps2: float = Field(default=0.1, gt=0, le=10, description="of a second's mean, as a sign of tilt")
     limit_deg: float = Field(default=0.2, gt=0, le=20, description="largest correction per second and axis")
     gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
@@ -196,9 +212,14 @@ class FadingConfig(Section):
 
     window: int = Field(default=10, ge=1, le=1000, description="looks")
     alpha: float = Field(default=20.0, ge=1, le=100, description="times the expected innovation is divergence")
-    looks: Annotated[tuple[Literal["gnss_position", "gnss_velocity", "gnss_course"], ...], Field(min_length=1)] = (
-        "gnss_position", "gnss_velocity", "gnss_course",
-    )  # fmt: skip
+    looks: Annotated[tuple[Literal["gnss_position", "gnss_velocity", "gnss_course"], ...], Field(min_length=1)] = Field(
+        default=(
+            "gnss_position",
+            "gnss_velocity",
+            "gnss_course",
+        ),
+        description="innovations that are watched",
+    )
 
 
 ImuStates: TypeAlias = Literal["biases", "full"]
@@ -210,11 +231,13 @@ class EstimatorConfig(Section):
     A federated one lists its aids by local filter instead (`nav.federated.Config` explains its keys).
     """
 
-    name: str
-    kind: Literal["ins", "federated", "ahrs"] = "ins"
-    imu: str = "imu"
-    spare_imus: Annotated[tuple[str, ...], Field(max_length=3)] = ()  # voted with the first, of its kind and beside it
-    aids: tuple[str, ...]
+    name: str = Field(description="what the record, metrics and figures call it")
+    kind: Literal["ins", "federated", "ahrs"] = Field(default="ins", description="which estimator")
+    imu: str = Field(default="imu", description="the unit that it integrates, by its name")
+    spare_imus: Annotated[tuple[str, ...], Field(max_length=3)] = Field(
+        default=(), description="further units of the same rate, voted on together with the first"
+    )
+    aids: tuple[str, ...] = Field(description="sensors whose samples it uses, by their names")
     states: ImuStates = Field(default="biases", description="full: in-run instability and scale factors of the IMU too")
     turn_degps: float = Field(
         default=math.degrees(0.06), ge=0, le=360, description="usual rate of turn: how far scale errors count"
@@ -227,21 +250,31 @@ class EstimatorConfig(Section):
     engine: Literal["linear", "unscented"] = Field(default="linear", description="derivatives or sigma points")
     course: CourseConfig | None = Field(default=None, description="of its GNSS receiver; none: not used")
     sage_husa: SageHusaConfig | None = Field(default=None, description="none: the receiver's sigmas are believed")
-    fading: FadingConfig | None = None
+    fading: FadingConfig | None = Field(
+        default=None, description="covariance that follows diverging innovations; none: it does not"
+    )
     false_rejection: float = Field(default=1e-3, ge=0, lt=0.5, description="of sound samples by the gate; 0: no gate")
     heading_deg: Heading | None = Field(default=None, description="of an AHRS without magnetometer at the start")
     levelling: bool = Field(default=True, description="false: once it has begun, an AHRS goes by its gyros alone")
     level: LevelConfig | None = Field(default=None, description="how an AHRS levels; none: as light turbulence wants")
     autopilot: bool = Field(default=False, description="true: an AHRS levels only while level flight is commanded")
-    locals: tuple[LocalConfig, ...] = ()
-    structure: Literal["no_reset", "full_reset", "partial"] = "no_reset"
-    sharing: Literal["fixed", "by_covariance", "none"] = "fixed"
-    combination: Literal["information", "scalar", "covariance_intersection"] = "information"
+    locals: tuple[LocalConfig, ...] = Field(default=(), description="local filters of a federated one")
+    structure: Literal["no_reset", "full_reset", "partial"] = Field(
+        default="no_reset", description="what the fusion gives back to the local filters"
+    )
+    sharing: Literal["fixed", "by_covariance", "none"] = Field(
+        default="fixed", description="how the common information is divided among the local filters"
+    )
+    combination: Literal["information", "scalar", "covariance_intersection"] = Field(
+        default="information", description="how the local estimates are fused"
+    )
     retention: float = Field(default=0.5, ge=0, le=1, description="of a partial reset: 0 is none, 1 a full one")
     weighting: Literal["none", "normalised"] = Field(
         default="none", description="normalised: a sample counts for less the nearer its detector is to an alarm"
     )
-    fusion_period_s: float = Field(default=1.0, ge=0, le=60)
+    fusion_period_s: float = Field(
+        default=1.0, ge=0, le=60, description="from one fusion to the next; 0: at every sample"
+    )
     isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
     recall_s: float | None = Field(
@@ -270,8 +303,8 @@ class EstimatorConfig(Section):
 class FeedbackConfig(Section):
     """Whose attitude and whose position: an estimator's name, or ``truth``. In the file one name may stand for both."""
 
-    attitude: str = "truth"
-    position: str = "truth"
+    attitude: str = Field(default="truth", description="whose attitude: an estimator's name, or `truth`")
+    position: str = Field(default="truth", description="whose position: an estimator's name, or `truth`")
 
     @model_validator(mode="before")
     @classmethod
@@ -291,21 +324,26 @@ class FeedbackConfig(Section):
 class AutopilotConfig(Section):
     """What the autopilot flies on: ``testbed.feeds.autopilot`` says what comes from where."""
 
-    feedback: FeedbackConfig = FeedbackConfig()
+    feedback: FeedbackConfig = Field(
+        default=FeedbackConfig(),
+        description="whose attitude and position is flown on: an estimator's name, `truth`, or a table of both",
+    )
 
 
 class RecordConfig(Section):
     """What goes into the run file: rate of truth and estimates, and whether every IMU sample is kept."""
 
-    rate_hz: float = Field(default=10.0, gt=0)
-    imu: bool = True
+    rate_hz: float = Field(
+        default=10.0, gt=0, description="rows of truth and estimates per second; divides the tick rate"
+    )
+    imu: bool = Field(default=True, description="whether every IMU sample is kept")
 
 
 class Bounds(Section):
     """What a metric may be, both ends included. In the file a plain number is a maximum."""
 
-    min: float | None = None
-    max: float | None = None
+    min: float | None = Field(default=None, description="least value that is allowed")
+    max: float | None = Field(default=None, description="largest value that is allowed")
 
     @model_validator(mode="before")
     @classmethod
@@ -337,18 +375,27 @@ class Bounds(Section):
 class Scenario(Section):
     """One run, described. Made by `Scenario.load`; a changed one comes from loading with overrides."""
 
-    title: str = Field(min_length=1)
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    duration_s: float = Field(gt=0, le=LONGEST_RUN_S)
-    date: Date = dt.date(2026, 1, 1)
-    truth: FlightTruth | KinematicTruth = Field(discriminator="source")
-    plan: tuple[guidance.Leg, ...] = ()
-    sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(default_factory=dict)
-    fault: tuple[faults.Fault, ...] = ()
-    estimator: tuple[EstimatorConfig, ...] = ()
-    autopilot: AutopilotConfig = AutopilotConfig()
-    record: RecordConfig = RecordConfig()
-    expect: dict[str, Bounds] = Field(default_factory=dict)
+    title: str = Field(min_length=1, description="what reports and figures are headed with")
+    seed: int = Field(
+        default=0, ge=0, lt=2**63, description="of all random numbers: same scenario, same seed, same bits"
+    )
+    duration_s: float = Field(gt=0, le=LONGEST_RUN_S, description="length of the run in simulated time")
+    date: Date = Field(default=dt.date(2026, 1, 1), description="for the geomagnetic field")
+    truth: FlightTruth | KinematicTruth = Field(discriminator="source", description="the motion")
+    plan: tuple[guidance.Leg, ...] = Field(default=(), description="legs that a flight consists of, in order")
+    sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(
+        default_factory=dict, description="sensors by their names; a name is the kind unless `kind` says otherwise"
+    )
+    fault: tuple[faults.Fault, ...] = Field(default=(), description="what goes wrong with sensors, and when")
+    estimator: tuple[EstimatorConfig, ...] = Field(
+        default=(), description="any number of estimators, side by side on the same samples"
+    )
+    autopilot: AutopilotConfig = Field(default=AutopilotConfig(), description="what the aircraft flies on")
+    record: RecordConfig = Field(default=RecordConfig(), description="what is kept of the run")
+    expect: dict[str, Bounds] = Field(
+        default_factory=dict,
+        description="bounds on metrics by their names, for `testbed check`; a plain number is a maximum",
+    )
 
     _text: str = PrivateAttr("")
     _path: Path | None = PrivateAttr(None)
