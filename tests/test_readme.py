@@ -14,7 +14,7 @@ import typer
 
 import testbed.__main__ as cli
 from testbed import Scenario, run
-from testbed.motion.flight import modes_table
+from testbed.motion.modes import modes_table
 from testbed.sensors import imu
 from testbed.sensors.faults import CHANNELS, FaultConfig
 

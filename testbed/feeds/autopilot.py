@@ -52,7 +52,7 @@ from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
 from nav.samples import AirspeedSample, Array, BarometerSample, Estimate, ImuSamples, Sample, Status, UpdateReport
 from testbed.estimators import Running, Tracked
-from testbed.motion.guidance import Feedback
+from testbed.motion.paths import Feedback
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from nav.earth import position_difference_n
 from testbed.mavlink.encode import latitude_e7, longitude_e7
-from testbed.motion import guidance
+from testbed.motion import guidance, legs, paths
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import Scenario
@@ -89,7 +89,7 @@ class _Here:
     speed: float
 
 
-def _flown(plan: Sequence[guidance.Leg], truth: FlightTruth) -> list[Item]:
+def _flown(plan: Sequence[legs.Leg], truth: FlightTruth) -> list[Item]:
     start = truth.start
     here = _Here(
         math.radians(start.lat_deg),
@@ -101,7 +101,7 @@ def _flown(plan: Sequence[guidance.Leg], truth: FlightTruth) -> list[Item]:
     return [_leg(leg, here) for leg in plan]
 
 
-def _leg(leg: guidance.Leg, here: _Here) -> Item:
+def _leg(leg: legs.Leg, here: _Here) -> Item:
     """The item of a leg that begins ``here``; moves on to where it ends."""
     place = getattr(leg, "to", None) or getattr(leg, "centre", None)
     lat0, lon0 = (math.radians(place.lat_deg), math.radians(place.lon_deg)) if place else (here.lat, here.lon)
@@ -109,18 +109,18 @@ def _leg(leg: guidance.Leg, here: _Here) -> Item:
     to_h = getattr(leg, "to_m", None) or getattr(leg, "alt_m", None) or here.h
     to_speed = getattr(leg, "to_mps", None) or getattr(leg, "airspeed_mps", None) or here.speed
     length = math.inf
-    if isinstance(leg, guidance.Climb | guidance.Descend):
+    if isinstance(leg, legs.Climb | legs.Descend):
         length = abs(to_h - here.h) / leg.rate_mps * here.speed
-    elif isinstance(leg, guidance.Airspeed):
+    elif isinstance(leg, legs.Airspeed):
         length = abs(to_speed - here.speed) / guidance.ACCELERATION * 0.5 * (to_speed + here.speed)
     elif duration := getattr(leg, "duration_s", None):
         length = duration * to_speed
-    motion = guidance.Motion(
+    motion = paths.Motion(
         north, east, here.speed * math.cos(here.course), here.speed * math.sin(here.course), here.course, here.speed
     )
     centre: tuple[float, float] | None = None
     for count, segment in enumerate(leg.segments(motion, here.course)):
-        if isinstance(segment, guidance.Arc) and centre is None:
+        if isinstance(segment, paths.Arc) and centre is None:
             centre = segment.north, segment.east
         north, east, here.course, length = _along(segment, north, east, here.course, to_speed, length)
         if length <= 0.0 or count >= _MOST_SEGMENTS:
@@ -135,21 +135,21 @@ def _leg(leg: guidance.Leg, here: _Here) -> Item:
 
 
 def _along(
-    segment: guidance.Segment, north: float, east: float, course: float, speed: float, length: float
+    segment: paths.Segment, north: float, east: float, course: float, speed: float, length: float
 ) -> tuple[float, float, float, float]:
     """Where a segment ends, or ``length`` [m] runs out: north, east, course, and what is left of the length."""
-    if isinstance(segment, guidance.Line):
+    if isinstance(segment, paths.Line):
         course = segment.course
         gone = min(segment.length, length)
         gone = gone if math.isfinite(gone) else 0.0
         return north + gone * math.cos(course), east + gone * math.sin(course), course, length - gone
-    if isinstance(segment, guidance.HeadingTurn):
-        radius, turn = guidance.turn_radius(speed, guidance.TURN_BANK), segment.remaining
+    if isinstance(segment, paths.HeadingTurn):
+        radius, turn = paths.turn_radius(speed, legs.TURN_BANK), segment.remaining
         side = math.copysign(1.0, turn)
         middle = north - side * radius * math.sin(course), east + side * radius * math.cos(course)
         sweep = abs(turn)
     else:
-        assert isinstance(segment, guidance.Arc)
+        assert isinstance(segment, paths.Arc)
         radius, side, middle = segment.radius, float(segment.side), (segment.north, segment.east)
         sweep = segment.sweep
         off_north, off_east = north - middle[0], east - middle[1]
@@ -159,21 +159,21 @@ def _along(
     sweep = sweep if math.isfinite(sweep) else 0.0
     course += side * sweep
     end = middle[0] + side * radius * math.sin(course), middle[1] - side * radius * math.cos(course)
-    return *end, guidance.wrap(course), length - sweep * radius
+    return *end, paths.wrap(course), length - sweep * radius
 
 
-def _item(leg: guidance.Leg, end: _Here) -> Item:
+def _item(leg: legs.Leg, end: _Here) -> Item:
     """The item of a leg that ends there."""
     place = end.lat, end.lon, end.h
     match leg:
-        case guidance.Climb() | guidance.Descend():
-            way = 1.0 if isinstance(leg, guidance.Climb) else 2.0
+        case legs.Climb() | legs.Descend():
+            way = 1.0 if isinstance(leg, legs.Climb) else 2.0
             return Item(mav.MAV_CMD_NAV_CONTINUE_AND_CHANGE_ALT, (way, 0.0, 0.0, 0.0), *place)
-        case guidance.Airspeed():
+        case legs.Airspeed():
             return Item(mav.MAV_CMD_DO_CHANGE_SPEED, (0.0, leg.to_mps, -1.0, 0.0), 0.0, 0.0, end.h)
-        case guidance.Loiter() | guidance.Racetrack() | guidance.FigureEight():
+        case legs.Loiter() | legs.Racetrack() | legs.FigureEight():
             radius = leg.radius_m if leg.direction == "right" else -leg.radius_m
-            rounds = leg.laps if isinstance(leg, guidance.Racetrack) else leg.turns
+            rounds = leg.laps if isinstance(leg, legs.Racetrack) else leg.turns
             if rounds is not None:
                 return Item(mav.MAV_CMD_NAV_LOITER_TURNS, (rounds, 0.0, radius, 0.0), *place)
             assert leg.duration_s is not None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from array import array
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from pathlib import Path
+from typing import TypeAlias
 
 import jsbsim
 import numpy as np
@@ -15,7 +17,11 @@ from nav.earth import GAS_CONSTANT
 from nav.rotation import quat_conjugate, quat_from_euler, quat_rotate
 from nav.samples import Array
 from testbed.data import data_dir
-from testbed.motion.guidance import Feedback, Guidance, Leg, min_airspeed
+from testbed.errors import UserError
+from testbed.motion import aircraft as aircraft_files
+from testbed.motion.guidance import Guidance
+from testbed.motion.legs import Leg
+from testbed.motion.paths import Feedback
 from testbed.motion.sections import FlightTruth, Start, Wind
 from testbed.motion.table import TruthBlock, increments
 
@@ -42,11 +48,8 @@ INTEGRATORS = {"rate/rotational": 3, "rate/translational": 3, "position/rotation
 # exceedance curve of the high-altitude model (fig. 7: light 1e-2, moderate 1e-3, severe 1e-5; JSBSim counts them).
 TURBULENCE = {"light": (25.3, 3), "moderate": (50.6, 4), "severe": (76.0, 6)}
 
-# Electrical load [A] on a 6 V bus, aircraft/SOURCES.md: avionics and payload, a servo at rest, at full rate.
-PAYLOAD_CURRENT, SERVO_IDLE, SERVO_RUNNING = 1.5, 0.01, 0.4
 SERVO_RATE = 10.0  # normalised travel per second at full rate
-
-TRAVEL = {"aileron": 0.35, "elevator": 0.52, "rudder": 0.35}  # of the surfaces [rad], as in the autopilot's actuators
+SURFACES = ("aileron", "elevator", "rudder")  # ap/travel/<surface>-rad says how far each goes [rad]
 
 # What is read on every tick: property and its unit in SI.
 STATE: Mapping[str, float] = {
@@ -69,9 +72,7 @@ STATE: Mapping[str, float] = {
     "atmosphere/T-R": RANKINE,
     "propulsion/engine/engine-rpm": 1.0,
     "propulsion/total-fuel-lbs": POUND,
-    "fcs/aileron-pos-rad": 1 / TRAVEL["aileron"],
-    "fcs/elevator-pos-rad": 1 / TRAVEL["elevator"],
-    "fcs/rudder-pos-rad": 1 / TRAVEL["rudder"],
+    **{f"fcs/{surface}-pos-rad": 1.0 for surface in SURFACES},  # over the aircraft's travel in `Aircraft.units`
     "fcs/throttle-pos-norm": 1.0,
 }
 # What is linearised: initial condition and rate of change, in JSBSim's units.
@@ -89,7 +90,6 @@ ENGINE_SETTLING_S = 3.0
 
 MAX_ROLL, MAX_PITCH = math.radians(80.0), math.radians(60.0)  # beyond these control is lost
 WIDTH = len(STATE)
-UNITS = np.array(list(STATE.values()))
 
 
 class Flight:
@@ -115,7 +115,8 @@ class Flight:
         self._feedback: Feedback | None = None
         self._wind_asked: tuple[float, float] | None = None  # north, east [m/s]
         alt, speed = truth.start.alt_m, truth.start.airspeed_mps
-        self._guidance = Guidance(plan, self.true_feedback(), alt, speed, self._frame / truth.rate_hz)
+        envelope, period = self._aircraft.envelope, self._frame / truth.rate_hz
+        self._guidance = Guidance(plan, envelope, self.true_feedback(), alt, speed, period)
         self._commands = (0.0, alt, speed, 0.0)  # bank, altitude, airspeed, leg
 
     def advance(self, ticks: int) -> TruthBlock:
@@ -194,7 +195,8 @@ class Flight:
         block = TruthBlock.empty(first, rows)
         if rows == 0:
             return block
-        table = np.concatenate((np.array(self._last), np.frombuffer(raw))).reshape(rows + 1, WIDTH) * UNITS
+        table = np.concatenate((np.array(self._last), np.frombuffer(raw))).reshape(rows + 1, WIDTH)
+        table *= self._aircraft.units
         self._last = raw[-WIDTH:].tolist()
         t = (first - 1 + np.arange(rows + 1)) / self.rate_hz
         v_n, wind_n, controls = table[:, 3:6], table[:, 12:15], table[:, 19:23]
@@ -213,9 +215,11 @@ class Flight:
         block.density[:] = block.pressure / (GAS_CONSTANT * block.temperature)
         block.engine_rpm[:], block.fuel[:] = table[1:, 17], table[1:, 18]
         block.controls[:] = controls[1:]
-        block.current[:] = PAYLOAD_CURRENT + 4 * SERVO_IDLE
+        load = self._aircraft.envelope.current
+        block.current[:] = load.payload_a + 4 * load.servo_idle_a
         for servo in range(4):
-            block.current[:] += SERVO_RUNNING * servos[:, servo]
+            block.current[:] += load.servo_running_a * servos[:, servo]
+        block.current[:] += load.motor_a * block.controls[:, 3]
         repeats = [steps for steps, _ in commands]
         held = np.repeat(np.array([values for _, values in commands]), repeats, axis=0)
         block.commands[:], block.leg[:] = held[:, :3], held[:, 3]
@@ -223,32 +227,54 @@ class Flight:
 
 
 class Aircraft:
-    """A JSBSim model with its property nodes held; SI at every method."""
+    """A JSBSim model with its property nodes held; SI at every method.
+
+    ``name`` is a shipped aircraft's, or the path of a folder. Raises UserError when it can't be loaded.
+    """
 
     def __init__(self, name: str, rate_hz: float) -> None:
         jsbsim.set_logger(LOGGER)  # per thread; no banner
-        folder = data_dir("aircraft")
-        self.fdm = jsbsim.FGFDMExec(str(folder))
+        self.name, self.envelope = name, aircraft_files.load(name)
+        self._folder = aircraft_files.folder(name)
+        self.fdm = jsbsim.FGFDMExec(str(data_dir("aircraft")))
         self.fdm.set_debug_level(0)
-        self.fdm.set_aircraft_path(".")
-        self.fdm.set_engine_path("engine")
+        self.fdm.set_aircraft_path(str(self._folder.parent))
+        self.fdm.set_engine_path("engine")  # the shipped ones, after those in the aircraft's own folder
         self.fdm.set_systems_path("systems")
         self.fdm.set_dt(1.0 / rate_hz)  # before loading: filters take their coefficients from it
-        self.fdm.load_model(name)
+        self._load()
         self.fdm.disable_output()
         for integrator, number in INTEGRATORS.items():
             self.fdm[f"simulation/integrator/{integrator}"] = number
         self.rate_hz = rate_hz
         self._read = [self._node(name).get_double_value for name in STATE]
+        tanks = (f"propulsion/tank[{number}]/contents-lbs" for number in itertools.count())
+        self._tanks = list(itertools.takewhile(self.fdm.get_property_manager().get_node, tanks))
         self._command = [
             self._node(f"ap/{name}").set_double_value
             for name in ("bank-cmd-rad", "altitude-cmd-m", "climb-cmd-mps", "airspeed-cmd-mps")
         ]
+        self.travel = {surface: self._node(f"ap/travel/{surface}-rad").get_double_value() for surface in SURFACES}
+        travels = {f"fcs/{surface}-pos-rad": 1 / travel for surface, travel in self.travel.items()}
+        self.units = np.array(list({**STATE, **travels}.values()))  # of a row, in SI and shares of travel
+
+    def _load(self) -> None:
+        """Let JSBSim read the model."""
+        try:
+            loaded = self.fdm.load_model(self._folder.name)
+        except jsbsim.BaseError as error:
+            raise UserError(f"{self._model}: JSBSim can't read it: {error}") from None
+        if not loaded:
+            raise UserError(f"{self._model}: JSBSim can't read it: its messages above say why")
+
+    @property
+    def _model(self) -> Path:
+        return self._folder / f"{self._folder.name}.xml"
 
     def _node(self, name: str) -> jsbsim.FGPropertyNode:
         node = self.fdm.get_property_manager().get_node(name)
         if node is None:
-            raise KeyError(f"the aircraft has no property {name}")
+            raise UserError(f'{self._model}: has no property {name}: does it lack <system file="autopilot"/>?')
         return node
 
     def read(self) -> list[float]:
@@ -314,10 +340,10 @@ class Aircraft:
         the start position and heading.
         """
         fdm = self.fdm
-        fuel = fdm["propulsion/tank/contents-lbs"]
+        fuel = {name: fdm[name] for name in self._tanks}
         wind = _wind_at(winds, start.alt_m)
         # JSBSim's engine start finds no steady state at high advance ratios, so the engine is started slowly.
-        slow = _v_n(1.15 * min_airspeed(start.alt_m), start.heading_deg)
+        slow = _v_n(1.15 * self.envelope.min_airspeed(start.alt_m), start.heading_deg)
         self._place(start, (0.0, 0.0, math.radians(start.heading_deg)), slow, (0.0, 0.0))
         fdm["propulsion/set-running"] = -1
         fdm["fcs/throttle-cmd-norm"] = 0.5
@@ -328,7 +354,8 @@ class Aircraft:
         euler = (fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], math.radians(start.heading_deg))
         air_b = np.array([fdm[f"velocities/{axis}-aero-fps"] for axis in "uvw"]) * FOOT
         air_n = quat_rotate(quat_from_euler(*euler), air_b)
-        fdm["propulsion/tank/contents-lbs"] = fuel
+        for name, contents in fuel.items():
+            fdm[name] = contents
         self._place(start, euler, (air_n[0] + wind[0], air_n[1] + wind[1], air_n[2]), wind)
 
     def linearise(self) -> tuple[Array, Array]:
@@ -338,7 +365,7 @@ class Aircraft:
         torque is left out.
         """
         fdm = self.fdm
-        for surface, travel in TRAVEL.items():
+        for surface, travel in self.travel.items():
             fdm[f"fcs/{surface}-cmd-norm"] = fdm[f"fcs/{surface}-pos-rad"] / travel
         fdm["fcs/throttle-cmd-norm"] = fdm["fcs/throttle-pos-norm"]
         fdm["ap/engaged"], fdm["ap/hold"] = 0.0, -1.0
@@ -384,61 +411,6 @@ class Aircraft:
         fdm["ic/vw-mag-fps"] = math.hypot(*wind) / FOOT
         fdm["ic/vw-dir-deg"] = math.degrees(math.atan2(wind[1], wind[0]))
         fdm.run_ic()
-
-
-class Mode(NamedTuple):
-    """One natural mode of the bare airframe: eigenvalue [1/s], and what can be seen of it.
-
-    ``period`` [s] is infinite for a mode that does not oscillate; ``time_constant`` [s] is 1/|real part|.
-    """
-
-    name: str
-    eigenvalue: complex
-    damping: float
-    period: float
-    time_constant: float
-
-
-def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[Mode]:
-    """Short period, phugoid, Dutch roll, roll and spiral at a trimmed true airspeed [m/s], loops off, controls fixed.
-
-    From central differences of JSBSim's own accelerations. The airframe is frozen at each perturbed state until the
-    engine has found its speed there, so thrust is what a fixed throttle gives.
-    """
-    aircraft = Aircraft(name, 200.0)
-    aircraft.start(Start(lat_deg=0, lon_deg=0, alt_m=alt_m, heading_deg=0, airspeed_mps=airspeed), CALM)
-    longitudinal, lateral = (np.linalg.eigvals(block) for block in aircraft.linearise())
-    phugoid, _, short, _ = sorted(longitudinal, key=lambda s: (abs(s), s.imag))
-    spiral, *dutch, roll = sorted(lateral, key=lambda s: (abs(s.real) if s.imag == 0 else 1.0, s.imag))
-    named = {
-        "short period": short,
-        "phugoid": phugoid,
-        "Dutch roll": dutch[-1],
-        "roll": roll,
-        "spiral": spiral,
-    }
-    return [_mode(name, complex(s)) for name, s in named.items()]
-
-
-def modes_table(airspeeds: Sequence[float] = (20.0, 25.0, 30.0, 35.0), alt_m: float = 800.0) -> str:
-    """The modes at several trimmed airspeeds, as a Markdown table."""
-    lines = [
-        "| airspeed m/s | mode | eigenvalue 1/s | damping | period s | time constant s |",
-        "|---|---|---|---|---|---|",
-    ]
-    for airspeed in airspeeds:
-        for mode in modes(airspeed, alt_m):
-            s, period = mode.eigenvalue, f"{mode.period:.2f}" if math.isfinite(mode.period) else "–"
-            value = f"{s.real:.3f} ± {abs(s.imag):.3f}i" if s.imag else f"{s.real:.4f}"
-            lines.append(
-                f"| {airspeed:g} | {mode.name} | {value} | {mode.damping:.2f} | {period} | {mode.time_constant:.2f} |"
-            )
-    return "\n".join(lines)
-
-
-def _mode(name: str, s: complex) -> Mode:
-    period = 2 * math.pi / abs(s.imag) if s.imag else math.inf
-    return Mode(name, s, -s.real / abs(s), period, 1.0 / abs(s.real))
 
 
 @njit

@@ -63,7 +63,9 @@ class FlightTruth(Section):
     """Motion from JSBSim: an aircraft flies the scenario's plan."""
 
     source: Literal["flight"]
-    aircraft: str = Field(default="loiter", description="which aircraft flies")
+    aircraft: str = Field(
+        default="loiter", description="a shipped aircraft by name, or the path of a folder, seen from this file"
+    )
     rate_hz: TickRate = 200.0
     start: Start = Field(description="where the flight begins, trimmed, straight and level")
     wind: Wind = Field(default=Wind(), description="wind and turbulence; none: calm air")

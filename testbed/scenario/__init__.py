@@ -1,7 +1,7 @@
 """The scenario file: what to fly, sense, estimate and expect. Whatever can be found wrong with it is found here.
 
 A scenario is one TOML file. Sensors and plan legs declare their own keys beside their code (`testbed.sensors`,
-`testbed.motion.guidance`); the sections that belong to nobody else are here. `Scenario.load` reports every mistake of a
+`testbed.motion.legs`); the sections that belong to nobody else are here. `Scenario.load` reports every mistake of a
 file at once, each with its line and key path.
 """
 
@@ -23,7 +23,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from testbed import measures
 from testbed.data import data_dir
 from testbed.errors import UserError
-from testbed.motion import guidance
+from testbed.motion import aircraft, guidance, legs
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
@@ -382,7 +382,7 @@ class Scenario(Section):
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S, description="length of the run in simulated time")
     date: Date = Field(default=dt.date(2026, 1, 1), description="for the geomagnetic field")
     truth: FlightTruth | KinematicTruth = Field(discriminator="source", description="the motion")
-    plan: tuple[guidance.Leg, ...] = Field(default=(), description="legs that a flight consists of, in order")
+    plan: tuple[legs.Leg, ...] = Field(default=(), description="legs that a flight consists of, in order")
     sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(
         default_factory=dict, description="sensors by their names; a name is the kind unless `kind` says otherwise"
     )
@@ -434,7 +434,9 @@ class Scenario(Section):
         if not data:
             raise UserError(f"{place}: is empty: begin with a copy of {data_dir('scenarios') / 'u_turn.toml'}")
         set_paths = {keypath.assign(data, override): override for override in overrides}
-        sensors = data.get("sensors")
+        truth, sensors = data.get("truth"), data.get("sensors")
+        if isinstance(truth, dict) and isinstance(named := truth.get("aircraft"), str):
+            truth["aircraft"] = _aircraft(named, path)
         for name, table in sensors.items() if isinstance(sensors, dict) else ():
             if isinstance(table, dict):
                 table.setdefault("kind", name)
@@ -521,6 +523,12 @@ def _toml(text: str, place: str) -> dict[str, Any]:
         raise UserError(f"{place}: is not valid TOML: {error}") from None
 
 
+def _aircraft(named: str, path: Path | None) -> str:
+    """A shipped aircraft's name as it is; the path of another's folder, as seen from the scenario file, in full."""
+    found = None if named in aircraft.shipped() else aircraft.find(named, path.parent if path else None)
+    return named if found is None else str(found)
+
+
 def _frozen(value: Any) -> Any:
     """The same with tuples for lists: sections are immutable, and strict validation does not convert."""
     if isinstance(value, dict):
@@ -557,16 +565,18 @@ def _plan_faults(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     if not scenario.plan:
         yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
         return
-    aircraft = sorted(file.stem for file in data_dir("aircraft").glob("*/*.xml") if file.stem == file.parent.name)
-    if scenario.truth.aircraft not in aircraft:
-        yield ("truth", "aircraft"), _unknown("aircraft", scenario.truth.aircraft, aircraft)
-    wind = scenario.truth.wind
+    named, wind = scenario.truth.aircraft, scenario.truth.wind
+    if aircraft.find(named) is None:
+        missing = _unknown("aircraft", named, list(aircraft.shipped()))
+        yield ("truth", "aircraft"), f"{missing}, or give the path of its folder, as seen from the scenario file"
+        return
     try:
-        guidance.check_plan(
-            scenario.plan, scenario.truth.start, max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
-        )
-    except ValueError as error:
-        key, _, what = str(error).partition(": ")
+        envelope = aircraft.load(named)
+    except UserError as error:
+        yield ("truth", "aircraft"), str(error)
+        return
+    strongest = max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
+    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, strongest):
         yield keypath.read(key), what
 
 

@@ -49,7 +49,7 @@ from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, FixType, Status
 from testbed.data import write_file
 from testbed.errors import UserError
-from testbed.motion import guidance
+from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
 from testbed.scenario import Scenario
 from testbed.sensors.faults import FaultTruth
@@ -304,7 +304,8 @@ def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]
         return {}
     t, bank = column(dataset, "truth/time"), np.abs(euler(column(dataset, "truth/q_nb"))[:, 0])
     eas = column(dataset, "truth/airspeed") * np.sqrt(column(dataset, "truth/density") / earth.SEA_LEVEL_DENSITY)
-    stall = guidance.STALL_EAS / np.sqrt(np.maximum(np.cos(bank), 0.01))
+    limits = aircraft.load(scenario.truth.aircraft).airspeed
+    stall = limits.stall_mps / np.sqrt(np.maximum(np.cos(bank), 0.01))
     climb_error = np.abs(column(dataset, "truth/h") - column(dataset, "truth/commands")[:, 1])
     path_error = _path_error(dataset, scenario.plan)
     denied = inside(t, windows)
@@ -316,7 +317,7 @@ def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]
         result |= {
             f"{prefix}bank_max_deg": float(np.rad2deg(bank[mask].max())),
             f"{prefix}stall_margin_min_mps": float((eas - stall)[mask].min()),
-            f"{prefix}overspeed_margin_min_mps": float((guidance.MAX_EAS - eas)[mask].min()),
+            f"{prefix}overspeed_margin_min_mps": float((limits.max_mps - eas)[mask].min()),
             f"{prefix}altitude_error_max_m": float(climb_error[mask].max()),
         }
         on_path = path_error[mask & np.isfinite(path_error)]
@@ -325,13 +326,13 @@ def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]
     return result
 
 
-def _path_error(dataset: xarray.DataTree, plan: Sequence[guidance.Leg]) -> Array:
+def _path_error(dataset: xarray.DataTree, plan: Sequence[legs.Leg]) -> Array:
     """Distance (N,) [m] from the circle that is being flown, NaN where there is none."""
     t, leg = column(dataset, "truth/time"), column(dataset, "truth/leg")
     result = np.full(len(leg), np.nan)
     for index, one in enumerate(plan):
         rows = np.flatnonzero(leg == index)
-        if not isinstance(one, guidance.Loiter) or one.centre is None or not len(rows):
+        if not isinstance(one, legs.Loiter) or one.centre is None or not len(rows):
             continue
         lat, lon, h = (column(dataset, f"truth/{name}")[rows] for name in ("lat", "lon", "h"))
         centre = np.deg2rad([one.centre.lat_deg, one.centre.lon_deg])

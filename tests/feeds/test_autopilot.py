@@ -22,7 +22,7 @@ from testbed.loop import loop
 from testbed.loop.requests import Clear, Inject, Recorded
 from testbed.many.check import judge
 from testbed.motion.flight import Flight
-from testbed.motion.guidance import Feedback
+from testbed.motion.paths import Feedback
 from testbed.score.metrics import column
 
 PERFECT = [f"sensors.{name}.grade=perfect" for name in ("imu", "gnss", "barometer", "magnetometer", "airspeed")]

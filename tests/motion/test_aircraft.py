@@ -8,10 +8,12 @@ from array import array
 import numpy as np
 import pytest
 
-from testbed.motion.flight import CALM, FOOT, POUND, Aircraft, modes, modes_table
-from testbed.motion.guidance import climb_limit, descent_limit
+from testbed.motion.aircraft import load
+from testbed.motion.flight import CALM, FOOT, POUND, Aircraft
+from testbed.motion.modes import modes, modes_table
 from testbed.motion.sections import Start
 
+LOITER = load("loiter")
 AIRSPEEDS = [20.0, 22.5, 25.0, 27.5, 30.0, 32.5, 35.0]
 # Wing area, span, chord [m], mass [kg], inertias [kg m^2].
 S, B, C, MASS = 0.55, 2.8956, 0.189941, 13.5
@@ -151,7 +153,7 @@ def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
 
 def test_climbs_as_the_plan_check_believes(aircraft: Aircraft) -> None:
     for airspeed, alt in [(21.0, 100.0), (25.0, 100.0), (32.0, 100.0), (27.0, 2500.0), (34.0, 2500.0)]:
-        for rate in (climb_limit(airspeed, alt), -descent_limit(airspeed, alt)):
+        for rate in (LOITER.climb_limit(airspeed, alt), -LOITER.descent_limit(airspeed, alt)):
             aircraft.start(level(alt, airspeed), CALM)
             climbing(aircraft, airspeed, alt, 40.0, rate)
             height, speed, throttle = values(

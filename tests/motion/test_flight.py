@@ -21,8 +21,11 @@ from scipy.spatial.transform import Rotation
 import testbed
 from nav import earth, strapdown
 from testbed.data import data_dir
+from testbed.motion import aircraft
 from testbed.motion.flight import LOGGER, Aircraft, Flight
-from testbed.motion.guidance import Feedback, Leg, check_plan
+from testbed.motion.guidance import plan_mistakes
+from testbed.motion.legs import Leg
+from testbed.motion.paths import Feedback
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import COLUMNS, TruthBlock
 
@@ -46,7 +49,7 @@ def flight(
 ) -> Flight:
     truth = FlightTruth(source="flight", rate_hz=rate_hz, start={**START, **start}, wind=wind or {})
     legs = PLAN.validate_python(plan)
-    check_plan(legs, truth.start, truth.wind.speed_mps)
+    assert not plan_mistakes(legs, truth.start, aircraft.load("loiter"), truth.wind.speed_mps)
     return Flight(truth, legs, seed)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,23 +12,16 @@ import pymap3d
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from testbed.motion.guidance import (
-    GRAVITY,
-    MAX_BANK,
-    Feedback,
-    Guidance,
-    Leg,
-    TangentPlane,
-    bank_limit,
-    check_plan,
-    min_airspeed,
-    turn_radius,
-    wrap,
-)
+from testbed.motion import aircraft
+from testbed.motion.aircraft import GRAVITY
+from testbed.motion.guidance import Guidance, plan_mistakes
+from testbed.motion.legs import Leg
+from testbed.motion.paths import Feedback, TangentPlane, turn_radius, wrap
 
 ELLIPSOID = pymap3d.Ellipsoid.from_name("wgs84")
 PLAN = TypeAdapter(list[Leg])
 RATE_HZ = 20.0
+LOITER = aircraft.load("loiter")
 
 
 def legs(*tables: dict[str, Any]) -> list[Any]:
@@ -55,7 +49,7 @@ class PointMass:
         self.lat, self.lon, self.h = math.radians(lat), math.radians(lon), 800.0
         self.bank, self.speed, self.wind = 0.0, speed, wind
         self.heading = course
-        self.guidance = Guidance(plan, self.state(), 800.0, speed, 1 / RATE_HZ)
+        self.guidance = Guidance(plan, LOITER, self.state(), 800.0, speed, 1 / RATE_HZ)
 
     def velocity(self) -> tuple[float, float]:
         return (
@@ -246,9 +240,9 @@ def test_activity_says_leg_and_progress() -> None:
 def test_bank_never_passes_the_limit_of_the_airspeed() -> None:
     plan = legs({"leg": "turn", "by_deg": 180}, {"leg": "loiter", "radius_m": 75, "turns": 2})
     track = PointMass(plan, speed=21.5).fly()
-    assert np.abs(track[:, 5]).max() <= bank_limit(21.5, 800.0) + 1e-9
-    assert bank_limit(40.0, 0.0) == MAX_BANK
-    assert bank_limit(min_airspeed(0.0), 0.0) == 0.0
+    assert np.abs(track[:, 5]).max() <= LOITER.bank_limit(21.5, 800.0) + 1e-9
+    assert LOITER.bank_limit(40.0, 0.0) == LOITER.max_bank
+    assert LOITER.bank_limit(LOITER.min_airspeed(0.0), 0.0) == 0.0
 
 
 @pytest.mark.parametrize(("lat", "lon"), [*PLACES, (84.9, 10.0)])
@@ -278,13 +272,8 @@ def test_tangent_plane_against_pymap3d(lat: float, lon: float) -> None:
         ({"leg": "straight"}, "ends by length_m or by to"),
         ({"leg": "straight", "length_m": 10, "to": {"lat_deg": 1, "lon_deg": 1}}, "give one of them"),
         ({"leg": "loiter", "radius_m": 300}, "ends by turns or by duration_s"),
-        ({"leg": "loiter", "radius_m": 20, "turns": 1}, "below the bank limit at any airspeed"),
         ({"leg": "turn"}, "ends by to_deg or by by_deg"),
         ({"leg": "turn", "by_deg": 90, "direction": "left"}, "leave direction out"),
-        ({"leg": "airspeed", "to_mps": 12}, "too slow: the aircraft stalls at"),
-        ({"leg": "airspeed", "to_mps": 80}, "too fast"),
-        ({"leg": "climb", "to_m": 9000}, "can't be flown"),
-        ({"leg": "descend", "to_m": -20}, "the ground is at 0 m"),
         ({"leg": "climb", "to_m": 900, "rate_mps": -1}, "greater than 0"),
         ({"leg": "racetrack", "length_m": 500, "radius_m": 200}, "ends by laps or by duration_s"),
         ({"leg": "figure_eight", "radius_m": 200}, "ends by turns or by duration_s"),
@@ -346,16 +335,42 @@ def test_a_plan_that_cannot_be_flown_is_refused(
     tables: list[Any], start: dict[str, float], wind: float, message: str
 ) -> None:
     beginning = SimpleNamespace(**{"alt_m": 800.0, "airspeed_mps": 25.0, **start})
-    with pytest.raises(ValueError, match=message):
-        check_plan(legs(*tables), beginning, wind)
+    (key, what), *others = plan_mistakes(legs(*tables), beginning, LOITER, wind)
+    assert re.match(message, f"{key}: {what}")
+    assert not others
+
+
+def test_every_leg_that_this_aircraft_can_never_fly_is_named() -> None:
+    beginning = SimpleNamespace(alt_m=800.0, airspeed_mps=25.0)
+    plan = legs(
+        {"leg": "loiter", "radius_m": 20, "turns": 1},
+        {"leg": "airspeed", "to_mps": 12},
+        {"leg": "airspeed", "to_mps": 80},
+        {"leg": "climb", "to_m": 9000},
+        {"leg": "descend", "to_m": -20},
+        {"leg": "straight", "length_m": 100, "alt_m": 0},
+    )
+    found = dict(plan_mistakes(plan, beginning, LOITER))
+    said = {
+        "plan[0].radius_m": "below the bank limit at any airspeed",
+        "plan[1].to_mps": "too slow: the aircraft stalls at",
+        "plan[2].to_mps": "too fast",
+        "plan[3].to_m": "can't be flown",
+        "plan[4].to_m": "the ground is at 0 m",
+        "plan[5].alt_m": "the ground is at 0 m",
+    }
+    assert found.keys() == said.keys()
+    for key, text in said.items():
+        assert text in found[key]
+    assert "plan[1].to_mps" not in dict(plan_mistakes(plan, beginning, aircraft.load("flying_wing")))  # it can: 12 m/s
 
 
 def test_altitude_and_airspeed_carry_over_from_leg_to_leg() -> None:
     beginning = SimpleNamespace(alt_m=800.0, airspeed_mps=25.0)
     tight = {"leg": "loiter", "radius_m": 110, "turns": 1}
-    check_plan(legs({"leg": "airspeed", "to_mps": 23}, tight), beginning)
-    with pytest.raises(ValueError, match=r"plan\[1\]\.radius_m"):
-        check_plan(legs({"leg": "airspeed", "to_mps": 30}, tight), beginning)
+    assert not plan_mistakes(legs({"leg": "airspeed", "to_mps": 23}, tight), beginning, LOITER)
+    ((key, _),) = plan_mistakes(legs({"leg": "airspeed", "to_mps": 30}, tight), beginning, LOITER)
+    assert key == "plan[1].radius_m"
 
 
 def test_the_least_radius_holds_the_bank_limit() -> None:

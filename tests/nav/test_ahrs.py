@@ -573,7 +573,7 @@ def test_half_an_hour_without_gnss(plan):
     from testbed import sensors
     from testbed.estimators import imu_model
     from testbed.motion.flight import Flight
-    from testbed.motion.guidance import Leg
+    from testbed.motion.legs import Leg
     from testbed.motion.sections import FlightTruth
 
     seconds = 1800.0
