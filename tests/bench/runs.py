@@ -1,0 +1,159 @@
+"""What a run costs: over the simulator alone, at its start, in a campaign, and as it grows."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+
+from bench.measure import MAIN, TWO_ESTIMATORS, Effort, Row, alternate, cpu_seconds, ratios, wall_seconds
+from bench.shares import shares
+
+from testbed.loop import loop
+from testbed.motion.flight import Aircraft
+from testbed.motion.sections import FlightTruth
+from testbed.scenario import Scenario
+
+CAMPAIGN_RUNS = 20
+
+
+def whole_run(effort: Effort) -> Iterator[Row]:
+    """Wall time to fly, sense, run two estimators and record, over JSBSim stepping the same aircraft as long.
+
+    A run counts until its record is complete and read back (`run.wall_s`): what comes then, metrics, is no part of it.
+    """
+    scenario = _main_scenario(effort, TWO_ESTIMATORS)
+    with tempfile.TemporaryDirectory() as folder:
+        whole, bare = alternate(
+            lambda: loop.run(scenario, out=Path(folder)).metrics["run.wall_s"],
+            lambda: wall_seconds(lambda: _step(scenario)),
+            effort,
+        )
+    yield Row("whole run / bare JSBSim stepping, wall", ratios(whole, bare), at_most=2.0, detail=_over(whole, bare))
+
+
+def cpu_two_estimators(effort: Effort) -> Iterator[Row]:
+    """Processor time of a whole run with two estimators and record, over JSBSim stepping the same aircraft."""
+    yield _cpu("two estimators and record / bare JSBSim, CPU", _main_scenario(effort, TWO_ESTIMATORS), 2.2, effort)
+
+
+def cpu_main_scenario(effort: Effort) -> Iterator[Row]:
+    """The same of the main scenario with its three estimators."""
+    yield _cpu("main scenario's three and record / bare, CPU", _main_scenario(effort), 3.0, effort)
+
+
+def _cpu(what: str, scenario: Scenario, at_most: float, effort: Effort) -> Row:
+    """A run in seconds of all processes, metrics included, and which part of the product takes how much of them."""
+    with tempfile.TemporaryDirectory() as folder:
+
+        def fly() -> None:
+            loop.run(scenario, out=Path(folder))
+
+        whole, bare = alternate(lambda: cpu_seconds(fly), lambda: cpu_seconds(lambda: _step(scenario)), effort)
+        parts = ", ".join(f"{room} {percent:.0f} %" for room, percent in shares(fly).items())
+    return Row(what, ratios(whole, bare), at_most=at_most, detail=f"{_over(whole, bare)}: {parts}")
+
+
+def _main_scenario(effort: Effort, *overrides: str) -> Scenario:
+    """The main scenario, all of it or its beginning."""
+    full = Scenario.load(MAIN, [*overrides, "expect={}"])
+    duration = effort.count(full.duration_s)
+    return full.model_copy(update={"duration_s": float(duration)})
+
+
+def _step(scenario: Scenario) -> None:
+    """Step JSBSim's model of the scenario's aircraft as long as the scenario flies, nothing read."""
+    truth = scenario.truth
+    assert isinstance(truth, FlightTruth)
+    aircraft = Aircraft(truth.aircraft, truth.rate_hz)
+    aircraft.start(truth.start, [(0.0, 0.0, 0.0)])
+    aircraft.turbulence(truth.wind.turbulence, 1)
+    run = aircraft.fdm.run
+    for _ in range(round(scenario.duration_s * truth.rate_hz)):
+        run()
+
+
+def _over(whole: tuple[float, ...], bare: tuple[float, ...]) -> str:
+    return f"{median(whole):.2f} s over {median(bare):.2f} s"
+
+
+def campaign_efficiency(effort: Effort) -> Iterator[Row]:
+    """Wall time of a campaign of the main scenario with two estimators, on one worker over twice that on two."""
+    from testbed.many.campaign import campaign
+
+    runs, overrides = effort.count(CAMPAIGN_RUNS), [TWO_ESTIMATORS, "expect={}"]
+    seconds: dict[int, list[float]] = {2: [], 1: []}
+    for _ in range(min(3, effort.rounds)):
+        for workers, taken in seconds.items():
+            with tempfile.TemporaryDirectory() as folder:
+                began = time.perf_counter()
+                campaign(MAIN, runs, overrides=overrides, out=Path(folder), workers=workers)
+                taken.append(time.perf_counter() - began)
+    detail = f"{runs} runs: {median(seconds[1]):.0f} s on one worker, {median(seconds[2]):.0f} s on two"
+    halves = tuple(one / 2 for one in seconds[1])
+    yield Row("campaign: parallel efficiency", ratios(halves, seconds[2]), "", at_least=0.85, detail=detail)
+
+
+def start_up(effort: Effort) -> Iterator[Row]:
+    """Cold compile of every kernel, and the time from process start to the first tick when they are compiled."""
+    script = (
+        "import time; from testbed import Scenario, run\n"
+        "first = []\n"
+        "def tick(p):\n"
+        "    first or first.append(time.time())\n"
+        f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]']), progress=tick)\n"
+        "print(first[0])\n"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        cold, _ = _process(script, {"NUMBA_CACHE_DIR": cache})
+        warm = [_process(script, {"NUMBA_CACHE_DIR": cache}) for _ in range(effort.rounds)]
+    yield Row("cold JIT compile", tuple(cold - total for total, _ in warm), "s", at_most=15.0)
+    yield Row("second start to first tick", tuple(first for _, first in warm), "s", at_most=3.0)
+
+
+def _process(script: str, environment: dict[str, str]) -> tuple[float, float]:
+    """Wall seconds of a fresh interpreter, in all and until the moment that it prints."""
+    began = time.time()
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | environment, capture_output=True, text=True, check=True
+    )
+    return time.time() - began, float(done.stdout) - began
+
+
+def growth(effort: Effort) -> Iterator[Row]:
+    """What a run costs as it grows: processor time per simulated hour, wall time and memory."""
+    many = ", ".join(f"{{name='ins{k}', aids=['gnss', 'barometer', 'magnetometer', 'airspeed']}}" for k in range(4))
+    cases = (
+        ("of 600 s", 600, []),
+        ("of 1200 s", 1200, []),
+        ("of 2400 s", 2400, []),
+        ("of 600 s, IMU at 100 Hz", 600, ["sensors.imu.rate_hz=100"]),
+        ("of 600 s, GNSS and barometer at 20 Hz", 600, ["sensors.gnss.rate_hz=20", "sensors.barometer.rate_hz=20"]),
+        ("of 600 s, 1 estimator", 600, ["estimator=[{name='ins', aids=['gnss']}]"]),
+        ("of 600 s, 4 estimators", 600, [f"estimator=[{many}]"]),
+    )
+    for case, full, further in cases:
+        duration = effort.count(full)
+        denied = f"sensors.gnss.denied=[[{duration / 3:.0f}, {duration * 2 / 3:.0f}]]"
+        overrides = [denied, "expect={}", f"duration_s={duration}", *further]
+        script = (
+            "import os, re, tempfile, time; from pathlib import Path; from testbed import Scenario, run\n"
+            f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]', 'expect={{}}']))  # imports\n"
+            f"scenario = Scenario.load('{MAIN}', {overrides!r})\n"
+            "with tempfile.TemporaryDirectory() as folder:\n"
+            "    began, before = time.perf_counter(), sum(os.times()[:4])\n"
+            "    run(scenario, out=Path(folder))\n"
+            "    wall, cpu = time.perf_counter() - began, sum(os.times()[:4]) - before\n"
+            # not getrusage, whose maximum is that of the process which started this one, if that was larger
+            "memory = int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1]) / 1024\n"
+            "print(cpu, wall, memory)\n"
+        )
+        out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+        cpu, wall, memory = map(float, out.split())
+        detail = f"{duration} s flown in {wall:.2f} s of wall time, at most {memory:.0f} MiB"
+        yield Row(f"run {case}", (cpu * 3600 / duration,), "CPU s/h", detail=detail)
