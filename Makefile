@@ -24,7 +24,7 @@ lint: $(VENV)/.ready
 	$(BIN)/lint-imports
 
 bench: $(VENV)/.ready
-	$(BIN)/python tests/bench
+	$(BIN)/python tests/bench $(BENCH)
 
 setup: $(VENV)/.ready
 
