@@ -3,10 +3,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 CLIENTS := .venv-clients
+LOWEST := .venv-lowest
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: run test test-all lint bench setup lock clean
+.PHONY: run test test-all lint bench wheel-test setup lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/testbed run loiter_gnss_outage --out runs/loiter_gnss_outage --mavlink tlog:runs/loiter_gnss_outage/run.tlog
@@ -26,6 +27,16 @@ lint: $(VENV)/.ready
 bench: $(VENV)/.ready
 	$(BIN)/python tests/bench $(BENCH)
 
+# The wheel as a user has it, outside the checkout, with the oldest versions that it says it works with.
+wheel-test: $(VENV)/.ready $(LOWEST)/.ready
+	rm -rf $(LOWEST)/dist
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --no-build-isolation --wheel-dir $(LOWEST)/dist .
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall $(LOWEST)/dist/*.whl
+	$(LOWEST)/bin/python -m pip check
+	folder=$$(mktemp -d) && cd $$folder && trap "rm -rf $$folder" EXIT \
+		&& $(CURDIR)/$(LOWEST)/bin/testbed run static_bench --set duration_s=90 \
+		&& $(CURDIR)/$(LOWEST)/bin/testbed check regression
+
 setup: $(VENV)/.ready
 
 $(VENV)/.ready: pyproject.toml requirements.lock
@@ -43,12 +54,18 @@ $(CLIENTS)/.ready: requirements-clients.lock
 	$(CLIENTS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $<
 	@touch $@
 
+$(LOWEST)/.ready: requirements-lowest.lock
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --require-hashes -r $<
+	@touch $@
+
 # After a change of the dependencies: what is locked stays as it is where it can; for newer versions, delete a lock first.
 lock:
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	$(COMPILE) --extra dev --extra docs --extra examples --output-file requirements.lock pyproject.toml
+	$(COMPILE) --resolution lowest-direct --output-file requirements-lowest.lock pyproject.toml
 	$(COMPILE) --group clients --no-deps --constraint requirements.lock --output-file requirements-clients.lock
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
