@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from testbed.loop.loop import RunResult, run
     from testbed.scenario import Scenario
+    from testbed.score.series import error_series
 
-__all__ = ["RunResult", "Scenario", "run"]
+__all__ = ["RunResult", "Scenario", "error_series", "run"]
 
 
 def __getattr__(name: str) -> Any:
@@ -18,6 +19,10 @@ def __getattr__(name: str) -> Any:
         from testbed.scenario import Scenario
 
         return Scenario
+    if name == "error_series":
+        from testbed.score.series import error_series
+
+        return error_series
     if name in ("run", "RunResult"):
         import testbed.loop.loop
 

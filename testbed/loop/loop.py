@@ -61,7 +61,7 @@ class RunResult:
     """What `run` gives back: the recorded dataset, its metrics, and the folder written (None when in memory).
 
     ``failure`` is empty unless the motion ended early because control was lost; then it says how. ``remarks`` are what
-    else the caller should know: a plan that ended before the run, deadlines missed in real time.
+    else the caller should know: a plan that ended before the run, deadlines missed in real time, errors not scored.
     """
 
     dataset: xarray.DataTree
@@ -267,7 +267,7 @@ def run(
     scenario: Scenario,
     *,
     seed: int | None = None,
-    out: Path | None = None,
+    out: str | Path | None = None,
     links: Sequence[Publisher] = (),
     shown: str | None = None,
     realtime: float | None = None,
@@ -289,6 +289,7 @@ def run(
     with ExitStack() as ending:
         for link in links:
             ending.callback(link.close)
+        out = None if out is None else Path(out)
         seed = scenario.seed if seed is None else seed
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
@@ -309,7 +310,7 @@ def run(
     results = metrics.compute(dataset) | {f"run.{name}": value for name, value in seconds.items()}
     if out is not None:
         metrics.save(results, out / "metrics.json")
-    return RunResult(dataset, results, out, failure, tuple(remarks))
+    return RunResult(dataset, results, out, failure, (*remarks, *metrics.unscored(dataset)))
 
 
 def _fly(

@@ -163,7 +163,7 @@ def _differences(estimates: Sequence[Estimate], truth: TruthBlock, rows: npt.NDA
 def _errors(tree: xarray.DataTree, name: str) -> tuple[Array, dict[str, Array]]:
     """Times (N,) and errors (N, 3) of position [m], velocity [m/s], roll, pitch and heading [arcsec]."""
     e = metrics.errors(tree, name)
-    attitude = np.column_stack([e.roll_pitch, e.attitude[:, 2]]) * ARCSEC_PER_RAD
+    attitude = np.column_stack([e.angles[:, :2], e.attitude[:, 2]]) * ARCSEC_PER_RAD
     return e.t, {"position": e.position, "velocity": e.velocity, "attitude": attitude}
 
 

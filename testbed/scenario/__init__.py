@@ -417,13 +417,16 @@ class Scenario(Section):
         return self._overrides
 
     @classmethod
-    def load(cls, path_or_name: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+    def load(cls, path_or_name: str | Path, overrides: Sequence[str] | Mapping[str, Any] = ()) -> Scenario:
         """Read a scenario file, or a shipped scenario by name, and check all of it.
 
-        ``overrides`` are ``key=value`` strings as `testbed.scenario.keypath.assign` takes them. Raises UserError with
-        every mistake found: file, line, key path and what to do.
+        ``overrides`` are values by key, such as ``{"duration_s": 60, "sensors.gnss.denied": [[10, 20]]}``, or
+        ``key=value`` strings as `testbed.scenario.keypath.assign` takes them. Raises UserError with every mistake
+        found: file, line, key path and what to do.
         """
         path = _find(path_or_name)
+        if isinstance(overrides, Mapping):
+            overrides = [keypath.override(key, value) for key, value in overrides.items()]
         return cls.parse(_read(path), overrides, path)
 
     @classmethod

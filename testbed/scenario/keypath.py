@@ -6,8 +6,12 @@ A key path is a tuple of table keys (str) and list indexes (int): ``("sensors", 
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
+from collections.abc import Mapping, Sequence
+from datetime import date
+from pathlib import PurePath
 from typing import Any, TypeAlias
 
 from testbed.errors import UserError
@@ -172,6 +176,40 @@ def assign(data: dict[str, Any], override: str) -> KeyPath:
     slot = _slot(here, steps[-1], path, where)
     here[slot] = _toml_value(value.strip())
     return (*path, slot)
+
+
+def override(key: str, value: Any) -> str:
+    """The ``key=value`` that sets ``key`` to a value given in Python, as `assign` takes it.
+
+    Booleans, numbers, texts, dates, lists and tables of these, and what `tolist` makes into such (numpy). Raises
+    UserError for anything else.
+    """
+    return f"{key}={_toml_text(value, f'{printable(key)} = {printable(repr(value))}')}"
+
+
+def _toml_text(value: Any, where: str) -> str:
+    if hasattr(value, "tolist"):  # an array, or a number of numpy
+        value = value.tolist()
+    match value:
+        case bool():
+            return str(value).lower()
+        case int() | float():
+            return repr(value)
+        case str() | PurePath():
+            return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        case date():
+            return value.isoformat()
+        case Mapping():
+            return (
+                "{"
+                + ", ".join(f"{_toml_text(str(key), where)} = {_toml_text(item, where)}" for key, item in value.items())
+                + "}"
+            )
+        case Sequence():
+            return "[" + ", ".join(_toml_text(item, where) for item in value) + "]"
+    raise UserError(
+        f"{where}: a scenario has booleans, numbers, texts, dates, lists and tables, and no {type(value).__name__}"
+    )
 
 
 def _override_steps(key: str, where: str) -> list[str]:

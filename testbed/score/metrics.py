@@ -80,17 +80,17 @@ class Errors:
     """Errors of one estimator where truth has a row at the same time: estimate - truth, by the conventions of `nav`.
 
     ``t`` (N,) [s]; ``position`` (N, 3) NED [m]; ``velocity`` (N, 3) NED [m/s]; ``attitude`` (N, 3) phi in n [rad];
-    ``roll_pitch`` (N, 2) differences of these angles [rad]; ``sigma_*`` (N, 3) what the estimator claimed; ``*_nees``
-    (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of alignment, None
-    when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,) rows that should
-    be numbers and are not; ``valid`` (N,) rows that count.
+    ``angles`` (N, 3) differences of roll, pitch and heading [rad]; ``sigma_*`` (N, 3) what the estimator claimed;
+    ``*_nees`` (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of
+    alignment, None when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,)
+    rows that should be numbers and are not; ``valid`` (N,) rows that count.
     """
 
     t: Array
     position: Array
     velocity: Array
     attitude: Array
-    roll_pitch: Array
+    angles: Array
     sigma_position: Array
     sigma_velocity: Array
     sigma_attitude: Array
@@ -165,7 +165,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         position=position,
         velocity=velocity,
         attitude=attitude,
-        roll_pitch=_wrapped(euler(estimated("q_nb")) - euler(true("q_nb")))[:, :2],
+        angles=_wrapped(euler(estimated("q_nb")) - euler(true("q_nb"))),
         sigma_position=estimated("sigma_position_n"),
         sigma_velocity=estimated("sigma_velocity_n"),
         sigma_attitude=estimated("sigma_attitude_n"),
@@ -293,6 +293,21 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
     return result | {f"flight.{key}": float(value) for key, value in _flight(dataset, windows).items()}
 
 
+def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[str]:
+    """Which estimators have no errors among the metrics, and why: a sentence each."""
+    told = []
+    for name in names(dataset):
+        e = errors(dataset, name, settling_s)
+        if e.aligned_s is None:
+            told.append(f"{name}: its errors are not scored: it never said that it is aligned (Status.ALIGNED)")
+        elif e.t[-1] < e.aligned_s + settling_s:
+            told.append(
+                f"{name}: its errors are not scored: they count from {settling_s:g} s after its alignment, "
+                f"{e.aligned_s + settling_s:.1f} s, and the run ends at {e.t[-1]:.1f} s"
+            )
+    return told
+
+
 def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]:
     """How the aircraft flew; nothing when none did, or of a record whose scenario is no longer read."""
     try:
@@ -387,7 +402,7 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
     if not e.attitude_only:
         axes += [(f"position_{axis}", e.position[mask, k], "m") for k, axis in enumerate(AXES)]
         axes += [(f"velocity_{axis}", e.velocity[mask, k], "mps") for k, axis in enumerate(AXES)]
-    axes += [(axis, np.rad2deg(e.roll_pitch[mask, k]), "deg") for k, axis in enumerate(("roll", "pitch"))]
+    axes += [(axis, np.rad2deg(e.angles[mask, k]), "deg") for k, axis in enumerate(("roll", "pitch"))]
     for axis, values, unit in [*axes, ("heading", heading, "deg")]:
         result[f"{axis}_rms_{unit}"] = _rms(values)
         result[f"{axis}_max_{unit}"] = float(np.abs(values).max())

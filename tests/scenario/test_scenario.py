@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -30,6 +31,34 @@ def test_values_arrive_where_they_belong() -> None:
     assert scenario.estimator[0].aids == ("gnss", "barometer", "magnetometer", "airspeed")
     assert scenario.date == dt.date(2026, 6, 1)
     assert isinstance(Scenario.load("static_bench").truth, KinematicTruth)
+
+
+def test_overrides_may_be_values_of_python() -> None:
+    given = {
+        "duration_s": 60,
+        "expect": {},
+        "sensors.gnss.denied": np.array([[10.0, 20.0]]),
+        "sensors.gnss.rate_hz": np.float64(2.0),
+        "record.imu": True,
+        "date": dt.date(2027, 1, 2),
+        "title": 'of "π" \\ \t\x7f 😀',
+        "fault": [{"kind": "step", "sensor": "barometer", "channel": "pressure", "window": (5, 15), "size": 30}],
+    }
+    scenario = Scenario.load("u_turn", given)
+    assert scenario.duration_s == 60
+    assert not scenario.expect
+    assert scenario.sensors["gnss"].denied == ((10.0, 20.0),)
+    assert scenario.sensors["gnss"].rate_hz == 2.0
+    assert scenario.record.imu
+    assert scenario.date == given["date"]
+    assert scenario.title == given["title"]
+    assert scenario.fault[0].window == (5.0, 15.0)
+    assert dict(Scenario.parse(scenario.text, scenario.overrides)) == dict(scenario)  # a record says them as texts
+
+
+def test_an_override_of_no_kind_that_a_scenario_has() -> None:
+    with pytest.raises(UserError, match=r"duration_s = None: .* and no NoneType"):
+        Scenario.load("u_turn", {"duration_s": None})
 
 
 def test_a_path_loads_like_a_name(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from nav.samples import FixType, GnssSample
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.score import metrics
+from testbed.score.series import error_series
 from testbed.sensors.faults import FaultTruth
 
 DENIED = ((150.0, 290.0),)
@@ -70,6 +72,52 @@ def test_errors_agree_with_independent_libraries(run: Any, computed: dict[str, f
         }
         for key, value in expected.items():
             assert computed[f"ins.{prefix}{key}"] == pytest.approx(value, rel=2e-5), key
+
+
+def test_error_series_agree_with_independent_libraries(run: Any) -> None:
+    x, table = independent(run, "late"), error_series(SimpleNamespace(dataset=run), "late")
+    assert table.index.name == "t_s"
+    assert np.array_equal(table.index, x["t"])
+    before, after = table.loc[:99], table.loc[101:]
+    assert before.isna().all(axis=None)
+    assert after.notna().all(axis=None)
+    rows = x["t"] >= 101
+    own = run["estimators/late"]
+    for columns, expected, atol in (
+        (["north_m", "east_m", "down_m"], x["position"], 1e-3),
+        (["v_north_mps", "v_east_mps", "v_down_mps"], x["velocity"], 1e-6),
+        (["phi_north_deg", "phi_east_deg", "phi_down_deg"], -x["turn_deg"], 1e-5),
+        (["sigma_north_m", "sigma_east_m", "sigma_down_m"], own["sigma_position_n"].values, 0),
+        (["sigma_v_north_mps", "sigma_v_east_mps", "sigma_v_down_mps"], own["sigma_velocity_n"].values, 0),
+        ([f"sigma_phi_{axis}_deg" for axis in metrics.AXES], np.rad2deg(own["sigma_attitude_n"].values), 1e-6),
+        (["roll_deg", "pitch_deg", "heading_deg"], euler_difference_deg(run, "late"), 1e-6),
+    ):
+        np.testing.assert_allclose(after[columns], expected[rows], rtol=1e-6, atol=atol)
+
+
+def euler_difference_deg(run: Any, name: str) -> np.ndarray:
+    """Roll, pitch, heading of the estimate less those of truth, by scipy; NaN before there is an estimate."""
+    q, q_true = run[f"estimators/{name}/q_nb"].values, run["truth/q_nb"].values
+    good = np.isfinite(q[:, 0])
+    angles, true = (Rotation.from_quat(x[good], scalar_first=True).as_euler("ZYX", degrees=True) for x in (q, q_true))
+    found = np.full((len(q), 3), np.nan)
+    found[good] = ((angles - true + 180) % 360 - 180)[:, ::-1]
+    return found
+
+
+def test_error_series_of_an_estimator_that_is_not_there(run: Any) -> None:
+    with pytest.raises(UserError, match=r"no estimator mine: choose from ins, late"):
+        error_series(run, "mine")
+
+
+def test_estimators_that_are_not_scored_are_told_and_why() -> None:
+    run = synthetic_run.dataset(
+        100.0, {"ins": Errors(), "late": Errors(aligned_after=70.0), "other": Errors(aligned_after=np.inf)}
+    )
+    late, other = metrics.unscored(run)
+    assert late.startswith("late: its errors are not scored: they count from 60 s after its alignment, 130.")
+    assert late.endswith("and the run ends at 100.0 s")
+    assert other == "other: its errors are not scored: it never said that it is aligned (Status.ALIGNED)"
 
 
 def test_heading_error_is_the_difference_of_headings_in_level_flight() -> None:
