@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from testbed.data import data_dir, is_result
+from testbed.data import data_dir
 from testbed.errors import UserError
+from testbed.results import METRICS, RECORD, REPORT, held, require_own
 
 if TYPE_CHECKING:
     import xarray
@@ -49,6 +50,7 @@ Overrides = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key: sensors.gnss.denied=[[300,500]]; repeatable."),
 ]
+Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that no earlier command made.")]
 
 
 class ExportFormat(StrEnum):
@@ -136,6 +138,7 @@ def run(
         float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
     ] = None,
     report: Annotated[bool, typer.Option("--report/--no-report", help="Write figures and report.html.")] = True,
+    force: Force = False,
 ) -> None:
     """Fly one scenario: record, metrics, report. Exit code 1 if control was lost on the way.
 
@@ -151,9 +154,10 @@ def run(
     else:
         loaded, folder = _load(scenario, overrides), RUNS / Path(scenario).stem
     folder = out or folder
-    if (folder / "run.nc").resolve() == Path(scenario).resolve():
+    if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with _output_folder(folder):
+        require_own(folder, [RECORD, METRICS, *([REPORT] if report else [])], force)
         links = _connect(
             mavlink or [],
             loaded,
@@ -165,7 +169,7 @@ def run(
             key=mavlink_key,
         )
         result = _fly(loaded, folder, seed=seed, links=links, shown=estimator, realtime=realtime, replay=replay)
-        _conclude(result.dataset, result.metrics, folder / "run.nc", report)
+        _conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
 
@@ -224,17 +228,17 @@ def check(
 
 
 @app.command()
-def report(run_file: RunFile) -> None:
+def report(run_file: RunFile, force: Force = False) -> None:
     """Write figures and report.html again from a run file, beside it."""
     from testbed.record import recorder as record
     from testbed.score import metrics
 
     dataset = record.load(run_file)
     computed = metrics.compute(dataset)
-    kept = run_file.parent / "metrics.json"
+    kept = run_file.parent / METRICS
     if not kept.exists():  # the run was killed
         metrics.save(computed, kept)
-    _conclude(dataset, computed, run_file, report=True)
+    _conclude(dataset, computed, run_file, True, force)
 
 
 @app.command()
@@ -242,11 +246,12 @@ def export(
     run_file: RunFile,
     format: Annotated[ExportFormat, typer.Option(help="One CSV file per table, or one MATLAB file.")],
     out: Annotated[Path | None, typer.Option(metavar="PATH", help="Where to; beside the run file.")] = None,
+    force: Force = False,
 ) -> None:
     """Turn a run file into CSV or MATLAB."""
     from testbed.record.export import export as write
 
-    print(write(run_file, format.value, out))
+    print(write(run_file, format.value, out, force))
 
 
 @app.command()
@@ -267,8 +272,10 @@ def campaign(
 
     varied = parse_vary(vary or [])
     folder = out or RUNS / f"{Path(scenario).stem}_campaign"
+    require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
     with (
         _output_folder(folder),
+        held(folder),
         _keeping(f"what is finished is in {folder}; the same command carries on"),
         progress.shown(_console(stderr=True), scenario) as tell,
     ):
@@ -301,8 +308,10 @@ def papers(
     from testbed.many import progress
 
     found = library.find(ids or [])
+    require_own(out, [library.RESULTS, *(f"{name}.png" for name in found)])
     with (
         _output_folder(out),
+        held(out),
         _keeping("nothing was written"),
         progress.shown(_console(stderr=True), "papers") as tell,
     ):
@@ -407,7 +416,7 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
         print(f"testbed: {run_file}: was made with {', '.join(other)}: bits may differ", file=sys.stderr)
     if not said["complete"]:
         print(f"testbed: {run_file}: ends early; the rerun goes on to the scenario's end", file=sys.stderr)
-    name = run_file.resolve().parent.name if run_file.name == "run.nc" else run_file.stem
+    name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
     return scenario, RUNS / f"{name}_again", seed, control.recorded(dataset, scenario)
 
 
@@ -457,7 +466,7 @@ def _connect(
     shown_estimator(scenario, estimator)
     for url in urls:
         path = log_path(url)
-        if path is not None and path.resolve().parent == folder.resolve() and is_result(path.name):
+        if path is not None and path.resolve().parent == folder.resolve() and path.name in (RECORD, METRICS, REPORT):
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
@@ -476,7 +485,7 @@ def _fly(
     from testbed.many import progress
 
     with (
-        _keeping(f"the record so far is {folder / 'run.nc'}"),
+        _keeping(f"the record so far is {folder / RECORD}"),
         keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
@@ -498,7 +507,9 @@ def _fly(
     return result
 
 
-def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool) -> None:
+def _conclude(
+    dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool, force: bool
+) -> None:
     from testbed.report import page as reports
     from testbed.score import observability as visibility
 
@@ -509,7 +520,7 @@ def _conclude(dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: 
         console.print(faults)
     if report:
         seen = visibility.of_run(dataset)
-        print(f"report: {reports.write_report(dataset, metrics, run_file.parent, seen)}")
+        print(f"report: {reports.write_report(dataset, metrics, run_file.parent, seen, force)}")
     print(f"record: {run_file}")
 
 

@@ -1,35 +1,11 @@
-"""Where the shipped aircraft and scenarios lie; what a run leaves in its folder; and writing a file whole."""
+"""Where the shipped aircraft and scenarios lie, and writing a file whole."""
 
 from __future__ import annotations
 
 import os
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from testbed.errors import UserError
-
-# What a run writes beside its record; * is the name of an estimator.
-DERIVED = (
-    "metrics.json",
-    "report.html",
-    *(f"{name}.png" for name in ("ground_track", "flight", "comparison", "attitude", "wind", "nees")),
-    *(f"*_{name}.png" for name in ("position_errors", "motion_errors", "attitude_errors", "biases", "innovations")),
-)
-
-
-def is_result(name: str) -> bool:
-    """Whether a run writes a file of that name into its folder."""
-    return name == "run.nc" or any(fnmatchcase(name, pattern) for pattern in DERIVED)
-
-
-def remove_derived(folder: Path) -> None:
-    """Remove what an earlier run in ``folder`` left beside its record. Raises UserError when that can't be done."""
-    try:
-        for pattern in DERIVED:
-            for path in folder.glob(pattern):
-                path.unlink()
-    except OSError as error:
-        raise UserError(f"{error.filename}: an earlier result can't be removed: {error.strerror}") from None
 
 
 def data_dir(name: str) -> Path:

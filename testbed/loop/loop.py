@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Protocol
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
 from testbed import estimators, sensors
-from testbed.data import remove_derived
 from testbed.errors import UserError
 from testbed.feeds.autopilot import Autopilot, Steered
 from testbed.loop.requests import Desk, Director, Plant, Recorded, Request, Restarted
@@ -27,6 +26,7 @@ from testbed.motion.ahead import Ahead
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.record.recorder import Recorder
+from testbed.results import METRICS, RECORD, held, require_own, start_anew
 from testbed.scenario import Scenario
 from testbed.score import metrics
 from testbed.sensors.faults import Faults, FaultTruth
@@ -295,6 +295,9 @@ def run(
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
+        if out is not None:
+            ending.enter_context(held(out))
+            require_own(out, [RECORD, METRICS])
         asking = (*(link.requests for link in links if link.asks), *controls)
         director = Director(scenario, asking, replay, realtime, rate_hz, source is None)
         if (
@@ -306,10 +309,10 @@ def run(
         while flown is None:
             with suppress(Restarted):
                 flown = _fly(scenario, seed, out, links, shown, director, progress, source)
-    dataset, failure, remarks, seconds = flown
-    results = metrics.compute(dataset) | {f"run.{name}": value for name, value in seconds.items()}
-    if out is not None:
-        metrics.save(results, out / "metrics.json")
+        dataset, failure, remarks, seconds = flown
+        results = metrics.compute(dataset) | {f"run.{name}": value for name, value in seconds.items()}
+        if out is not None:
+            metrics.save(results, out / METRICS)
     return RunResult(dataset, results, out, failure, (*remarks, *metrics.unscored(dataset)))
 
 
@@ -363,7 +366,7 @@ def _fly(
         legs = scenario.plan if isinstance(scenario.truth, FlightTruth) else scenario.truth.segments
         plan = [leg.leg for leg in legs]
 
-        recorder = Recorder(out / "run.nc" if out else None, scenario, seed)
+        recorder = Recorder(out / RECORD if out else None, scenario, seed)
         ending.callback(recorder.close)
 
         def emit(t: float, severity: str, text: str) -> None:
@@ -422,7 +425,7 @@ def _fly(
             if not len(block):
                 break
             if tick == 0 and out is not None:  # from here on what an earlier run left there would not fit the record
-                remove_derived(out)
+                start_anew(out, [RECORD])
             imu, samples = sense(block) if flown is None else (flown.imu, flown.samples)
             for own in samples.values():
                 latest.add(own)

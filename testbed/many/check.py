@@ -28,10 +28,11 @@ from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from testbed import measures
-from testbed.data import data_dir, remove_derived, write_file
+from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.loop import loop
 from testbed.report import page as report
+from testbed.results import start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score import observability as visibility
 from testbed.score.metrics import column
@@ -245,9 +246,8 @@ def _told(error: Exception) -> str:
 
 def clear(folder: Path) -> None:
     """Remove what a run left in its folder, and the folder when nothing else is in it."""
-    with suppress(OSError):
-        remove_derived(folder)
-        (folder / "run.nc").unlink(missing_ok=True)
+    with suppress(OSError, UserError):
+        start_anew(folder)
         folder.rmdir()
 
 

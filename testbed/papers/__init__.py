@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from testbed.data import data_dir, write_file
+from testbed.data import data_dir
 from testbed.errors import UserError
+from testbed.results import write_result
 from testbed.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ def reproduce(papers: Mapping[str, Paper], out: Path, tell: Tell | None = None) 
         claims[name] = paper.conclude(in_order)
         paper.draw(in_order, out)
     found = {name: [claim.record() for claim in own] for name, own in claims.items()}
-    write_file(out / RESULTS, json.dumps(found, indent=1).encode())
+    write_result(out / RESULTS, json.dumps(found, indent=1).encode())
     return claims
 
 

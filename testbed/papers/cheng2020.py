@@ -19,9 +19,9 @@ from nav.error_model import PAPERS, ErrorModel, ImuModel, Indices
 from nav.observability import Segment, analyse, continuous, derivatives, in_units, stripped
 from nav.rotation import quat_from_euler
 from nav.samples import Array
-from testbed.data import write_file
 from testbed.loop.loop import run
 from testbed.papers import Claim, Job, Paper, scenario
+from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score import metrics
 
@@ -332,7 +332,7 @@ def _draw(results: Sequence[Any], out: Path) -> None:
     level.set_xlim(0, SHORT_S)
     picture = io.BytesIO()
     figure.savefig(picture, format="png", dpi=100)
-    write_file(out / "cheng2020.png", picture.getvalue())
+    write_result(out / "cheng2020.png", picture.getvalue())
 
 
 PAPER = Paper("Cheng et al. 2020: heading from GNSS course on the road", _jobs, _conclude, _draw)

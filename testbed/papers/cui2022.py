@@ -24,11 +24,11 @@ from nav.ins import Ins
 from nav.local_filter import ISOLATED
 from nav.samples import Array, Estimate
 from testbed import estimators, sensors
-from testbed.data import write_file
 from testbed.loop.loop import motion, run
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report.page import AXIS_COLOURS, COLOURS, FAULT
+from testbed.results import write_result
 from testbed.score import metrics
 from testbed.score.metrics import column
 
@@ -436,7 +436,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     drawn, content = io.BytesIO(), io.BytesIO()
     figure.savefig(drawn)
     Image.open(drawn).convert("RGB").quantize(COLOURS_KEPT).save(content, "png")
-    write_file(out / f"{NAME}.png", content.getvalue())
+    write_result(out / f"{NAME}.png", content.getvalue())
 
 
 PAPER = Paper("Cui et al. 2022: fault-tolerant federated SINS, GPS, Doppler and star tracker", jobs, conclude, draw)

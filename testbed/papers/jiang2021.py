@@ -18,10 +18,10 @@ from nav.ahrs import Ahrs
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, Sample
 from testbed import estimators, sensors
-from testbed.data import write_file
 from testbed.loop import loop
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
+from testbed.results import write_result
 from testbed.score import metrics
 
 if TYPE_CHECKING:
@@ -252,7 +252,7 @@ def _finish(panels: Sequence[Axes]) -> None:
 def _save(figure: Figure, path: Path) -> None:
     image = io.BytesIO()
     figure.savefig(image, format="png")
-    write_file(path, image.getvalue())
+    write_result(path, image.getvalue())
 
 
 PAPER = Paper(

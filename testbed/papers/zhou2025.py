@@ -20,10 +20,10 @@ import numpy as np
 
 from nav.detection import ChiSquare, Detector, Glr, Reset, Sprt, eq20, exponential, glr_false_alarm
 from nav.samples import Array
-from testbed.data import write_file
 from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report.page import COLOURS, FAULT
+from testbed.results import write_result
 from testbed.score import metrics
 from testbed.sensors.noise import stream
 
@@ -378,7 +378,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     _draw_results(halves[1], found)
     data = io.BytesIO()
     figure.savefig(data, format="png")
-    write_file(out / "zhou2025.png", data.getvalue())
+    write_result(out / "zhou2025.png", data.getvalue())
 
 
 def _draw_statistics(figure: Any) -> None:

@@ -20,9 +20,9 @@ from nav.federated import Federated, weights_by_covariance, weights_eq13
 from nav.samples import Array
 from nav.weighting import inflation
 from testbed import estimators, sensors
-from testbed.data import write_file
 from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
+from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score.metrics import attitude_error
 from testbed.sensors.faults import Faults
@@ -323,7 +323,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
         ax.spines[["top", "right"]].set_visible(False)
     image = io.BytesIO()
     figure.savefig(image, format="png")
-    write_file(out / "zhu2020.png", image.getvalue())
+    write_result(out / "zhu2020.png", image.getvalue())
 
 
 PAPER_TABLE_3 = {

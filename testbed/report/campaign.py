@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nav.samples import Array
-from testbed.data import write_file
+from testbed.results import write_result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from testbed.many.campaign import CampaignResult, Combination, Outcome
 
+TABLE, SUMMARY = "campaign.csv", "campaign.json"
 NEES_DOF = 3  # north, east, down
 CONFIDENCE = (0.025, 0.975)
 
@@ -184,12 +185,12 @@ def _longest(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
 
 def save(result: CampaignResult) -> None:
     """Write campaign.csv (one line per run), campaign.json (statistics and failures) and the figures."""
-    write_file(result.path / "campaign.csv", _csv(result).encode())
-    write_file(result.path / "campaign.json", json.dumps(_json(result), indent=1).encode())
+    write_result(result.path / TABLE, _csv(result).encode())
+    write_result(result.path / SUMMARY, json.dumps(_json(result), indent=1).encode())
     for name, figure in figures(result).items():
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=120)
-        write_file(result.path / f"{name}.png", buffer.getvalue())
+        write_result(result.path / f"{name}.png", buffer.getvalue())
 
 
 def _csv(result: CampaignResult) -> str:

@@ -22,8 +22,7 @@ from scipy.stats import chi2
 from nav import earth
 from nav.observability import Visibility
 from nav.samples import Array
-from testbed.data import write_file
-from testbed.errors import UserError
+from testbed.results import REPORT, held, write_result
 from testbed.score import metrics as scores
 from testbed.score.metrics import Errors, column
 
@@ -764,28 +763,24 @@ def write_report(
     metrics: Mapping[str, float],
     folder: Path,
     seen: Mapping[str, Visibility] = MappingProxyType({}),
+    force: bool = False,
 ) -> Path:
     """Write ``report.html`` and one PNG per figure into ``folder`` and return the page's path.
 
     ``seen`` tells which states of each estimator can be seen. The page holds everything it shows. Raises UserError when
-    the folder can't be written.
+    the folder can't be written or, without ``force``, holds files of these names that no earlier command made.
     """
     run = _Run(dataset)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with held(folder):
         shown = []
         for name, caption, figure in _figures(run, seen):
             if figure is not None:
                 png = io.BytesIO()
                 figure.savefig(png, pil_kwargs={"compress_level": 4})
-                write_file(folder / f"{name}.png", png.getvalue())
+                write_result(folder / f"{name}.png", png.getvalue(), force)
                 shown.append((caption, png.getvalue()))
-        page = folder / "report.html"
-        write_file(page, _page(run, metrics, shown, seen).encode())
-    except OSError as error:
-        raise UserError(
-            f"{folder}: can't write the report ({error.strerror or error}); choose another --out"
-        ) from error
+        page = folder / REPORT
+        write_result(page, _page(run, metrics, shown, seen).encode(), force)
     return page
 
 

@@ -47,10 +47,10 @@ from nav import earth
 from nav.detection import Verdict
 from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, FixType, Status
-from testbed.data import write_file
 from testbed.errors import UserError
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
+from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.sensors.faults import FaultTruth
 
@@ -640,4 +640,4 @@ def _false_alarms(dataset: xarray.DataTree, estimator: str, e: Errors, troubled:
 def save(metrics: Mapping[str, float], path: Path) -> None:
     """Write metrics as JSON. Raises UserError when the file can't be written."""
     text = json.dumps(dict(metrics), indent=1, sort_keys=True, allow_nan=False) + "\n"
-    write_file(path, text.encode())
+    write_result(path, text.encode())

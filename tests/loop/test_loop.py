@@ -12,7 +12,7 @@ import pytest
 from worlds.loop import Watcher, same
 
 from nav.samples import FixType, GnssSample, Sample
-from testbed import Scenario, run, sensors
+from testbed import Scenario, results, run, sensors
 from testbed.errors import UserError
 from testbed.loop import loop
 from testbed.motion import flight
@@ -143,7 +143,7 @@ def test_links_show_the_estimator_that_was_asked_for() -> None:
         ({"seed": 2**63}, [], "seed 9223372036854775808: must be from 0"),
         ({"shown": "inz"}, [], "--estimator inz: the scenario has no such estimator: choose from ins"),
         ({}, ["estimator=[]", "expect={}"], r"no \[\[estimator\]\], so a link has nothing to show"),
-        ({"out": Path("/proc/testbed")}, [], "can't write here"),
+        ({"out": Path("/proc/testbed")}, [], "can't be written"),
     ],
 )
 def test_a_refused_run_closes_its_links(options: dict[str, Any], overrides: list[str], says: str) -> None:
@@ -181,6 +181,7 @@ def test_what_an_earlier_run_left_goes_when_the_next_one_starts(tmp_path: Path) 
 
     for path in stale + mine:
         path.write_text("")
+    results.enter(tmp_path, [path.name for path in stale])
     for calls, left in ((0, True), (1, False)):
         with pytest.raises(UserError, match="no trim"):
             run(scenario, out=tmp_path, source=Broken(calls))

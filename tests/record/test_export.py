@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import resource
+import shutil
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +15,7 @@ import pytest
 from scipy.io import loadmat
 from worlds import synthetic_run
 
+from testbed import results
 from testbed.errors import UserError
 from testbed.record.export import export
 from testbed.record.recorder import load
@@ -27,7 +33,7 @@ def test_csv_has_one_file_per_group_with_units_in_its_header(run_file: Path) -> 
     tree = load(run_file)
     assert folder == run_file.with_name("run_csv")
     groups = {n.path.strip("/").replace("/", ".") for n in tree.subtree if n.to_dataset(inherit=False).data_vars}
-    assert {p.stem for p in folder.iterdir()} == groups
+    assert {p.stem for p in folder.glob("*.csv")} == groups
     own = pandas.read_csv(folder / "estimators.ins.csv", dtype=str)
     assert own.columns[0] == "time [s]"
     np.testing.assert_array_equal(own["v_n.east [m/s]"].astype(float), tree["estimators/ins/v_n"].values[:, 1])
@@ -36,6 +42,56 @@ def test_csv_has_one_file_per_group_with_units_in_its_header(run_file: Path) -> 
     assert events["text"].tolist() == ["leg 1/2 «circle»"]
     imu = pandas.read_csv(folder / "sensors.imu.csv", dtype=str)
     np.testing.assert_array_equal(imu["dv.down [m/s]"].astype(float), tree["sensors/imu/dv"].values[:, 2])
+
+
+def test_each_component_has_its_own_unit(run_file: Path, tmp_path: Path) -> None:
+    truth = pandas.read_csv(export(run_file, "csv", tmp_path / "units") / "truth.csv", nrows=1)
+    assert {"commands.bank [rad]", "commands.altitude [m]", "commands.airspeed [m/s]"} <= set(truth.columns)
+
+
+def test_an_export_replaces_an_earlier_one_but_nothing_else(run_file: Path, tmp_path: Path) -> None:
+    record = tmp_path / "run.nc"
+    shutil.copy(run_file, record)
+    before = record.read_bytes()
+    with pytest.raises(UserError, match=r"run\.nc: is the record itself"):
+        export(record, "mat", record)
+    (tmp_path / "run.mat").write_text("mine")
+    with pytest.raises(UserError, match=r"run\.mat already, not made by an earlier command"):
+        export(record, "mat")
+    (tmp_path / "run.mat").unlink()
+    (tmp_path / "run_csv").mkdir()
+    (tmp_path / "run_csv/truth.csv").write_text("mine")
+    with pytest.raises(UserError, match=r"run_csv: there is truth\.csv already"):
+        export(record, "csv")
+    assert (record.read_bytes(), (tmp_path / "run_csv/truth.csv").read_text()) == (before, "mine")
+    for _ in range(2):
+        export(record, "csv", force=True)
+    results.enter(tmp_path, ["run.nc"])
+    for _ in range(2):
+        export(record, "csv")
+        export(record, "mat")
+    results.start_anew(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("form", ["csv", "mat"])
+def test_a_full_disk_leaves_no_half_export(run_file: Path, tmp_path: Path, form: str) -> None:
+    with file_size_limit(100_000), pytest.raises(UserError, match="can't be written: File too large"):
+        export(run_file, form, tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """A disk with little room, as far as this process can tell."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_mat_has_a_struct_per_group_with_units(run_file: Path, tmp_path: Path) -> None:

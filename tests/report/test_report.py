@@ -14,10 +14,10 @@ from rich.console import Console
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from testbed.data import is_result
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.report import page as report
+from testbed.results import start_anew
 from testbed.score import metrics
 from testbed.sensors.faults import FaultTruth
 
@@ -50,7 +50,6 @@ def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> N
     text = page.read_text(encoding="utf-8")
     images = sorted(p.name for p in tmp_path.glob("*.png"))
     assert {"flight.png", "ground_track.png"} <= set(images)
-    assert all(is_result(path.name) for path in tmp_path.iterdir()), "the next run would leave it there"
     assert text.count("data:image/png;base64,") == len(images)
     assert not re.findall(r"(?:src|href)='(?!data:)", text)
     assert "A made-up circle" in text
@@ -61,6 +60,18 @@ def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> N
             for what in ("position_errors", "motion_errors", "biases", "innovations"):
                 assert f"{name}_{what}.png" in images
         assert {"comparison.png", "attitude.png", "wind.png", "nees.png"} <= set(images)
+    start_anew(tmp_path)
+    assert not list(tmp_path.iterdir()), "the next run would leave it there"
+
+
+def test_a_figure_that_is_not_ours_is_not_replaced(tmp_path: Path) -> None:
+    run = synthetic_run.dataset(**RUNS["no gnss"])
+    (tmp_path / "flight.png").write_text("mine")
+    with pytest.raises(UserError, match=r"flight\.png already, not made by an earlier command"):
+        report.write_report(run, {}, tmp_path)
+    assert (tmp_path / "flight.png").read_text() == "mine"
+    report.write_report(run, {}, tmp_path, force=True)
+    assert (tmp_path / "flight.png").stat().st_size > 1000
 
 
 def test_a_body_at_rest(tmp_path: Path) -> None:
@@ -169,5 +180,5 @@ def test_scenario_text_cannot_break_the_page(tmp_path: Path) -> None:
 
 def test_unwritable_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="can't write the report"):
+    with pytest.raises(UserError, match="can't be written"):
         report.write_report(synthetic_run.dataset(5.0), {}, tmp_path / "file")

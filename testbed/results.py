@@ -1,0 +1,131 @@
+"""What is written into a folder of results: by one command at a time, and never over a file that is somebody else's.
+
+`MANIFEST` in the folder lists what was written there; every file enters as it is written. Only what it lists is ever
+replaced or removed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from testbed.data import write_file
+from testbed.errors import UserError
+
+RECORD, METRICS, REPORT = "run.nc", "metrics.json", "report.html"
+MANIFEST = "testbed_manifest.json"  # {"files": [names within the folder]}
+
+
+def write_result(path: Path, content: bytes, force: bool = False) -> None:
+    """Write a file, whole or not at all, and enter it in the manifest of its folder.
+
+    Raises UserError when it can't be written; or, without ``force``, when a file of that name is there that the
+    manifest doesn't list.
+    """
+    require_own(path.parent, [path.name], force)
+    enter(path.parent, [path.name])
+    write_file(path, content)
+
+
+def require_own(folder: Path, names: Iterable[str], force: bool = False) -> None:
+    """See that files of these names in ``folder`` are absent or listed in its manifest; with ``force``, list them.
+
+    Raises UserError that names the others.
+    """
+    listed = _listed(folder)
+    foreign = [name for name in names if name not in listed and (folder / name).exists()]
+    if foreign and force:
+        enter(folder, foreign)
+    elif foreign:
+        raise UserError(
+            f"{folder}: there is {', '.join(foreign)} already, not made by an earlier command: move it away or choose"
+            " another folder (run, report and export take --force to replace it)"
+        )
+
+
+def enter(folder: Path, names: Iterable[str]) -> None:
+    """List files in the manifest of a folder: from now on they may be replaced and removed."""
+    before = _listed(folder)
+    if not before.issuperset(names):
+        _list(folder, before.union(names))
+
+
+def start_anew(folder: Path, names: Iterable[str] = ()) -> None:
+    """Remove what the manifest of a folder lists, but files of these names: they are listed, as about to be written.
+
+    Raises UserError when something can't be removed.
+    """
+    coming = set(names)
+    before = _listed(folder)
+    try:
+        for path in (folder / name for name in sorted(before - coming)):
+            if path.is_dir():  # an export, with a manifest of its own
+                start_anew(path)
+                with suppress(OSError):  # something else is in it
+                    path.rmdir()
+            else:
+                path.unlink(missing_ok=True)
+        if before and not coming:
+            (folder / MANIFEST).unlink()
+    except OSError as error:
+        raise UserError(f"{error.filename}: an earlier result can't be removed: {error.strerror}") from None
+    if coming:
+        _list(folder, coming)
+
+
+def _list(folder: Path, names: Iterable[str]) -> None:
+    write_file(folder / MANIFEST, (json.dumps({"files": sorted(names)}, indent=1) + "\n").encode())
+
+
+def _listed(folder: Path) -> set[str]:
+    path = folder / MANIFEST
+    try:
+        files = set(json.loads(path.read_bytes())["files"])
+        if any(Path(name).name != name for name in files):  # none of ours leads out of the folder
+            raise ValueError
+    except (FileNotFoundError, NotADirectoryError):
+        return set()
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise UserError(f"{path}: is damaged: delete it, and the results beside it that are not wanted") from None
+    return files
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make a folder and keep other commands from writing into it meanwhile. The lock ends with the process.
+
+    Raises UserError when another one holds it, or when the folder can't be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: can't be written: {error.strerror}: choose another place with --out") from None
+    lock = _lock(folder)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            os.close(lock)
+
+
+def _lock(folder: Path) -> int | None:
+    """A descriptor whose closing ends the lock, None where folders can't be locked (Windows, some network drives)."""
+    try:
+        import fcntl
+    except ImportError:
+        return None
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise UserError(f"{folder}: another run is writing here: wait for it, or choose another folder") from None
+    except OSError:
+        os.close(lock)
+        return None
+    return lock
