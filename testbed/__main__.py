@@ -230,10 +230,10 @@ def check(
 @app.command()
 def report(run_file: RunFile, force: Force = False) -> None:
     """Write figures and report.html again from a run file, beside it."""
-    from testbed.record import recorder as record
+    from testbed.record.reader import load
     from testbed.score import metrics
 
-    dataset = record.load(run_file)
+    dataset = load(run_file)
     computed = metrics.compute(dataset)
     kept = run_file.parent / METRICS
     if not kept.exists():  # the run was killed
@@ -400,10 +400,11 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
 def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
     """Scenario, folder, seed and requests for running a record again."""
     from testbed.loop import requests as control
-    from testbed.record import recorder as record
+    from testbed.record.reader import load
+    from testbed.record.recorder import versions as installed
     from testbed.scenario import Scenario
 
-    dataset = record.load(run_file)
+    dataset = load(run_file)
     said = dataset.attrs
     try:
         before, versions = [*json.loads(said["overrides"])], [*json.loads(said["versions"]).items()]
@@ -411,7 +412,7 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
     scenario = Scenario.parse(text, [*before, *overrides], Path(path) if path else run_file)
-    other = [f"{name} {version}" for name, version in versions if record.versions().get(name) != version]
+    other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
     if other:
         print(f"testbed: {run_file}: was made with {', '.join(other)}: bits may differ", file=sys.stderr)
     if not said["complete"]:

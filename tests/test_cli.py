@@ -24,7 +24,7 @@ from testbed.errors import UserError
 from testbed.loop import loop
 from testbed.many import progress
 from testbed.motion import flight
-from testbed.record import recorder as record
+from testbed.record import reader as record
 
 QUICK = ["--set", "duration_s=3", "--no-report"]
 PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "watch"}

@@ -13,7 +13,8 @@ import numpy as np
 
 from testbed.data import write_file
 from testbed.errors import UserError
-from testbed.record.recorder import AXES, load
+from testbed.record.columns import AXES
+from testbed.record.reader import load
 from testbed.results import MANIFEST, enter, held, require_own, start_anew, write_result
 
 if TYPE_CHECKING:

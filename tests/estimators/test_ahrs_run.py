@@ -25,8 +25,9 @@ from testbed.errors import UserError
 from testbed.many import campaign
 from testbed.many.campaign import CampaignResult, Combination, Outcome
 from testbed.mavlink import MavlinkPublisher
-from testbed.record import recorder as record
+from testbed.record import reader as record
 from testbed.record.export import export
+from testbed.record.recorder import Recorder
 from testbed.report import campaign as campaign_report
 from testbed.report import page as report
 from testbed.score import metrics
@@ -192,7 +193,7 @@ def test_a_sample_that_is_refused_is_recorded(tmp_path: Path) -> None:
     flight = scenario(AHRS, overrides=("duration_s=1",))
     refused = Ahrs(config(AHRS)).refuse(AirspeedSample(0.5, 0.5, math.nan), "not finite")
     level = UpdateReport(1.0, "accelerometer", "level", np.zeros(2), np.eye(2), 0.0, math.inf, 1.0)
-    recorder = record.Recorder(tmp_path / "run.nc", flight, 1)
+    recorder = Recorder(tmp_path / "run.nc", flight, 1)
     recorder.reports("ahrs", [*refused, level])
     recorder.close()
     own = record.load(tmp_path / "run.nc")["estimators/ahrs/innovations"]

@@ -18,7 +18,7 @@ import pytest
 from testbed.loop import keyboard
 from testbed.loop.keyboard import Keyboard, keys
 from testbed.loop.requests import End, Faster, Restart, Step, Toggle
-from testbed.record import recorder as record
+from testbed.record import reader as record
 
 
 @pytest.fixture

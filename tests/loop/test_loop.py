@@ -17,7 +17,7 @@ from testbed.errors import UserError
 from testbed.loop import loop
 from testbed.motion import flight
 from testbed.motion.table import MotionSource, TruthBlock
-from testbed.record import recorder as record
+from testbed.record import reader as record
 from testbed.scenario import shipped
 
 SHORT = ["duration_s=40", "sensors.gnss.denied=[[20, 26]]"]

@@ -40,7 +40,7 @@ from testbed.loop.requests import (
     recorded,
     settings,
 )
-from testbed.record import recorder as record
+from testbed.record import reader as record
 
 HEALTHY = ["sensors.gnss.denied=[]", "expect={}", "truth.wind.turbulence='none'"]
 TWICE = [

@@ -23,7 +23,7 @@ from rich.console import Console
 import testbed.__main__ as cli
 from testbed.errors import UserError
 from testbed.mavlink.watch import LONGEST_TEXT, Picture, _messages, watch
-from testbed.record import recorder as record
+from testbed.record import reader as record
 
 SECONDS = 16
 DENIED = (6, 12)

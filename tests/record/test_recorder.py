@@ -25,7 +25,10 @@ from nav.samples import ImuSamples, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record
-from testbed.record.recorder import Recorder, load
+from testbed.record.columns import AXES
+from testbed.record.reader import load
+from testbed.record.recorder import Recorder
+from testbed.record.tables import Table
 
 TWO = {"ins": Errors(), "dead_reckoning": Errors(drift_mps=5.0)}
 DENIED = ((20.0, 40.0),)
@@ -123,7 +126,7 @@ def test_samples_estimates_reports_and_events_come_back(run_file: Path) -> None:
 def test_every_variable_has_a_unit_and_a_meaning(run_file: Path) -> None:
     text = {"reason", "severity", "text", "sensor"}
     for path, variable in variables(load(run_file)).items():
-        if path.rsplit("/", 1)[1] in record.AXES:
+        if path.rsplit("/", 1)[1] in AXES:
             continue
         assert variable.attrs.get("long_name"), path
         assert path.rsplit("/", 1)[1] in text or variable.attrs.get("units"), path
@@ -371,16 +374,16 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
     recorder.flush()
     before = load(path)
     writes = 0
-    real = record._Table.rows
+    real = Table.rows
 
-    def dying(self: record._Table, name: str) -> Any:
+    def dying(self: Table, name: str) -> Any:
         nonlocal writes
         writes += 1
         if writes > step:
             raise Died
         return real(self, name)
 
-    monkeypatch.setattr(record._Table, "rows", dying)
+    monkeypatch.setattr(Table, "rows", dying)
     recorder.truth(truth.rows(2001, 4001))
     rng = np.random.default_rng(5)
     for k in range(2020, 4001, 20):
@@ -472,7 +475,7 @@ def test_a_full_disk_is_told_and_the_last_flush_stays(tmp_path: Path, monkeypatc
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(record, "_create", full)
+    monkeypatch.setattr(record, "create", full)
     recorder.truth(truth.rows(401, 801))
     recorder.event(2.0, "info", "needs a new group")
     with pytest.raises(UserError, match=r"run\.nc: can't write the record \(No space left on device\)"):

@@ -22,7 +22,7 @@ from nav.samples import (
 )
 from testbed import sensors
 from testbed.errors import UserError
-from testbed.record import recorder as record
+from testbed.record import columns as record
 from testbed.sensors import (
     airspeed,
     barometer,

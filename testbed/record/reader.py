@@ -1,0 +1,104 @@
+"""Reading a record back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from testbed.errors import UserError
+from testbed.record.columns import AXES, FORMAT, Variable
+from testbed.record.tables import Data
+
+if TYPE_CHECKING:
+    import h5py
+    import xarray
+
+
+def load(path: Path) -> xarray.DataTree:
+    """Read a record. A run that was killed gives the rows of its last flush, and the attribute ``complete`` is 0.
+
+    Raises UserError when the file is missing, damaged or no record.
+    """
+    import h5py
+
+    if not path.exists():
+        raise UserError(f"{path}: no such file; `testbed run` writes run.nc into its --out folder")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; give the record in it, such as {path / 'run.nc'}")
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path}: not a record of a run (not netCDF-4/HDF5)")
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("format") != FORMAT:
+                raise UserError(f"{path}: netCDF-4/HDF5, but not a record of a run of this version ({FORMAT!r})")
+            columns: dict[str, dict[str, tuple[Variable, Data]]] = {}
+            _read_group(file, "", columns)
+            attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        return tree(columns, attributes)
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: damaged record ({error}); run the scenario again") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _read_group(group: h5py.Group, path: str, found: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
+    import h5py
+
+    time_name = next((name for name in ("time", "sample_time") if name in group), None)
+    if time_name is not None:
+        written = np.flatnonzero(np.isfinite(group[time_name][()]))
+        rows = int(written[-1]) + 1 if len(written) else 0
+        found[path] = {
+            name: _read_column(item, rows)
+            for name, item in group.items()
+            if isinstance(item, h5py.Dataset) and "long_name" in item.attrs
+        }
+    for name, item in group.items():
+        if isinstance(item, h5py.Group):
+            _read_group(item, f"{path}/{name}".lstrip("/"), found)
+
+
+def _read_column(dataset: h5py.Dataset, rows: int) -> tuple[Variable, Data]:
+    attributes = {
+        name: _plain(dataset.attrs[name])
+        for name in ("units", "long_name", "flag_values", "flag_masks", "flag_meanings")
+        if name in dataset.attrs
+    }
+    dims = tuple(Path(dataset.dims[k][0].name).name for k in range(1, dataset.ndim))
+    values = dataset[:rows]
+    if values.dtype.kind == "S":
+        values = values.view(f"S{values.shape[1]}")[:, 0]
+        dims = dims[:-1]
+    variable = Variable(attributes.pop("units", ""), attributes.pop("long_name"), dims, values.dtype.str, attributes)
+    return variable, values
+
+
+def tree(
+    columns: Mapping[str, Mapping[str, tuple[Variable, Data]]], attributes: Mapping[str, str | int | float]
+) -> xarray.DataTree:
+    """A record as labelled arrays, from the columns of each group and the attributes of the root."""
+    import xarray
+
+    nodes = {"/": xarray.Dataset(attrs=dict(attributes))}
+    for path, group in columns.items():
+        time_name = "sample_time" if "sample_time" in group else "time"
+        nodes[path] = xarray.Dataset(
+            {
+                name: (
+                    (time_name, *variable.dims),
+                    np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
+                    variable.labels,
+                )
+                for name, (variable, values) in group.items()
+            }
+        ).set_coords(time_name)
+        labels = {str(dim): list(AXES[str(dim)]) for dim in nodes[path].dims if dim in AXES}
+        nodes[path] = nodes[path].assign_coords(labels)
+    return xarray.DataTree.from_dict(nodes)
