@@ -193,3 +193,23 @@ class Estimate:
     sigma_accel_bias: Array
     status: Status
     extra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, t: float, *, q_nb: Array | None = None, lla: Array | None = None, v_n: Array | None = None,
+        covariance: Array | None = None, status: Status | None = None,
+    ) -> Estimate:  # fmt: skip
+        """An estimate of what is given, ``lla`` being (lat, lon, h); what is not given is NaN, and not known.
+
+        Without ``status`` it is aligned when there is an attitude, and of attitude only when there is no position.
+        """
+        if status is None:
+            aligned = Status.ALIGNED if lla is not None else Status.ALIGNED | Status.ATTITUDE_ONLY
+            status = Status.ALIGNING if q_nb is None else aligned
+        unknown = np.full(3, np.nan)
+        lat, lon, h = unknown if lla is None else lla
+        return cls(
+            t, float(lat), float(lon), float(h), unknown if v_n is None else v_n,
+            np.full(4, np.nan) if q_nb is None else q_nb, unknown, unknown,
+            np.full((9, 9), np.nan) if covariance is None else covariance, unknown, unknown, status,
+        )  # fmt: skip

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field
 
+LONGEST_RUN_S = 48 * 3600.0  # longer than any aircraft of this class flies; a slip of the keyboard beyond that
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 Heading: TypeAlias = Annotated[float, Field(ge=-360, le=360)]
 
 

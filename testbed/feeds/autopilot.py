@@ -51,7 +51,8 @@ from nav.local_filter import ISOLATED, OUTSIDE
 from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
 from nav.samples import AirspeedSample, Array, BarometerSample, Estimate, ImuSamples, Sample, Status, UpdateReport
-from testbed.estimators import Running, Tracked
+from testbed.estimators.lane import Lane, Tracked
+from testbed.feeds.known import commanded, handed_over
 from testbed.motion.paths import Feedback
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.scenario import Scenario
@@ -111,7 +112,7 @@ class Autopilot:
     flown on are run here.
     """
 
-    def __init__(self, source: Steered, scenario: Scenario, filters: Mapping[str, Running], sense: Sense) -> None:
+    def __init__(self, source: Steered, scenario: Scenario, filters: Mapping[str, Lane], sense: Sense) -> None:
         feedback = scenario.autopilot.feedback
         self.events: deque[tuple[float, str, str]] = deque()
         self.closed = False
@@ -167,13 +168,14 @@ class Autopilot:
         """Sense and estimate over the rows of one frame, or of a part of it; at its end, feed back."""
         if block.tick == 0:
             for one in self._filters.values():
-                one.begin(block)
+                if one.handover is not None:
+                    one.start(handed_over(one.handover, block))
         self._tick = block.tick + len(block)
         t = float(block.t[-1])
         ends = self._tick % self._frame == 0
         times = [*wanted, t] if ends and t not in wanted else wanted
         imu, samples = self._sense(block)
-        tracked = {name: one.track(block, imu, samples, times) for name, one in self._filters.items()}
+        tracked = {name: one.track(commanded(block), imu, samples, times) for name, one in self._filters.items()}
         self._integrate(tracked[self._leader].increments)
         if self._air is not None:
             self._air.take(samples, tracked[self._position].reports)

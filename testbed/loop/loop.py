@@ -18,9 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from nav.samples import Estimate, FixType, GnssSample, ImuSamples, Sample, Status, UpdateReport
-from testbed import estimators, sensors
+from testbed import sensors
 from testbed.errors import UserError
+from testbed.estimators import registry
 from testbed.feeds.autopilot import Autopilot, Steered
+from testbed.feeds.known import commanded, handed_over
 from testbed.loop.requests import Desk, Director, Plant, Recorded, Request, Restarted
 from testbed.motion.ahead import Ahead
 from testbed.motion.sections import FlightTruth
@@ -358,7 +360,7 @@ def _fly(
             else:
                 aiding[name] = sensor
         faults = Faults(scenario.fault, scenario.sensors, seed)
-        filters = estimators.build(scenario, seed)
+        filters = registry.build(scenario.estimator, scenario.rig(seed))
         # Between a tick and what a filter has surely used by then: an increment may not be complete yet.
         behind = {
             name: one.horizon.lag_s + 1 / inertial[one.imu].rate_hz - 1 / rate_hz for name, one in filters.items()
@@ -437,9 +439,9 @@ def _fly(
                 if flown is not None and name in flown.tracked:
                     tracked = flown.tracked[name]
                 else:
-                    if tick == 0:
-                        one.begin(block)
-                    tracked = one.track(block, imu, samples, times)
+                    if tick == 0 and one.handover is not None:
+                        one.start(handed_over(one.handover, block))
+                    tracked = one.track(commanded(block), imu, samples, times)
                 integrated[name], parity, reports, estimates[name] = tracked
                 recorder.reports(name, parity)
                 votes[name].extend(parity)

@@ -32,16 +32,18 @@ from pydantic import TypeAdapter, ValidationError
 
 from nav.ins import Ins
 from testbed.errors import UserError
+from testbed.estimators.ins import InsSection
 from testbed.loop.pacer import Pacer
 from testbed.motion.sections import FlightTruth
-from testbed.scenario import LONGEST_RUN_S, Scenario
+from testbed.scenario import Scenario
+from testbed.schema import LONGEST_RUN_S
 from testbed.sensors.faults import Fault, FaultConfig, Faults, FaultTruth, mistakes
 from testbed.sensors.gnss import Gnss
 
 if TYPE_CHECKING:
     import xarray
 
-    from testbed.estimators import Running
+    from testbed.estimators.lane import Lane
     from testbed.motion.table import MotionSource
     from testbed.record.recorder import Recorder
     from testbed.sensors import AidingSensor
@@ -254,7 +256,7 @@ class Plant:
 
     faults: Faults
     aiding: Mapping[str, AidingSensor]
-    filters: Mapping[str, Running]
+    filters: Mapping[str, Lane]
     source: MotionSource
 
 
@@ -315,7 +317,7 @@ def _knobs(scenario: Scenario) -> dict[str, _Knob]:
     text = "simulated over wall time"
     knobs["SIM_SPEEDUP"] = _Knob(Setting(1, SMALLEST_SPEED, LARGEST_SPEED, False, text))
     for k, estimator in enumerate(scenario.estimator, 1):
-        if estimator.kind == "ins":
+        if isinstance(estimator, InsSection):
             key = f"EST{k}_FALSE_REJ"
             text = f"{estimator.name}: sound samples that its gate may refuse [1]; 0: no gate"
             gate = _gate(estimator.name, key)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -23,7 +23,11 @@ from nav.horizon import FusionHorizon
 from nav.ins import Ins
 from nav.local_filter import ISOLATED
 from nav.samples import Array, Estimate
-from testbed import estimators, sensors
+from testbed import sensors
+from testbed.estimators import registry
+from testbed.estimators.federated import FederatedSection
+from testbed.estimators.ins import InsSection
+from testbed.feeds.known import handed_over
 from testbed.loop.loop import motion, run
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
@@ -115,8 +119,10 @@ def floor(seed: int) -> dict[str, dict[str, list[float]]]:
     """
     chosen = scenario(NAME, HEALTHY)
     federated = next(one for one in chosen.estimator if one.name == "with_star")
+    assert isinstance(federated, FederatedSection)
+    same = ("name", "imu", "states", "turn_degps", "gust_mps", "handover", "nonholonomic_mps")
     aids = tuple(aid for local in federated.locals for aid in local.aids)
-    alone = federated.model_copy(update={"kind": "ins", "aids": aids, "locals": (), "false_rejection": 0.0})
+    alone = InsSection(aids=aids, false_rejection=0.0, **{key: getattr(federated, key) for key in same})
     chosen = chosen.model_copy(update={"estimator": (alone,)})
     truth = motion(chosen, seed).advance(round(chosen.duration_s * chosen.truth.rate_hz) + 1)
     sensed: dict[str, Any] = {
@@ -131,11 +137,11 @@ def floor(seed: int) -> dict[str, dict[str, list[float]]]:
     t = np.arange(0.0, chosen.duration_s + 0.5)
     largest = {}
     for when, policies in (("six faults", told), ("no fault", None)):
-        built = estimators.build(chosen, seed)["with_star"]
+        built = registry.build(chosen.estimator, chosen.rig(seed))["with_star"]
         assert isinstance(built.horizon.estimator, Ins)
         assert built.handover is not None
         ins = Ins(built.horizon.estimator.config, policies=policies)
-        replace(built.handover, estimator=ins).take_over(truth)
+        ins.start(handed_over(built.handover, truth))
         handed = [sample for aid in built.sensors for sample in sensed[aid]]
         _, estimates = FusionHorizon(ins).track(built.increments(sensed)[0], handed, t.tolist())
         largest[when] = _largest(t, _differences(estimates, truth, np.searchsorted(truth.t, t - metrics.SAME_TIME_S)))

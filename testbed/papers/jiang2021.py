@@ -17,7 +17,9 @@ import numpy as np
 from nav.ahrs import Ahrs
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, Sample
-from testbed import estimators, sensors
+from testbed import sensors
+from testbed.estimators import registry
+from testbed.estimators.lane import Lane
 from testbed.loop import loop
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
@@ -97,11 +99,12 @@ def fly(seed: int) -> dict[Case, Flown]:
         }
         for case in CASES:
             if case.flight == flight:
-                found[case] = _run(case, estimators.build(chosen, seed)[case.estimator], truth, sensed)
+                lane = registry.build(chosen.estimator, chosen.rig(seed))[case.estimator]
+                found[case] = _run(case, lane, truth, sensed)
     return found
 
 
-def _run(case: Case, running: estimators.Running, truth: TruthBlock, sensed: dict[str, Any]) -> Flown:
+def _run(case: Case, running: Lane, truth: TruthBlock, sensed: dict[str, Any]) -> Flown:
     ahrs = running.horizon.estimator
     assert isinstance(ahrs, Ahrs)
     tilt = -math.radians(case.tilt_deg) * NORTH  # C_nb_hat = (I - [phi x]) C_nb

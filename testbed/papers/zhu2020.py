@@ -19,7 +19,9 @@ from nav.earth import position_difference_n
 from nav.federated import Federated, weights_by_covariance, weights_eq13
 from nav.samples import Array
 from nav.weighting import inflation
-from testbed import estimators, sensors
+from testbed import sensors
+from testbed.estimators import registry
+from testbed.feeds.known import handed_over
 from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.results import write_result
@@ -75,7 +77,7 @@ def navigate(chosen: Scenario, seed: int) -> dict[str, Flown]:
     source = loop.motion(chosen, seed)
     sensed = {name: sensors.build(name, config, rate, seed, chosen.site()) for name, config in chosen.sensors.items()}
     faults = Faults(chosen.fault, chosen.sensors, seed)
-    filters = estimators.build(chosen, seed)
+    filters = registry.build(chosen.estimator, chosen.rig(seed))
     ticks = round(chosen.duration_s) * rate + 1
     wrong = [round(t * rate) for t in OUTLIERS if t < chosen.duration_s]
     wanted = np.array(sorted({*range(0, ticks, rate), *wrong, *(tick - 1 for tick in wrong)}))
@@ -87,7 +89,8 @@ def navigate(chosen: Scenario, seed: int) -> dict[str, Flown]:
         due = wanted[(wanted >= first) & (wanted < first + len(truth))] - first
         for name, one in filters.items():
             if first == 0 and one.handover is not None:
-                replace(one.handover, random=stream(seed, "zhu2020", "handover")).take_over(truth)
+                start = replace(one.handover, random=stream(seed, "zhu2020", "handover"))
+                one.start(handed_over(start, truth))
             handed = [sample for aid in one.sensors for sample in samples[aid]]
             increments, _ = one.increments(samples)
             _, found = one.horizon.track(increments, handed, truth.t[due].tolist())

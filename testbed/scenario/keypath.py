@@ -14,7 +14,7 @@ from datetime import date
 from pathlib import PurePath
 from typing import Any, TypeAlias
 
-from testbed.errors import UserError
+from testbed.errors import UserError, printable
 
 KeyPath: TypeAlias = tuple[str | int, ...]
 
@@ -46,11 +46,6 @@ def written(path: KeyPath) -> str:
 def read(text: str) -> KeyPath:
     """The key path that `written` wrote, of bare keys and indexes."""
     return tuple(int(index) if index else key for index, key in re.findall(r"\[(\d+)\]|([^.\[\]]+)", text))
-
-
-def printable(text: str) -> str:
-    """The same on one line: what does not print is escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def line_numbers(text: str) -> dict[KeyPath, int]:

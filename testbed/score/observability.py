@@ -51,8 +51,8 @@ from nav.samples import (
     StarSample,
     Status,
 )
-from testbed import estimators
 from testbed.errors import UserError
+from testbed.estimators import registry
 from testbed.scenario import Scenario
 from testbed.score import metrics as scores
 from testbed.score.metrics import column
@@ -88,7 +88,8 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     except (KeyError, ValueError, UserError):
         return {}
     found = {}
-    for name, running in estimators.build(scenario, scenario.seed).items():
+    own = [section for section in scenario.estimator if section.kind in registry.BUILT_IN]  # others say nothing of it
+    for name, running in registry.build(own, scenario.rig(scenario.seed)).items():
         way = _way(dataset, name) if name in scores.names(dataset) else None
         if way is None:
             continue

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 
 from nav.local_filter import ISOLATED
-from testbed import Scenario, estimators, run
+from testbed import Scenario, run
+from testbed.estimators import registry
+from testbed.estimators.lane import Lane
 from testbed.score import metrics
 
 SEEDS = 10
@@ -131,7 +133,7 @@ def test_faults_of_every_sensor() -> None:
 def seconds(scenario: Scenario, patch: pytest.MonkeyPatch) -> dict[str, float]:
     """What each estimator spends in its fusion horizon during one run."""
     spent = {one.name: 0.0 for one in scenario.estimator}
-    build = estimators.build
+    build = registry.build
 
     def clock(name: str, track: Any) -> Any:
         def clocked(*given: Any) -> Any:
@@ -142,14 +144,14 @@ def seconds(scenario: Scenario, patch: pytest.MonkeyPatch) -> dict[str, float]:
 
         return clocked
 
-    def clocked_build(*given: Any) -> dict[str, estimators.Running]:
+    def clocked_build(*given: Any) -> dict[str, Lane]:
         built = build(*given)
         for name, running in built.items():
             patch.setattr(running.horizon, "track", clock(name, running.horizon.track))
         return built
 
     with patch.context() as inner:
-        inner.setattr(estimators, "build", clocked_build)
+        inner.setattr(registry, "build", clocked_build)
         run(scenario)
     return spent
 

@@ -16,11 +16,12 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mav
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from worlds.lanes import lanes
 
 from nav.ahrs import Ahrs
 from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, UpdateReport
-from testbed import RunResult, Scenario, estimators, run
+from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
 from testbed.many import campaign
 from testbed.many.campaign import CampaignResult, Combination, Outcome
@@ -47,7 +48,7 @@ def scenario(*chosen: str, overrides: tuple[str, ...] = ()) -> Scenario:
 
 def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
     """What the last of the estimators is told."""
-    ahrs = list(estimators.build(scenario(*chosen, overrides=overrides), 0).values())[-1].horizon.estimator
+    ahrs = list(lanes(scenario(*chosen, overrides=overrides), 0).values())[-1].horizon.estimator
     assert isinstance(ahrs, Ahrs)
     return ahrs.config
 

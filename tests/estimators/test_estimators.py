@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from worlds.lanes import lanes
 
 from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, eq20, exponential, plain
 from nav.earth import position_difference_n
@@ -16,7 +17,7 @@ from nav.ins import Ins
 from nav.local_filter import AirspeedAid, GnssAid
 from nav.unscented import Scaling
 from nav.weighting import MahalanobisInflation, SageHusa
-from testbed import Scenario, estimators, papers, run
+from testbed import Scenario, papers, run
 from testbed.errors import UserError
 from testbed.loop.loop import motion
 from testbed.motion.kinematic import Kinematic
@@ -35,7 +36,7 @@ TWO_RECEIVERS = [
 
 
 def told(scenario: Scenario, name: str = "ins") -> Ins:
-    inner = estimators.build(scenario, 0)[name].horizon.estimator
+    inner = lanes(scenario, 0)[name].horizon.estimator
     assert isinstance(inner, Ins)
     return inner
 
@@ -113,8 +114,8 @@ def test_scale_factors_are_found_in_flight(engine: str) -> None:
 
 def test_a_receiver_that_is_no_aid_is_not_fused() -> None:
     scenario = Scenario.load("u_turn", TWO_RECEIVERS)
-    assert estimators.build(scenario, 0)["ins"].sensors[0] == "gnss2"
-    assert "gnss" not in estimators.build(scenario, 0)["ins"].sensors
+    assert lanes(scenario, 0)["ins"].sensors[0] == "gnss2"
+    assert "gnss" not in lanes(scenario, 0)["ins"].sensors
     fused = run(scenario).dataset["estimators/ins/innovations/gnss_position"]["sample_time"].values
     assert not ((fused > 8.05) & (fused < 14.95)).any()
     assert (fused < 8).any()
@@ -286,7 +287,7 @@ FEDERATED = [
 
 
 def test_a_federation_is_told_of_each_sensor() -> None:
-    running = estimators.build(Scenario.load("u_turn", FEDERATED), 0)["fed"]
+    running = lanes(Scenario.load("u_turn", FEDERATED), 0)["fed"]
     federated = running.horizon.estimator
     assert isinstance(federated, Federated)
     assert running.sensors == ("gnss", "gnss2", "airspeed", "barometer", "magnetometer")
@@ -319,7 +320,7 @@ def test_a_federation_is_told_of_each_sensor() -> None:
 def test_every_sequential_test_can_be_asked_for(keys: str, expected: Mean) -> None:
     """It remembers as the mean that is built by hand."""
     override = f"estimator[0].locals[0].detector={{kind='sprt', {keys}}}"
-    running = estimators.build(Scenario.load("u_turn", [*FEDERATED, override]), 0)["fed"]
+    running = lanes(Scenario.load("u_turn", [*FEDERATED, override]), 0)["fed"]
     federated = running.horizon.estimator
     assert isinstance(federated, Federated)
     detector = federated.config.locals[0].sensors[0].detector()
@@ -340,7 +341,7 @@ def test_a_local_filter_has_its_own_engine_and_policy() -> None:
         "estimator[0].locals[0].policy={kind='sage_husa', b=0.9}",
         "estimator[0].locals[1].policy={kind='inflate', solver='newton', reject_above=50.0}",
     ]
-    federated = estimators.build(Scenario.load("u_turn", [*FEDERATED, *keys]), 0)["fed"].horizon.estimator
+    federated = lanes(Scenario.load("u_turn", [*FEDERATED, *keys]), 0)["fed"].horizon.estimator
     assert isinstance(federated, Federated)
     one, two, air = federated.config.locals
     assert [local.scaling for local in (one, two, air)] == [Scaling(), None, None]
@@ -354,7 +355,7 @@ def test_a_local_filter_has_its_own_engine_and_policy() -> None:
 
 def test_a_federation_without_receivers_aligns_with_the_first() -> None:
     blind = ['estimator=[{name="fed", kind="federated", locals=[{name="air", aids=["barometer"]}]}]', "expect={}"]
-    running = estimators.build(Scenario.load("u_turn", blind), 0)["fed"]
+    running = lanes(Scenario.load("u_turn", blind), 0)["fed"]
     assert running.sensors == ("barometer", "gnss", "magnetometer")
 
 

@@ -21,7 +21,8 @@ from nav.error_model import PHI, POS, VEL
 from nav.horizon import FusionHorizon
 from nav.local_filter import LocalFilter
 from nav.samples import Sample
-from testbed import estimators
+from testbed.estimators import federated
+from testbed.estimators.rig import Rig
 from testbed.many import check
 from testbed.report import page as report
 
@@ -72,7 +73,7 @@ def noise(part: str, factor: float = 100.0) -> Break:
 
 def no_detector(monkeypatch: pytest.MonkeyPatch) -> None:
     """Detectors that never alarm."""
-    monkeypatch.setattr(estimators, "_detector", lambda config: Never())
+    monkeypatch.setattr(federated, "_detector", lambda config: Never())
 
 
 def samples_as_they_arrive(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,7 +88,7 @@ def samples_as_they_arrive(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def no_lag(monkeypatch: pytest.MonkeyPatch) -> None:
     """Latency ignored: no horizon, so that a filter is past a sample's time when it arrives."""
-    monkeypatch.setattr(estimators, "_lag_s", lambda *_: 0.0)
+    monkeypatch.setattr(Rig, "lag_s", lambda *_: 0.0)
 
 
 def gravity(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -571,7 +571,7 @@ def test_half_an_hour_without_gnss(plan):
     from pydantic import TypeAdapter
 
     from testbed import sensors
-    from testbed.estimators import imu_model
+    from testbed.estimators.datasheet import imu_model
     from testbed.motion.flight import Flight
     from testbed.motion.legs import Leg
     from testbed.motion.sections import FlightTruth

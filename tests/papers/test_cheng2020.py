@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from worlds.lanes import lanes
 
 from nav.ins import Ins
-from testbed import estimators, papers
+from testbed import papers
 from testbed.papers import cheng2020
 
 
 def test_the_scenario_tells_the_filters_what_it_says() -> None:
-    built = estimators.build(papers.scenario("cheng2020"), 0)
+    built = lanes(papers.scenario("cheng2020"), 0)
     filters = {name: one.horizon.estimator for name, one in built.items()}
     assert set(filters) == set(cheng2020.ALL)
     for name, ins in filters.items():

@@ -11,6 +11,7 @@ import numpy as np
 import pymap3d
 import pytest
 from scipy.stats import chi2, ncx2
+from worlds.lanes import lanes
 
 from nav.detection import Eraim, Glr
 from nav.error_model import POS, VEL
@@ -19,7 +20,7 @@ from nav.kalman import correct, innovate
 from nav.local_filter import GnssAid, LocalFilter, Seat
 from nav.samples import Array, FixType, GnssSample
 from testbed import papers, run
-from testbed.estimators import build, imu_model
+from testbed.estimators.datasheet import imu_model
 from testbed.loop.loop import motion
 from testbed.papers import Claim, cui2022
 from testbed.scenario import Scenario
@@ -89,7 +90,7 @@ def test_a_body_that_never_turns_keeps_its_gyro_bias() -> None:
 
 
 def test_turn_rate_and_recall_reach_the_filters(shipped: Scenario) -> None:
-    config = build(shipped, 1)["with_star"].horizon.estimator.config  # type: ignore[union-attr]
+    config = lanes(shipped, 1)["with_star"].horizon.estimator.config  # type: ignore[union-attr]
     assert config.recall_s == 10.0
     assert math.degrees(config.imu.gyro_bias_sigma) * 3600 == pytest.approx(0.01, rel=0.02)
 
@@ -98,7 +99,7 @@ def test_the_states_are_those_of_eq_36() -> None:
     """24 common ones, none of which walks for want of another; 6 of a GPS with slow errors, 6 of the Doppler."""
     slow = ["correlated_m", "velocity_correlated_mps"]
     gps = [f"sensors.gps.{axis}_{what}=1" for axis in ("horizontal", "vertical") for what in slow]
-    estimator = build(papers.scenario("cui2022", gps), 1)["with_star"].horizon.estimator
+    estimator = lanes(papers.scenario("cui2022", gps), 1)["with_star"].horizon.estimator
     assert isinstance(estimator, Federated)
     common = ["phi", "dv", "dp", "gyro_bias", "accel_bias", "gyro_drift", "gyro_scale", "accel_scale"]
     own = {
@@ -286,7 +287,7 @@ def test_the_gain_of_eq_9_makes_the_variance_negative() -> None:
 def test_the_measurement_matrix_of_eq_35_would_see_the_misalignments() -> None:
     """Printed: ones in the first three columns, twice. There the attitude lies (Eq 12)."""
     scenario = papers.scenario("cui2022")
-    estimator = build(scenario, 1)["with_star"].horizon.estimator
+    estimator = lanes(scenario, 1)["with_star"].horizon.estimator
     reference = estimator._reference  # type: ignore[union-attr]
     state = reference.start(_level())
     local: LocalFilter = estimator.locals[0]  # type: ignore[union-attr]

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
+from worlds.lanes import lanes
 
 from nav.federated import Federated
-from testbed import estimators, papers
+from testbed import papers
 from testbed.loop.loop import motion
 from testbed.papers import zhou2025
 from testbed.papers.zhou2025 import (
@@ -42,7 +43,7 @@ def test_the_circuit_is_nearly_closed() -> None:
 
 def test_the_scenario_is_that_of_the_tables() -> None:
     scenario = papers.scenario("zhou2025")
-    running = estimators.build(scenario, 1)
+    running = lanes(scenario, 1)
     filters = {name: one.horizon.estimator for name, one in running.items()}
     assert list(filters) == list(LABELS)
     for name, one in filters.items():

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from worlds.lanes import lanes
 
 from nav.detection import Never
-from testbed import estimators, papers
+from testbed import papers
 from testbed.errors import UserError
 from testbed.loop.loop import run
 from testbed.papers import scenario, zhu2020
@@ -25,7 +26,7 @@ SHORT = ("duration_s=320", "expect={}")
 def test_scenarios_are_sound(name: str) -> None:
     chosen = scenario(name)
     assert chosen.expect
-    assert "frkf" in estimators.build(chosen, 1)
+    assert "frkf" in lanes(chosen, 1)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def line_of(text: str, start: str) -> int:
         ),
         ('name = "ins"', 'name = "my ins"', "estimator[0].name: is made of letters"),
         ('name = "ins"', 'name = "run"', "estimator[0].name: 'run' is reserved"),
-        ('kind = "ins"', 'kind = "ukf"', 'estimator[0].kind: can\'t be "ukf": choose from ins'),
+        ('kind = "ins"', 'kind = "ukf"', 'estimator[0].kind: there is no kind "ukf": choose from ins'),
         ('kind = "ins"', 'imu = "gnss"', 'estimator[0].imu: there is no IMU "gnss": choose from imu'),
         ('aids = ["gnss", ', 'aids = ["gps", ', 'estimator[0].aids[0]: there is no sensor "gps"'),
         (
@@ -333,7 +333,10 @@ def test_same_name_for_two_estimators() -> None:
         ('estimator[0].locals[1].aids=["gps"]', 'estimator[0].locals[1].aids[0]: there is no sensor "gps"'),
         ('estimator[0].locals[1].aids=["imu"]', "aids[0]: 'imu' is of kind 'imu', which does not aid 'federated'"),
         ("estimator[0].locals[1].share=0.4", "estimator[0].locals: the shares of all local filters must add up to 1"),
-        ('estimator[0].aids=["gnss"]', "estimator[0].aids: a federated estimator lists its aids by local filter"),
+        (
+            'estimator[0].aids=["gnss"]',
+            "estimator[0].aids: is a key of kind 'ins' or 'ahrs', not of 'federated': give it to its locals",
+        ),
         (
             "estimator[0]={name='ins', kind='federated', cross_check=true, structure='partial', "
             "locals=[{name='a', aids=['gnss']}]}",

@@ -1,0 +1,155 @@
+"""``kind = "ahrs"``: attitude alone, levelled by specific force while the motion allows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from nav.ahrs import Ahrs, AhrsConfig
+from nav.horizon import FusionHorizon
+from nav.motion import LowDynamics
+from nav.samples import Array
+from testbed.estimators.datasheet import FIELD_SIZE, PAYLOAD_CURRENT, SOFT_IRON_SHARE, imu_model
+from testbed.estimators.lane import Commanded, Lane, mountings
+from testbed.estimators.rig import Rig
+from testbed.estimators.section import (
+    USUAL_TURN_DEGPS,
+    EstimatorSection,
+    Gust,
+    Mistake,
+    TurnRate,
+    aid_mistakes,
+    second_of_a_kind,
+)
+from testbed.schema import Heading, Section
+from testbed.sensors import SensorConfig, geomagnetic_field_n
+from testbed.sensors.magnetometer import MagnetometerConfig
+
+AIDS = frozenset({"barometer", "magnetometer", "airspeed"})
+FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
+LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
+IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
+NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
+LEVEL_BANK = math.radians(5.0)  # commanded; a straight in light turbulence takes 2.5 (99 % of the time)
+
+
+class LevelSection(Section):
+    """When an AHRS takes specific force for tilt, and how far it follows; with airspeed as without.
+
+    Defaults are those of Jiang et al. 2021 (`nav.motion.LowDynamics`, `nav.ahrs.AhrsConfig`).
+    """
+
+    acceleration_mps2: float = Field(default=0.2, gt=0, le=10, description="largest acceleration at which it levels")
+    yaw_rate_degps: float = Field(
+        default=0.5, gt=0, le=100, description="largest rate about the body's down axis at which it levels"
+    )
+    roll_rate_degps: float = Field(
+        default=2.0, gt=0, le=100, description="largest rate about the body's forward axis at which it levels"
+    )
+    test: Literal["norm", "vector"] = Field(
+        default="norm",
+        description="acceleration by the size of specific force less gravity, or by its vector less gravity",
+    )
+    force_sigma_mps2: float = Field(default=0.1, gt=0, le=10, description="of a second's mean, as a sign of tilt")
+    limit_deg: float = Field(default=0.2, gt=0, le=20, description="largest correction per second and axis")
+    gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
+
+
+class AhrsSection(EstimatorSection):
+    """Keys of an AHRS (`nav.ahrs.AhrsConfig`)."""
+
+    kind: Literal["ahrs"] = "ahrs"
+    aids: tuple[str, ...] = Field(description="sensors whose samples it uses, by their names")
+    turn_degps: TurnRate = USUAL_TURN_DEGPS
+    gust_mps: Gust = 1.0
+    heading_deg: Heading | None = Field(default=None, description="at the start, of one without magnetometer")
+    levelling: bool = Field(default=True, description="false: once it has begun, it goes by its gyros alone")
+    level: LevelSection | None = Field(default=None, description="how it levels; none: as light turbulence wants")
+    autopilot: bool = Field(default=False, description="true: it levels only while level flight is commanded")
+    literal: bool = Field(default=False, description="as printed: Jiang et al. 2021, equation 10")
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return True
+
+    def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
+        """What is wrong with it among these sensors."""
+        blind = "magnetometer" not in [sensors[aid].kind for aid in self.aids if aid in sensors]
+        if blind and self.heading_deg is None:
+            yield ("heading_deg",), "is missing: an AHRS without magnetometer is told where it points at the start"
+        elif not blind and self.heading_deg is not None:
+            yield ("heading_deg",), "the magnetometer among the aids finds the heading: leave one of the two out"
+        yield from super().mistakes(sensors)
+        yield from aid_mistakes("ahrs", self.aids, sensors, AIDS)
+        yield from second_of_a_kind("ahrs", self.aids, sensors)
+
+
+@dataclass
+class FlightControl:
+    """Tells an AHRS when its autopilot commands level flight: no turn, no climb, no change of speed.
+
+    `LEVEL_BANK` is what keeping a straight course in gusts
+    takes.
+    """
+
+    ahrs: Ahrs
+    _held: Array = field(default_factory=lambda: np.full(2, np.nan))  # last commanded altitude [m] and airspeed [m/s]
+
+    def tell(self, commanded: Commanded) -> None:
+        """Pass on what is in effect."""
+        held = np.column_stack([commanded.altitude, commanded.airspeed])
+        before = np.vstack([self._held, held[:-1]])
+        moved = (held != before) & ~np.isnan(before)
+        self._held = held[-1].copy()
+        self.ahrs.flight_control(commanded.t, (np.abs(commanded.bank) <= LEVEL_BANK) & ~moved.any(axis=1))
+
+
+def build(section: AhrsSection, rig: Rig) -> Lane:
+    """Attitude alone. It is told its area of operation, and its heading where no magnetometer finds it."""
+    errors, site = rig.imu(section.imu).errors(), rig.site
+    aids = {rig.sensors[name].kind: rig.sensors[name] for name in section.aids}
+    field_n = geomagnetic_field_n(site.lat, site.lon, site.h, site.date)
+    told: dict[str, object] = {"force_sigma": LEVELLING_FORCE}
+    level = section.level
+    if level is not None:
+        yaw_rate, roll_rate = math.radians(level.yaw_rate_degps), math.radians(level.roll_rate_degps)
+        limits = LowDynamics(level.acceleration_mps2, yaw_rate, roll_rate, level.test)
+        told |= {"motion": limits, "compensated_motion": limits}
+        told |= {"force_sigma": level.force_sigma_mps2, "phi_limit": math.radians(level.limit_deg)}
+        told |= {"gyro_bias_feedback": level.gyro_bias_feedback}
+    if not section.levelling:
+        told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
+    if section.heading_deg is not None:
+        told |= {"heading": math.radians(section.heading_deg)}
+    magnetometer = aids.get("magnetometer")
+    if isinstance(magnetometer, MagnetometerConfig):
+        m = magnetometer.errors()
+        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * PAYLOAD_CURRENT)
+        lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * IRON_TURN_S * magnetometer.rate_hz)
+        told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
+    ahrs = Ahrs(
+        AhrsConfig(
+            imu_model(errors, math.radians(section.turn_degps)),
+            site.lat,
+            site.h,
+            tuple(aids),
+            airspeed_sigma=section.gust_mps,
+            literal=section.literal,
+            **told,  # type: ignore[arg-type]
+        ),
+        field_n,
+    )
+    imus, voter = mountings(section, rig)
+    return Lane(
+        FusionHorizon(ahrs, rig.lag_s(section.aids), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
+        imus,
+        section.aids,
+        voter=voter,
+        commanded=FlightControl(ahrs).tell if section.autopilot else None,
+    )

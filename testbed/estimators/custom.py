@@ -1,0 +1,289 @@
+"""``kind = "module:Class"``: anybody's estimator, run as ours are.
+
+The class is the user's, found in a module, in a file beside the scenario, or by an entry point of the group
+``navigation_testbed.estimators``:
+
+    class Mine:
+        def __init__(self, rig, **options): ...   # `testbed.estimators.rig.Rig`; the other keys of its [[estimator]]
+        def propagate(self, imu): ...             # a block of increments, `nav.samples.ImuSamples`
+        def update(self, sample): ...             # one aiding sample; None, or a list of `nav.samples.UpdateReport`
+        def estimate(self): ...                   # `nav.samples.Estimate` at the end of the last increment
+
+Samples come in the order of their times, each after the increments up to its own time; one of a kind that it does not
+use it ignores. ``Options``, a pydantic model inside the class, checks its keys if it is there. Where it has them,
+``predict(imu)``, ``accepts(sample)``, ``refuse(sample, reason)`` and ``listening`` of `nav.horizon.Estimator` are used;
+else `Adapter` stands in for them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from nav import strapdown
+from nav.horizon import FusionHorizon
+from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from testbed.errors import UserError, choice, shown, unknown
+from testbed.estimators.lane import Lane, mountings
+from testbed.estimators.rig import Rig
+from testbed.estimators.section import EstimatorSection, Mistake
+from testbed.sensors import SensorConfig
+
+GROUP = "navigation_testbed.estimators"
+METHODS = ("propagate", "update", "estimate")
+
+T = TypeVar("T")
+
+
+class CustomSection(EstimatorSection):
+    """Keys of an estimator of the user's. Those that are not here are handed to its class."""
+
+    model_config = ConfigDict(extra="allow")
+
+    aids: tuple[str, ...] | None = Field(default=None, description="whose samples it is handed; none: of every sensor")
+    estimates: Literal["motion", "attitude"] = Field(default="motion", description="attitude: no position, no velocity")
+
+    @property
+    def attitude_only(self) -> bool:
+        """Whether it estimates no position and no velocity."""
+        return self.estimates == "attitude"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The keys that are the class's own."""
+        return dict(self.model_extra or {})
+
+    def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
+        """What is wrong with it among these sensors."""
+        yield from super().mistakes(sensors)
+        aiding = [name for name, sensor in sensors.items() if sensor.kind != "imu"]
+        for index, aid in enumerate(self.aids or ()):
+            if aid not in aiding:
+                yield ("aids", index), unknown("sensor", aid, aiding)
+
+
+def build(section: CustomSection, rig: Rig) -> Lane:
+    """The user's estimator behind its fusion horizon.
+
+    Raises UserError when its class can't be had, does not have the three methods, or refuses its options.
+    """
+    made = load(section.kind, rig.folder)
+    options = _options(section, made)
+    try:
+        inner = made(rig, **options)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"estimator {section.name}: {section.kind} can't be made: {_told(error)}") from error
+    missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
+    if missing:
+        raise UserError(f"estimator {section.name}: {section.kind} lacks {', '.join(missing)}: see docs/extending.md")
+    aiding = tuple(name for name, sensor in rig.sensors.items() if sensor.kind != "imu")
+    used = aiding if section.aids is None else section.aids
+    imus, voter = mountings(section, rig)
+    coning = rig.imu(section.imu).rate_hz < rig.tick_rate_hz
+    return Lane(FusionHorizon(Adapter(inner), rig.lag_s(used), coning=coning), imus, used, voter=voter)
+
+
+def _options(section: CustomSection, made: Any) -> dict[str, Any]:
+    """The class's own keys, checked by its ``Options`` if it has that."""
+    options: type[BaseModel] | None = getattr(made, "Options", None)
+    if options is None:
+        return section.options
+    try:
+        checked = options.model_validate(section.options)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"])) or "options"
+        if first["type"] == "extra_forbidden":
+            raise UserError(
+                f"estimator {section.name}: {key}: unknown key: {choice(key, list(options.model_fields))}"
+            ) from None
+        raise UserError(f"estimator {section.name}: {key}: {first['msg']}, not {shown(first['input'])}") from None
+    return {name: getattr(checked, name) for name in options.model_fields} | dict(checked.model_extra or {})
+
+
+# --- finding the class
+
+
+@cache
+def installed() -> Mapping[str, str]:
+    """The kinds that installed packages offer by entry points: name and ``module:Class``."""
+    return {point.name: point.value for point in entry_points(group=GROUP)}
+
+
+def load(kind: str, folder: Path) -> Any:
+    """The class that ``kind`` names; a path is relative to ``folder``. Raises UserError when it can't be had."""
+    where, _, name = installed().get(kind, kind).rpartition(":")
+    try:
+        module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
+    except UserError:
+        raise
+    except ModuleNotFoundError as error:
+        if error.name is not None and where.split(".")[0] != error.name.split(".")[0]:
+            raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}") from error
+        todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
+        raise UserError(f"kind {shown(kind)}: there is no module {where}: {todo}") from None
+    except Exception as error:
+        raise UserError(f"kind {shown(kind)}: {where} can't be imported: {_told(error)}") from error
+    if not hasattr(module, name):
+        classes = [key for key, value in vars(module).items() if isinstance(value, type) and not key.startswith("_")]
+        raise UserError(f"kind {shown(kind)}: {unknown(f'class in {where}', name, classes)}")
+    return getattr(module, name)
+
+
+def _file(path: Path) -> ModuleType:
+    """The module in a file, the same one as long as the file is the same."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror}: a path is relative to the scenario file") from None
+    name = f"{path.stem}_{hashlib.sha256(str(path.resolve()).encode() + content).hexdigest()[:12]}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None  # its name ends with .py
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _told(error: BaseException) -> str:
+    """What was raised and where, on one line."""
+    frames = traceback.extract_tb(error.__traceback__)
+    at = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {error}{at}"
+
+
+# --- running it
+
+
+class Adapter:
+    """A class of three methods as an estimator of the house (`nav.horizon.Estimator`).
+
+    What it raises, or gives that is no estimate, is its end: ``failure`` says why, and from there on it has no
+    estimate. It is handed read-only arrays, so that it can't change what others see.
+    """
+
+    def __init__(self, inner: Any) -> None:
+        self.inner = inner
+        self.failure = ""
+        self._t = np.nan
+
+    @property
+    def listening(self) -> bool:
+        """Whether a sample of some kind would still be used."""
+        return not self.failure and bool(getattr(self.inner, "listening", True))
+
+    def accepts(self, sample: Sample) -> bool:
+        """Whether `update` would use the sample now."""
+        accepts: Callable[[Sample], bool] | None = getattr(self.inner, "accepts", None)
+        if self.failure or accepts is None:
+            return not self.failure
+        return self._asked(lambda: bool(accepts(_read_only(sample))), False)
+
+    def propagate(self, imu: ImuSamples) -> Sequence[UpdateReport]:
+        """Advance by a block of increments."""
+        self._t = float(imu.t[-1])
+        return self._asked(lambda: _reports(self.inner.propagate(_read_only(imu))), [])
+
+    def update(self, sample: Sample) -> list[UpdateReport]:
+        """Use a sample that is valid at the estimator's own time."""
+        return self._asked(lambda: _reports(self.inner.update(_read_only(sample))), [])
+
+    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+        """The reports on a sample that came too late: none, unless it has something to say."""
+        refuse = getattr(self.inner, "refuse", None)
+        return [] if refuse is None else self._asked(lambda: _reports(refuse(_read_only(sample), reason)), [])
+
+    def estimate(self) -> Estimate:
+        """The state at its own time."""
+        return self._asked(lambda: _checked(self.inner.estimate()), Estimate.of(self._t))
+
+    def predict(self, imu: ImuSamples) -> Estimate:
+        """The state after further increments: its own prediction, or its estimate carried on by the increments."""
+        end = float(imu.t[-1])
+        predict = getattr(self.inner, "predict", None)
+        if predict is not None:
+            return self._asked(lambda: _checked(predict(_read_only(imu))), Estimate.of(end))
+        return self._asked(lambda: carried(_checked(self.inner.estimate()), imu), Estimate.of(end))
+
+    def _asked(self, ask: Callable[[], T], otherwise: T) -> T:
+        if self.failure:
+            return otherwise
+        try:
+            return ask()
+        except Exception as error:
+            self.failure = _told(error)
+            return otherwise
+
+
+def carried(estimate: Estimate, imu: ImuSamples) -> Estimate:
+    """An estimate carried on by increments, less the biases that it knows; what it does not know stays unknown."""
+    ends = float(imu.t[-1])
+    gyro, accel = (np.nan_to_num(bias) for bias in (estimate.gyro_bias, estimate.accel_bias))
+    dt = imu.dt[:, None]
+    dtheta, dv = imu.dtheta - gyro * dt, imu.dv - accel * dt
+    lla, q_nb = np.array([estimate.lat, estimate.lon, estimate.h]), np.array(estimate.q_nb, dtype=float)
+    v_n = np.array(estimate.v_n, dtype=float)
+    moving = bool(np.isfinite(lla).all() and np.isfinite(v_n).all())
+    if not moving:
+        lla[:], v_n[:] = 0.0, 0.0
+    strapdown.propagate(q_nb, v_n, lla, dtheta, dv, imu.dt)
+    if not moving:
+        return dataclasses.replace(estimate, t=ends, q_nb=q_nb)
+    lat, lon, h = lla.tolist()
+    return dataclasses.replace(estimate, t=ends, lat=lat, lon=lon, h=h, v_n=v_n, q_nb=q_nb)
+
+
+def _reports(given: Any) -> list[UpdateReport]:
+    """What `update` gave as a list. Raises TypeError when it is no such thing."""
+    reports = [] if given is None else [given] if isinstance(given, UpdateReport) else list(given)
+    for report in reports:
+        if not isinstance(report, UpdateReport):
+            raise TypeError(f"update gave {type(report).__name__} where nav.samples.UpdateReport was expected")
+    return reports
+
+
+SHAPES = {"v_n": (3,), "q_nb": (4,), "gyro_bias": (3,), "accel_bias": (3,), "covariance": (9, 9),
+          "sigma_gyro_bias": (3,), "sigma_accel_bias": (3,)}  # fmt: skip
+
+
+def _checked(estimate: Any) -> Estimate:
+    """The same, if it is an estimate. Raises TypeError or ValueError, saying what is wrong with it."""
+    if not isinstance(estimate, Estimate):
+        raise TypeError(f"estimate gave {type(estimate).__name__} where nav.samples.Estimate was expected")
+    for name, shape in SHAPES.items():
+        if np.shape(getattr(estimate, name)) != shape:
+            raise ValueError(f"estimate: {name} has shape {np.shape(getattr(estimate, name))}, not {shape}")
+    return estimate
+
+
+def _read_only(record: T) -> T:
+    """The same record with arrays that can't be written to."""
+    changes = {}
+    for name in (field.name for field in dataclasses.fields(record)):  # type: ignore[arg-type]
+        value = getattr(record, name)
+        if isinstance(value, np.ndarray):
+            changes[name] = value.view()
+            changes[name].flags.writeable = False
+    return dataclasses.replace(record, **changes) if changes else record  # type: ignore[type-var]

@@ -1,0 +1,150 @@
+"""From datasheets to what filters are told: the noise and the error states of the IMU and of each aid.
+
+A filter knows the datasheets, never the errors that were drawn from them. Terms that it has no state for
+(g-sensitivity, temperature, misalignment, mostly scale factors too) widen the bias that it does estimate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+from nav.earth import STANDARD_GRAVITY
+from nav.error_model import ImuModel
+from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid
+from testbed.estimators.section import ImuStates
+from testbed.sensors import SensorConfig
+from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
+from testbed.sensors.barometer import BarometerConfig
+from testbed.sensors.body_velocity import BodyVelocityConfig
+from testbed.sensors.gnss import GnssConfig
+from testbed.sensors.imu import ImuErrors
+from testbed.sensors.magnetometer import MagnetometerConfig
+from testbed.sensors.position_fix import PositionFixConfig
+from testbed.sensors.star_tracker import StarTrackerConfig
+
+WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
+TURN_RATE = 0.06  # of a usual turn of this aircraft [rad/s]
+LOAD_CHANGE = 0.1  # and the change of its load factor
+MANOEUVRE_S = 120.0  # between changes of these
+METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
+FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
+PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
+SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
+GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
+SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
+WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
+SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
+
+
+def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE, states: ImuStates = "biases") -> ImuModel:
+    """The datasheet as the filter's error model; ``turn_rate`` [rad/s] is the usual one.
+
+    Misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk. Of the gyros it is as
+    large as a turn makes it; of the accelerometers as a change of load does, `LOAD_CHANGE`. In turns slower than
+    `TURN_RATE` the load changes by less, with the square of their rate: n^2 = 1 + (v turn_rate / g)^2.
+
+    With ``states`` "biases" scale factors do so too, and in-run instability (Gauss-Markov, sigma and tau) becomes a
+    random walk of the same driving noise, q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two
+    cannot be told apart. With "full" both are states of their own (Cui et al. 2022, Eq 36).
+    """
+    full = states == "full"
+    beside = replace(errors, gyro_in_run=0.0, accel_in_run=0.0, gyro_scale=0.0, accel_scale=0.0) if full else errors
+    level = math.hypot(beside.accel_misalignment, beside.accel_nonorthogonality, beside.accel_scale)
+    turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
+    pull = beside.gyro_g_sensitivity * STANDARD_GRAVITY
+    changes = math.sqrt(1 / MANOEUVRE_S)
+    load_change = LOAD_CHANGE * min(1.0, turn_rate / TURN_RATE) ** 2
+    return ImuModel(
+        gyro_noise=beside.gyro_noise,
+        accel_noise=beside.accel_noise,
+        gyro_bias_sigma=math.hypot(
+            beside.gyro_turn_on, beside.gyro_in_run, beside.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
+        ),
+        accel_bias_sigma=math.hypot(
+            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
+        ),
+        gyro_bias_walk=math.hypot(
+            beside.gyro_random_walk,
+            _drive(beside.gyro_in_run, beside.gyro_in_run_tau),
+            turn * turn_rate * changes,
+            pull * load_change * changes,
+        ),
+        accel_bias_walk=math.hypot(
+            beside.accel_random_walk,
+            _drive(beside.accel_in_run, beside.accel_in_run_tau),
+            level * STANDARD_GRAVITY * load_change * changes,
+        ),
+        gyro_drift_sigma=errors.gyro_in_run if full else 0.0,
+        accel_drift_sigma=errors.accel_in_run if full else 0.0,
+        gyro_drift_correlation_s=errors.gyro_in_run_tau,
+        accel_drift_correlation_s=errors.accel_in_run_tau,
+        gyro_scale_sigma=errors.gyro_scale if full else 0.0,
+        accel_scale_sigma=errors.accel_scale if full else 0.0,
+    )
+
+
+def _drive(sigma: float, tau: float) -> float:
+    return sigma * math.sqrt(2 / tau)
+
+
+def own_aid(name: str, section: SensorConfig, imu: ImuErrors, slip_mps: float | None) -> Aid | None:
+    """An aid of which a filter may have several, None for a sensor of any other kind.
+
+    What they measure is of the centre of gravity; ``slip_mps`` is of wheels, None without that constraint.
+    """
+    arm_b: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
+    match section:
+        case BodyVelocityConfig():
+            v = section.errors()
+            return BodyVelocityAid(name, v.axes, v.noise, v.scale, v.correlated, v.tau, slip_mps, arm_b)
+        case StarTrackerConfig():
+            return StarAid(name, tuple(section.errors().noise_b))
+        case PositionFixConfig():
+            p = section.errors()
+            return PositionFixAid(name, tuple(p.position_n), p.height, arm_b)
+    return None
+
+
+def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float) -> dict[str, object]:
+    """The keys of `InsConfig` that one sensor of each kind decides on."""
+    told: dict[str, object] = {}
+    gnss = kinds.get("gnss")
+    if isinstance(gnss, GnssConfig):
+        e = gnss.errors()
+        told |= {
+            "gnss_arm_b": tuple(e.lever_arm_b - imu.lever_arm_b),
+            "gnss_position_error_sigma": tuple(e.position_correlated_n),
+            "gnss_position_error_correlation_s": e.position_tau,
+            "gnss_velocity_error_sigma": tuple(e.velocity_correlated_n),
+            "gnss_velocity_error_correlation_s": e.velocity_tau,
+        }
+    barometer = kinds.get("barometer")
+    if isinstance(barometer, BarometerConfig):
+        b = barometer.errors()
+        told |= {
+            "barometer_sigma": b.noise * METRES_PER_PASCAL,
+            "barometer_bias_walk": _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL,
+        }
+    magnetometer = kinds.get("magnetometer")
+    if isinstance(magnetometer, MagnetometerConfig):
+        m = magnetometer.errors()
+        told |= {
+            "magnetometer_sigma": m.noise,
+            "magnetometer_error_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
+            "magnetometer_anomaly_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
+            "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * PAYLOAD_CURRENT),
+        }
+    airspeed = kinds.get("airspeed")
+    if isinstance(airspeed, AirspeedConfig):
+        a = airspeed.errors()
+        told |= {
+            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * gust_mps),
+            "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
+            "gust_sigma": gust_mps,
+            "gust_correlation_s": GUST_TIME_S,
+            "wind_walk": WIND_WALK,
+            "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
+        }
+    return told

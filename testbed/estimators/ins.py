@@ -1,0 +1,150 @@
+"""``kind = "ins"``: one strapdown INS with an error-state filter of all its aids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from nav.horizon import FusionHorizon
+from nav.ins import AIDS as INS_AIDS
+from nav.ins import Ins, InsConfig
+from nav.local_filter import Course
+from nav.unscented import Scaling
+from nav.weighting import Fading, SageHusa
+from testbed.estimators.datasheet import aid_settings, imu_model, own_aid
+from testbed.estimators.lane import Lane, handover_errors, mountings
+from testbed.estimators.rig import Rig
+from testbed.estimators.section import (
+    ONE_EACH,
+    SEVERAL,
+    USUAL_TURN_DEGPS,
+    Engine,
+    EstimatorSection,
+    Gust,
+    Handover,
+    Mistake,
+    Slip,
+    States,
+    TurnRate,
+    aid_mistakes,
+    second_of_a_kind,
+)
+from testbed.schema import Section
+from testbed.sensors import SensorConfig, geomagnetic_field_n
+
+GNSS_MEASUREMENTS = ("gnss_position", "gnss_velocity", "gnss_course")
+
+
+class CourseSection(Section):
+    """GNSS course as a measurement of heading: with the wind where airspeed aids, else taken for the heading."""
+
+    max_turn_rate_degps: float | None = Field(default=None, gt=0, le=360, description="none: in turns as well")
+    quiet_s: float = Field(default=2.0, ge=0, le=60, description="for how long it must not have turned faster")
+
+
+class SageHusaSection(Section):
+    """Measurement noise learned from the residuals (`nav.weighting.SageHusa`)."""
+
+    b: float = Field(default=0.97, ge=0.5, lt=1, description="forgetting factor per measurement")
+
+
+class FadingSection(Section):
+    """Covariance made as large as the innovations say when they diverge (`nav.weighting.Fading`)."""
+
+    window: int = Field(default=10, ge=1, le=1000, description="measurements that it averages over")
+    alpha: float = Field(default=20.0, ge=1, le=100, description="times the expected innovation is divergence")
+    looks: Annotated[tuple[Literal["gnss_position", "gnss_velocity", "gnss_course"], ...], Field(min_length=1)] = Field(
+        default=(
+            "gnss_position",
+            "gnss_velocity",
+            "gnss_course",
+        ),
+        description="innovations that are watched",
+    )
+
+
+class InsSection(EstimatorSection):
+    """Keys of an INS (`nav.ins.InsConfig`)."""
+
+    kind: Literal["ins"] = "ins"
+    aids: tuple[str, ...] = Field(description="sensors whose samples it uses, by their names")
+    states: States = "biases"
+    turn_degps: TurnRate = USUAL_TURN_DEGPS
+    gust_mps: Gust = 1.0
+    handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
+    nonholonomic_mps: Slip | None = None
+    engine: Engine = "linear"
+    course: CourseSection | None = Field(default=None, description="of its GNSS receiver; none: not used")
+    sage_husa: SageHusaSection | None = Field(default=None, description="none: the receiver's sigmas are believed")
+    fading: FadingSection | None = Field(
+        default=None, description="covariance that follows diverging innovations; none: it does not"
+    )
+    false_rejection: float = Field(default=1e-3, ge=0, lt=0.5, description="of sound samples by the gate; 0: no gate")
+
+    def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
+        """What is wrong with it among these sensors."""
+        yield from super().mistakes(sensors)
+        yield from aid_mistakes("ins", self.aids, sensors, ONE_EACH | SEVERAL)
+        receivers = [aid for aid in self.aids if aid in sensors and sensors[aid].kind == "gnss"]
+        for key in ("course", "sage_husa", "fading"):
+            if getattr(self, key) is not None and not receivers:
+                yield (key,), "needs a GNSS receiver among the aids: add one, or leave it out"
+        yield from second_of_a_kind("ins", self.aids, sensors)
+
+
+def build(section: InsSection, rig: Rig) -> Lane:
+    """The INS that a section asks for, not yet aligned."""
+    sensors = rig.sensors
+    # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
+    offered = {sensors[name].kind: name for name in section.aids if sensors[name].kind in INS_AIDS}
+    aids = tuple(offered)
+    for name, sensor in sensors.items():
+        if sensor.kind in INS_AIDS:
+            offered.setdefault(sensor.kind, name)
+    errors = rig.imu(section.imu).errors()
+    told = aid_settings({kind: sensors[name] for kind, name in offered.items()}, errors, section.gust_mps)
+    if section.course is not None:
+        # With the wind, course says what the constraint of no sideslip says: both would count it twice.
+        slip = told.pop("sideslip_sigma", 0.0) if "airspeed" in aids else 0.0
+        told |= {"course": _course(section.course, slip), "sideslip_sigma": None}
+    others = {name: own_aid(name, sensors[name], errors, section.nonholonomic_mps) for name in section.aids}
+    learning, fading = section.sage_husa, section.fading
+    ins = Ins(
+        InsConfig(
+            imu_model(errors, math.radians(section.turn_degps), section.states),
+            aids,
+            tuple(aid for aid in others.values() if aid is not None),
+            mounting_sigma=errors.accel_misalignment,
+            scaling=scaling(section.engine),
+            false_rejection=section.false_rejection,
+            **told,  # type: ignore[arg-type]
+        ),
+        partial(geomagnetic_field_n, date=rig.site.date),
+        {part: SageHusa(learning.b) for part in GNSS_MEASUREMENTS} if learning else None,
+        {part: Fading(fading.window, fading.alpha) for part in fading.looks} if fading else None,
+    )
+    used = tuple(dict.fromkeys((*offered.values(), *(name for name, aid in others.items() if aid is not None))))
+    imus, voter = mountings(section, rig)
+    return Lane(
+        FusionHorizon(ins, rig.lag_s(used), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
+        imus,
+        used,
+        handover_errors(section.name, section.handover, errors.lever_arm_b, rig.seed),
+        voter,
+    )
+
+
+def scaling(engine: Engine) -> Scaling | None:
+    """How far out the sigma points of an engine lie, None when it has none."""
+    return Scaling() if engine == "unscented" else None
+
+
+def _course(section: CourseSection, slip: object) -> Course:
+    """Course with the slip [m/s] that the constraint of no sideslip would be told, none on a road."""
+    assert isinstance(slip, float)
+    limit = math.inf if section.max_turn_rate_degps is None else math.radians(section.max_turn_rate_degps)
+    return Course(limit, section.quiet_s, slip)

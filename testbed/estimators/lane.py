@@ -1,0 +1,146 @@
+"""An estimator at work in a run: the IMUs it integrates, the sensors it is handed, what it makes of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol, cast
+
+import numpy as np
+
+from nav.alignment import InitialState
+from nav.horizon import FusionHorizon
+from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
+from nav.voting import Voter
+from testbed.estimators.datasheet import imu_model
+from testbed.estimators.rig import Rig
+from testbed.estimators.section import EstimatorSection, Handover
+from testbed.sensors.noise import stream
+
+VOTED_OUT, DISAGREE = "voted out", "the units left disagree"
+
+
+class Tracked(NamedTuple):
+    """What an estimator integrated, its reports on redundant units and on samples, and its estimates."""
+
+    increments: ImuSamples
+    votes: list[UpdateReport]
+    reports: list[UpdateReport]
+    estimates: list[Estimate]
+
+
+class Commanded(NamedTuple):
+    """What the autopilot commands over the intervals that end at ``t`` (n,) [s]: bank [rad], altitude [m], airspeed
+    [m/s], each (n,), NaN where nothing is commanded.
+    """
+
+    t: Array
+    bank: Array
+    altitude: Array
+    airspeed: Array
+
+
+@dataclass(frozen=True, slots=True)
+class HandoverErrors:
+    """How wrong the state is that somebody else's navigation hands over.
+
+    ``arm_b`` (3,) [m] points from the centre of gravity to the IMU; ``sigma`` (9,) is of attitude [rad], velocity [m/s]
+    and position [m], NED; the errors are drawn from ``random``.
+    """
+
+    arm_b: Array
+    sigma: Array
+    random: np.random.Generator
+
+
+class _Startable(Protocol):
+    def start(self, initial: InitialState) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """An estimator behind its fusion horizon: the IMUs it integrates, the sensors whose samples it is handed.
+
+    ``imus`` has how each IMU is mounted, C_sb (3, 3), by name; of several the ``voter`` makes one. The estimate is of
+    the point where the first sits. ``commanded`` is for one that listens to the autopilot. With ``handover`` it does
+    not align but waits for `start`.
+    """
+
+    horizon: FusionHorizon
+    imus: Mapping[str, Array]
+    sensors: tuple[str, ...]
+    handover: HandoverErrors | None = None
+    voter: Voter | None = None
+    commanded: Callable[[Commanded], None] | None = None
+
+    def start(self, initial: InitialState) -> None:
+        """Begin with a state that is handed over."""
+        cast(_Startable, self.horizon.estimator).start(initial)
+
+    def track(
+        self, commanded: Commanded, imu: Mapping[str, ImuSamples], samples: Mapping[str, Sequence[Sample]],
+        times: Sequence[float],
+    ) -> Tracked:  # fmt: skip
+        """Give it what the sensors delivered and the autopilot commanded; estimates are wanted at ``times`` [s]."""
+        if self.commanded is not None:
+            self.commanded(commanded)
+        increments, votes = self.increments(imu)
+        handed = [sample for aid in self.sensors for sample in samples[aid]]
+        reports, estimates = self.horizon.track(increments, handed, times)
+        return Tracked(increments, votes, reports, estimates)
+
+    @property
+    def imu(self) -> str:
+        """The first IMU."""
+        return next(iter(self.imus))
+
+    def increments(self, imu: Mapping[str, ImuSamples]) -> tuple[ImuSamples, list[UpdateReport]]:
+        """What to integrate, in body axes, from the increments of each IMU; and on each unit of several what was voted.
+
+        A report's nis is the unit's parity statistic; its weight is 0 while the unit is voted out.
+        """
+        turned = [
+            replace(imu[name], dtheta=_turned_back(C_sb, imu[name].dtheta), dv=_turned_back(C_sb, imu[name].dv))
+            for name, C_sb in self.imus.items()
+        ]
+        if self.voter is None:
+            return turned[0], []
+        used, ballots = self.voter.vote(turned)
+        none = np.empty(0)
+        return used, [
+            UpdateReport(
+                ballot.t, name, "imu_parity", none, none.reshape(0, 0), float(statistic), ballot.threshold,
+                0.0 if failed else 1.0, VOTED_OUT if failed else DISAGREE if ballot.ambiguous else "",
+            )
+            for ballot in ballots
+            for name, statistic, failed in zip(self.imus, ballot.statistic, ballot.failed, strict=True)
+        ]  # fmt: skip
+
+
+def mountings(section: EstimatorSection, rig: Rig) -> tuple[dict[str, Array], Voter | None]:
+    """How the IMUs of an estimator are mounted, C_sb by name, and who votes where there are several."""
+    errors = {name: rig.imu(name).errors() for name in (section.imu, *section.spare_imus)}
+    mounted = {name: e.C_sb for name, e in errors.items()}
+    if not section.spare_imus:
+        return mounted, None
+    e = errors[section.imu]
+    turn = math.hypot(e.gyro_misalignment, e.gyro_nonorthogonality, e.gyro_scale)
+    level = math.hypot(e.accel_misalignment, e.accel_nonorthogonality, e.accel_scale)
+    return mounted, Voter(imu_model(e), turn, level)
+
+
+def handover_errors(name: str, given: Handover | None, arm_b: Array, seed: int) -> HandoverErrors | None:
+    """The errors of a state handed over to the estimator ``name``, None when it aligns."""
+    if given is None:
+        return None
+    level, heading = math.radians(given.level_deg), math.radians(given.heading_deg)
+    sigma = np.array([level, level, heading, *[given.velocity_mps] * 3, *[given.position_m] * 3])
+    return HandoverErrors(arm_b, sigma, stream(seed, name, "handover"))
+
+
+def _turned_back(C_sb: Array, x_s: Array) -> Array:
+    """C_sb' x of each row; written out, since the sums of a matrix product depend on the number of rows."""
+    with np.errstate(all="ignore"):  # a broken unit may say anything
+        x_b: Array = x_s[:, 0:1] * C_sb[0] + x_s[:, 1:2] * C_sb[1] + x_s[:, 2:3] * C_sb[2]
+    return x_b

@@ -1,0 +1,37 @@
+"""What a builder of estimators may know of a run: datasheets, the site, the rates. Never what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from testbed.sensors import SensorConfig, Site
+from testbed.sensors.imu import ImuConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """The sensors of a run by name, each a section of the scenario whose ``errors()`` is its datasheet in SI units.
+
+    ``site`` is the area of operation and the date, known within kilometres; ``tick_rate_hz`` the rate of the motion;
+    ``seed`` that of the run, for what an estimator draws itself. Files that a scenario names lie in ``folder``.
+    """
+
+    sensors: Mapping[str, SensorConfig]
+    site: Site
+    tick_rate_hz: float
+    seed: int
+    folder: Path = field(default_factory=Path)
+
+    def imu(self, name: str) -> ImuConfig:
+        """The section of an IMU. Raises ValueError when ``name`` is no IMU."""
+        section = self.sensors[name]
+        if not isinstance(section, ImuConfig):
+            raise ValueError(f"{name!r} is a sensor of kind {section.kind!r}, not an IMU")
+        return section
+
+    def lag_s(self, names: Iterable[str]) -> float:
+        """The largest latency [s] of the aids of these names."""
+        sections = [self.sensors[name] for name in names]
+        return max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)

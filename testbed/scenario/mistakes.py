@@ -1,0 +1,209 @@
+"""What can be wrong between keys of a scenario that are each right."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from testbed import measures
+from testbed.errors import UserError, unknown
+from testbed.estimators.ahrs import AhrsSection
+from testbed.estimators.section import EstimatorSection
+from testbed.motion import aircraft, guidance
+from testbed.motion.sections import FlightTruth, KinematicTruth
+from testbed.scenario import keypath
+from testbed.scenario.keypath import KeyPath
+from testbed.schema import IDENTIFIER, LONGEST_RUN_S
+from testbed.sensors import SensorConfig, faults
+from testbed.sensors.timing import TICK_TOLERANCE
+
+if TYPE_CHECKING:
+    from testbed.scenario.schema import Scenario
+
+LONGEST_NAME = 32  # as the record keeps them
+EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
+RESERVED = frozenset({"run", "flight", "truth"})  # `run.wall_s` and the like would become ambiguous
+
+
+def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    """What is wrong between keys that are each right."""
+    tick_hz = scenario.truth.rate_hz
+    yield from _divides(("record", "rate_hz"), scenario.record.rate_hz, tick_hz)
+    for name, config in scenario.sensors.items():
+        yield from _sensor_mistakes(("sensors", name), config, tick_hz, scenario.duration_s)
+    yield from _plan_mistakes(scenario)
+    yield from _fault_mistakes(scenario)
+    taken: set[str] = set()
+    for index, estimator in enumerate(scenario.estimator):
+        yield from _estimator_mistakes(("estimator", index), estimator, scenario.sensors, taken)
+        taken.add(estimator.name)
+    yield from _autopilot_mistakes(scenario)
+    for key in scenario.expect:
+        yield from _expect_mistakes(key, taken)
+
+
+def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    if not isinstance(scenario.truth, FlightTruth):
+        if scenario.plan:
+            yield ("plan",), f"a body of source {scenario.truth.source!r} flies no plan: leave it out"
+        yield from _track_mistakes(scenario.truth)
+        return
+    if not scenario.plan:
+        yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
+        return
+    named, wind = scenario.truth.aircraft, scenario.truth.wind
+    if aircraft.find(named) is None:
+        missing = unknown("aircraft", named, list(aircraft.shipped()))
+        yield ("truth", "aircraft"), f"{missing}, or give the path of its folder, as seen from the scenario file"
+        return
+    try:
+        envelope = aircraft.load(named)
+    except UserError as error:
+        yield ("truth", "aircraft"), str(error)
+        return
+    strongest = max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
+    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, strongest):
+        yield keypath.read(key), what
+
+
+def _track_mistakes(truth: KinematicTruth) -> Iterator[tuple[KeyPath, str]]:
+    if truth.motion == "static":
+        if truth.segments:
+            yield ("truth", "segments"), 'a static body follows none: set truth.motion = "segments", or leave them out'
+        if truth.start.speed_mps > 0:
+            yield ("truth", "start", "speed_mps"), 'a static body has none: set truth.motion = "segments"'
+    elif not truth.segments:
+        yield ("truth", "segments"), "is missing: add at least one [[truth.segments]] table"
+    else:
+        try:
+            truth.track()
+        except ValueError as error:
+            key, _, what = str(error).partition(": ")
+            yield keypath.read(key), what
+
+
+def _sensor_mistakes(
+    path: KeyPath, config: SensorConfig, tick_hz: float, duration_s: float
+) -> Iterator[tuple[KeyPath, str]]:
+    name = str(path[-1])
+    if not IDENTIFIER.fullmatch(name):
+        yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
+    elif len(name) > LONGEST_NAME:
+        yield path, f"a sensor's name has at most {LONGEST_NAME} letters"
+    yield from _divides((*path, "rate_hz"), config.rate_hz, tick_hz)
+    offset_s = getattr(config, "offset_s", 0.0)
+    if not _whole(offset_s * tick_hz):
+        nearest = round(offset_s * tick_hz) / tick_hz
+        yield (*path, "offset_s"), f"is not a multiple of the tick {1 / tick_hz:g} s: the nearest is {nearest:g}"
+    for start, end in getattr(config, "denied", ()):
+        if start >= duration_s:
+            window = f"window [{start:g}, {end:g}]"
+            yield (*path, "denied"), f"{window} starts after the end of the run: duration_s is {duration_s:g}"
+
+
+def _fault_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    taken: list[str] = []
+    for index, fault in enumerate(scenario.fault):
+        path: KeyPath = ("fault", index)
+        name = faults.label(fault, taken)
+        if not IDENTIFIER.fullmatch(name):
+            yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
+        elif name in taken:
+            yield (*path, "name"), f"{name!r} is taken by a fault above: give each its own name"
+        taken.append(name)
+        start, end = fault.window
+        if start >= scenario.duration_s:
+            after = f"starts after the end of the run: duration_s is {scenario.duration_s:g}"
+            yield (*path, "window"), f"[{start:g}, {end:g}] {after}"
+        sensor = scenario.sensors.get(fault.sensor)
+        if sensor is None:
+            yield (*path, "sensor"), unknown("sensor", fault.sensor, list(scenario.sensors))
+            continue
+        channels = list(faults.CHANNELS.get(sensor.kind, {}))
+        channel = getattr(fault, "channel", None)
+        if channel is not None and channel not in channels:
+            yield (*path, "channel"), unknown(f"channel of {fault.sensor}", channel, channels)
+        for key, complaint in faults.mistakes(fault, sensor):
+            yield (*path, key), complaint
+
+
+def _estimator_mistakes(
+    path: KeyPath, section: EstimatorSection, sensors: Mapping[str, SensorConfig], taken: set[str]
+) -> Iterator[tuple[KeyPath, str]]:
+    if not IDENTIFIER.fullmatch(section.name):
+        yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
+    elif section.name in taken:
+        yield (*path, "name"), f"{section.name!r} is taken by an estimator above: give each its own name"
+    elif section.name in RESERVED:
+        yield (*path, "name"), f"{section.name!r} is reserved: choose another name"
+    for where, text in section.mistakes(sensors):
+        yield (*path, *where), text
+
+
+def _autopilot_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    path: KeyPath = ("autopilot", "feedback")
+    feedback = scenario.autopilot.feedback
+    flown = isinstance(scenario.truth, FlightTruth)
+    for index, config in enumerate(scenario.estimator):
+        if isinstance(config, AhrsSection) and config.autopilot and not flown:
+            yield (
+                ("estimator", index, "autopilot"),
+                f"a body of source {scenario.truth.source!r} has none: leave it out",
+            )
+    if not feedback.estimators:
+        return
+    if not flown:
+        text = f"a body of source {scenario.truth.source!r} has no autopilot that could follow: leave it out"
+        yield path, text
+        return
+    known = {config.name: config for config in scenario.estimator}
+    groups = [((*path, key), getattr(feedback, key)) for key in ("attitude", "position")]
+    if feedback.attitude == feedback.position:
+        groups = [(path, feedback.attitude)]
+    for where, name in groups:
+        if name != "truth" and name not in known:
+            yield where, unknown("estimator", name, [*known, "truth"])
+    kinds = {section.kind for section in scenario.sensors.values()}
+    if feedback.position not in known:
+        return
+    where = groups[-1][0]
+    if "airspeed" not in kinds:
+        yield where, "flying on an estimate takes an airspeed sensor: add [sensors.airspeed]"
+    if known[feedback.position].attitude_only and "barometer" not in kinds:
+        text = f"{feedback.position!r} estimates attitude alone, and height must come from a barometer"
+        yield where, f"{text}: add [sensors.barometer], or take the position of another estimator"
+
+
+def _expect_mistakes(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
+    """What is wrong with the name of an expected metric: no run of the scenario could have it."""
+    path: KeyPath = ("expect", key)
+    match = EXPECT_KEY.fullmatch(key)
+    if not match:
+        yield (
+            path,
+            'is no metric: write it quoted as "<estimator>.<quantity>_<statistic>_<unit>", such as'
+            ' "ins.position_horizontal_rms_m" = 5.0',
+        )
+        return
+    whose, metric = match["whose"], match["metric"]
+    if whose not in estimators | {"run", "flight"}:
+        yield path, unknown("estimator", whose, sorted(estimators | {"run", "flight"}))
+    elif measures.find(key) is None:
+        yield path, unknown("metric", metric, measures.names(whose))
+
+
+def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:
+    if rate_hz > tick_hz:
+        yield path, f"{rate_hz:g} Hz is faster than the tick rate of {tick_hz:g} Hz (truth.rate_hz)"
+    elif rate_hz * LONGEST_RUN_S < 1:
+        yield path, f"{rate_hz:g} Hz is less than once in the longest run"
+    elif not _whole(tick_hz / rate_hz):
+        ticks = int(tick_hz / rate_hz)
+        slower, faster = tick_hz / (ticks + 1), tick_hz / ticks
+        nearest = f"{slower:.10g} or {faster:.10g}"
+        yield path, f"{rate_hz:g} Hz does not divide the tick rate of {tick_hz:g} Hz (truth.rate_hz): try {nearest}"
+
+
+def _whole(value: float) -> bool:
+    return abs(value - round(value)) <= TICK_TOLERANCE * max(1.0, value)
