@@ -14,7 +14,7 @@ from testbed.many import check
 
 SCENARIOS = sorted(path.stem for path in data_dir("scenarios").glob("*.toml"))
 SHORT_S = 400.0
-GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN = Path(__file__).parent / "golden"
 
 
 def test_the_promised_scenarios_are_shipped() -> None:
