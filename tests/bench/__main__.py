@@ -18,6 +18,7 @@ MEASURES = {
         runs.whole_run,
         runs.cpu_two_estimators,
         runs.cpu_main_scenario,
+        runs.federation,
         peers.strapdown_alone,
         peers.ins_at_every_sample,
         peers.accuracy,

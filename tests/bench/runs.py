@@ -55,8 +55,28 @@ def _cpu(what: str, scenario: Scenario, at_most: float, effort: Effort) -> Row:
             loop.run(scenario, out=Path(folder))
 
         whole, bare = alternate(lambda: cpu_seconds(fly), lambda: cpu_seconds(lambda: _step(scenario)), effort)
-        parts = ", ".join(f"{room} {percent:.0f} %" for room, percent in shares(fly).items())
+        spent = shares(fly)
+    parts = ", ".join(f"{room} {100 * seconds / sum(spent.values()):.0f} %" for room, seconds in spent.items())
     return Row(what, ratios(whole, bare), at_most=at_most, detail=f"{_over(whole, bare)}: {parts}")
+
+
+def federation(effort: Effort) -> Iterator[Row]:
+    """Processor time in a federation of three local filters over that in an INS with the same aids, in flight."""
+    ins = 'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}]'
+    parts = ", ".join(
+        f"{{name='{name}', aids=[{aids}]}}"
+        for name, aids in (("gnss", "'gnss'"), ("air", "'airspeed', 'barometer'"), ("mag", "'magnetometer'"))
+    )
+
+    def spent(estimator: str) -> float:
+        scenario = _main_scenario(effort, estimator)
+        return shares(lambda: loop.run(scenario))["estimators"]
+
+    for structure in ("full_reset", "no_reset"):
+        federated = f'estimator=[{{name="fused", kind="federated", structure="{structure}", locals=[{parts}]}}]'
+        above, below = alternate(lambda one=federated: spent(one), lambda: spent(ins), effort)
+        detail = f"{median(above):.2f} s over {median(below):.2f} s"
+        yield Row(f"federation, {structure} / INS, CPU", ratios(above, below), at_most=4.0, detail=detail)
 
 
 def _main_scenario(effort: Effort, *overrides: str) -> Scenario:

@@ -18,7 +18,7 @@ HOUSE = str(Path(testbed.__file__).parent)
 
 
 def shares(work: Callable[[], object]) -> dict[str, float]:
-    """Percent of the processor time of ``work`` for each of `ROOMS`, and for the "rest".
+    """Processor seconds of ``work`` in each of `ROOMS`, and in the "rest".
 
     The stack is looked at every millisecond: the outermost room on it pays. Processes that ``work`` starts are the
     motion's, which is flown ahead in one.
@@ -41,7 +41,7 @@ def shares(work: Callable[[], object]) -> dict[str, float]:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
         signal.signal(signal.SIGPROF, before)
     spent["motion"] += sum(os.times()[2:4]) - children
-    return {room: 100 * spent[room] / spent.total() for room in (*ROOMS, "rest")}
+    return {room: spent[room] for room in (*ROOMS, "rest")}
 
 
 def _room(frame: FrameType | None) -> str:

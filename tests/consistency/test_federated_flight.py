@@ -1,11 +1,12 @@
 """Federated filters on the flown aircraft: whether they know how wrong they are, and cry wolf only by chance.
 
-The sensors are those of the shipped scenarios: correlated GNSS, turbulence, misaligned, vibrating IMU, soft iron.
+The sensors are those of the shipped scenarios: correlated GNSS, turbulence, misaligned, vibrating IMU, soft iron. The
+filters' models are simpler than those, so NEES has no chi-square distribution: its bands are how far from one it may be
+before an estimate misleads.
 """
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
@@ -15,8 +16,6 @@ import pytest
 
 from nav.local_filter import ISOLATED
 from testbed import Scenario, run
-from testbed.estimators import registry
-from testbed.estimators.lane import Lane
 from testbed.score import metrics
 
 SEEDS = 10
@@ -128,46 +127,6 @@ def test_faults_of_every_sensor() -> None:
         right = {key: value for key, value in one.items() if key.startswith("federated.isolation_correct.")}
         assert len(right) == 7
         assert set(right.values()) == {1.0}, right
-
-
-def seconds(scenario: Scenario, patch: pytest.MonkeyPatch) -> dict[str, float]:
-    """What each estimator spends in its fusion horizon during one run."""
-    spent = {one.name: 0.0 for one in scenario.estimator}
-    build = registry.build
-
-    def clock(name: str, track: Any) -> Any:
-        def clocked(*given: Any) -> Any:
-            began = time.perf_counter()
-            done = track(*given)
-            spent[name] += time.perf_counter() - began
-            return done
-
-        return clocked
-
-    def clocked_build(*given: Any) -> dict[str, Lane]:
-        built = build(*given)
-        for name, running in built.items():
-            patch.setattr(running.horizon, "track", clock(name, running.horizon.track))
-        return built
-
-    with patch.context() as inner:
-        inner.setattr(registry, "build", clocked_build)
-        run(scenario)
-    return spent
-
-
-INS = '{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}'
-
-
-def test_costs_at_most_four_times_the_ins(monkeypatch: pytest.MonkeyPatch) -> None:
-    overrides = [f"estimator=[{INS}, {RESETS}, {NO_RESET}]", "duration_s=90", "sensors.gnss.denied=[]", "expect={}"]
-    scenario = Scenario.load("loiter_gnss_outage", overrides)
-    rounds = [seconds(scenario, monkeypatch) for _ in range(3)]
-    least = {name: min(one[name] for one in rounds) for name in rounds[0]}
-    print({name: f"{spent / 90 * 1e3:.2f} ms per second of flight" for name, spent in least.items()})
-    assert least["resets"] <= 4.0 * least["ins"]
-    assert least["no_reset"] <= 4.0 * least["ins"]
-    assert least["ins"] > 0.0
 
 
 def test_two_minutes_of_healthy_flight() -> None:

@@ -1,6 +1,7 @@
 """The main scenario as it is shipped, over twenty seeds: how far it drifts in the outage, and whether it knows.
 
 Unlike `test_ins_nees` nothing is matched here: correlated GNSS, turbulence, misaligned, vibrating sensors, soft iron.
+So NEES has no chi-square distribution, and its bands are how far from one it may be before the estimate misleads.
 """
 
 from __future__ import annotations
