@@ -124,13 +124,14 @@ def resolve(url: str, where: str, forms: str = _FORMS) -> tuple[str, int]:
 
 
 class TelemetryLog:
-    """A telemetry log (.tlog) as ground stations, mavlogdump and MAVExplorer read it. Folders are made as needed."""
+    """A telemetry log (.tlog) as ground stations, mavlogdump and MAVExplorer read it."""
 
     def __init__(self, url: str, path: Path) -> None:
         self._url = url
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
+        except FileNotFoundError:
+            raise UserError(f"{url}: there is no folder {path.parent}: make it, or choose another path") from None
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UserError(f"{url}: the log can't be written there ({reason}); choose another path") from None

@@ -125,7 +125,7 @@ class Picture:
     def hear(self, message: Any, clock: float) -> str | None:
         """Take a message that came at ``clock``; the line it says, if it is the end of a STATUSTEXT."""
         name = message.get_type()
-        if self._system is None and message.get_srcComponent() == mav.MAV_COMP_ID_AUTOPILOT1:
+        if self._system is None and _is_of_vehicle(message):
             self._system = message.get_srcSystem()
         if message.get_srcSystem() != self._system:
             return None
@@ -320,6 +320,10 @@ def _listen(connection: socket.socket) -> Turns:
             yield time.monotonic(), heard
 
 
+def _is_of_vehicle(message: Any) -> bool:
+    return bool(message.get_srcComponent() == mav.MAV_COMP_ID_AUTOPILOT1)
+
+
 def _messages(parser: Any, data: bytes) -> list[Any]:
     """The messages that ``data`` completes; a frame that the parser fails at is passed over."""
     found: list[Any] = []
@@ -342,10 +346,12 @@ def _replay(path: Path, speed: float) -> Turns:
     except OSError as error:
         raise UserError(f"{path}: can't be read ({error.strerror}); give {_FORMS}") from None
     log = _frames(data)
-    first = next(log, None)
-    if first is None:
-        raise UserError(f"{path}: no telemetry log: there is no MAVLink message in it")
-    return _paced(itertools.chain([first], log), speed)
+    before: list[Turn] = []  # among random bytes there are messages too, now and then
+    for turn in log:
+        before.append(turn)
+        if any(_is_of_vehicle(message) and message.get_type() == "HEARTBEAT" for message in turn[1]):
+            return _paced(itertools.chain(before, log), speed)
+    raise UserError(f"{path}: no telemetry log: there is no heartbeat of a vehicle in it")
 
 
 def _paced(log: Iterator[Turn], speed: float) -> Turns:

@@ -106,8 +106,14 @@ def test_order_of_links_is_kept(tmp_path):
         link.close()
 
 
-def test_log_is_stamps_and_frames_in_a_folder_that_is_made(tmp_path):
-    path = tmp_path / "runs" / "new" / "run.tlog"
+def test_log_in_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(UserError, match=r"there is no folder .*/rums: make it, or choose another path"):
+        connect(f"tlog:{tmp_path / 'rums' / 'run.tlog'}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_log_is_stamps_and_frames(tmp_path):
+    path = tmp_path / "run.tlog"
     log = connect(f"tlog:{path}")
     log.send(1_700_000_000_000_000, [FRAME, b"two"])
     log.send(-5, [b"three"])

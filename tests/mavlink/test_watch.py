@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import random
 import re
 import signal
 import socket
@@ -271,8 +272,11 @@ def test_wrong_sources(source: str, hint: str) -> None:
 
 def test_sources_that_can_not_be_had(tmp_path: Path) -> None:
     (tmp_path / "text.tlog").write_text("no log at all\n" * 50)
-    with pytest.raises(UserError, match="no MAVLink message"):
-        shown(tmp_path / "text.tlog")
+    by_chance = random.Random(1).randbytes(5000) + Vehicle().bytes(sys_status(ALL))
+    (tmp_path / "random.tlog").write_bytes(by_chance)
+    for name in ("text", "random"):
+        with pytest.raises(UserError, match="no telemetry log: there is no heartbeat of a vehicle in it"):
+            shown(tmp_path / f"{name}.tlog")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         with pytest.raises(UserError, match="choose another"):
