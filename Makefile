@@ -7,7 +7,7 @@ LOWEST := .venv-lowest
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: run test test-all lint bench wheel-test setup lock clean
+.PHONY: run test test-ci test-all lint bench wheel-test setup lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/testbed run loiter_gnss_outage --out runs/loiter_gnss_outage --mavlink tlog:runs/loiter_gnss_outage/run.tlog
@@ -15,8 +15,11 @@ run: $(VENV)/.ready
 test: $(VENV)/.ready
 	$(BIN)/pytest -n 2 --dist worksteal
 
+test-ci: $(VENV)/.ready
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
+
 test-all: $(VENV)/.ready $(CLIENTS)/.ready
-	$(BIN)/pytest -n 2 --dist worksteal -m "slow or not slow"
+	$(BIN)/pytest -n 2 --dist worksteal -m "slow or not slow" --hypothesis-profile=searching
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

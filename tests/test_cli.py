@@ -342,6 +342,7 @@ def test_an_interrupted_run_says_what_it_leaves(testbed: Testbed, monkeypatch: p
     assert (ended.code, ended.err) == (130, "testbed: interrupted: the record so far is runs/u_turn/run.nc\n")
 
 
+@pytest.mark.ci
 def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "testbed", "run", "static_bench", "--realtime", "50", "--no-report"]
     # Tests that run in the background of a shell inherit that interrupts are ignored.

@@ -137,6 +137,7 @@ def test_two_minutes_of_healthy_flight() -> None:
     assert 0.05 < found["federated.velocity_nees_mean"] < 4.0
 
 
+@pytest.mark.ci
 def test_faults_in_a_minute() -> None:
     """Three of the shipped faults, closer together."""
     spoof = '{name="spoof", sensor="gnss1", kind="drag_off", window=[90, 130], bearing_deg=60, acceleration_mps2=0.05}'

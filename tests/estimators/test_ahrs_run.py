@@ -207,6 +207,7 @@ def test_a_sample_that_is_refused_is_recorded(tmp_path: Path) -> None:
 # --- what is shown
 
 
+@pytest.mark.ci
 def test_report_shows_attitude_where_there_is_no_position(flown: Any, tmp_path: Path) -> None:
     report.write_report(flown[0].dataset, flown[0].metrics, tmp_path)
     images = {path.stem for path in tmp_path.glob("*.png")}
@@ -283,6 +284,7 @@ def test_export(flown: Any, tmp_path: Path) -> None:
     assert export(flown[2] / "run.nc", "mat", tmp_path / "run.mat").stat().st_size > 100_000
 
 
+@pytest.mark.ci
 def test_a_campaign_counts_degrees(flown: Any, tmp_path: Path) -> None:
     result = flown[0]
     history = campaign._history(result.dataset)

@@ -59,6 +59,7 @@ def apart(one: RunResult, other: RunResult) -> tuple[Any, Any, Any, Any]:
 # --- against truth
 
 
+@pytest.mark.ci
 def test_on_perfect_sensors_it_flies_as_on_truth() -> None:
     """Same path within a metre, same height within 0.2 m.
 
@@ -90,6 +91,7 @@ def test_the_result_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch
     assert same(reference.dataset, closed(overrides, replay=asked).dataset)
 
 
+@pytest.mark.ci
 def test_live_and_batch_give_the_same_bits() -> None:
     watcher = Watcher()
     live = closed(SHORT, links=[watcher], realtime=1000.0)
@@ -98,6 +100,7 @@ def test_live_and_batch_give_the_same_bits() -> None:
     assert not same(live.dataset, closed([*SHORT, "autopilot.feedback=truth"]).dataset)
 
 
+@pytest.mark.ci
 def test_a_lever_arm_does_not_move_the_aircraft() -> None:
     arm = [*PERFECT, *LOITER, "duration_s=60", "sensors.imu.lever_arm_m=[3,0,-8]"]
     on_truth, on_estimate = closed([*arm, "autopilot.feedback=truth"]), closed(arm)
@@ -106,6 +109,7 @@ def test_a_lever_arm_does_not_move_the_aircraft() -> None:
     assert np.abs(down).max() < 0.3
 
 
+@pytest.mark.ci
 def test_each_group_by_itself() -> None:
     """A barometer that is 30 m off and a pitot tube that reads low move the position group alone."""
     wrong = [
@@ -144,6 +148,7 @@ def delayed(frames: int, airspeed: float, hz: float = 50.0) -> float:
     return float(np.rad2deg(np.concatenate(rates[len(rates) // 3 :]).std()))
 
 
+@pytest.mark.ci
 def test_frames_leave_the_inner_loops_their_margin() -> None:
     """The head of `testbed.feeds.autopilot` says how much later the feedback might be."""
     assert delayed(0, 25.0) < 1.05 * delayed(0, 25.0, 200.0)
@@ -360,6 +365,7 @@ def test_what_cant_be_flown_on_is_said_at_load(name: str, overrides: list[str], 
 # --- the flight-control state
 
 
+@pytest.mark.ci
 def test_the_ahrs_hears_of_commands_whatever_it_flies_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the autopilot's word it levels on the straight alone, open or closed loop, in whatever chunks."""
 

@@ -157,6 +157,7 @@ def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
     assert (len(replay.advance(70)), replay.failure) == (0, "control lost")
 
 
+@pytest.mark.ci
 def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
     overrides = ["duration_s=30", "truth.wind.turbulence=none"]
     scenario = Scenario.load("u_turn", overrides)
@@ -192,6 +193,7 @@ def test_truth_is_not_shared_when_it_is_varied(at_rest: Path) -> None:
 # --- the same numbers, however flown
 
 
+@pytest.mark.ci
 def test_two_workers_give_what_one_process_gives(at_rest: Path, tmp_path: Path) -> None:
     told: list[Progress] = []
     result = campaign(at_rest, 3, out=tmp_path / "out", workers=2, progress=told.append)
@@ -239,6 +241,7 @@ def test_varied_values_and_files(at_rest: Path, tmp_path: Path, threads: str) ->
 # --- nothing is lost
 
 
+@pytest.mark.ci
 def test_interrupted_campaign_carries_on(
     at_rest: Path, tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
