@@ -22,7 +22,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, exp1
 
 from nav._jit import njit
@@ -435,6 +434,8 @@ def glr_threshold(false_alarm: float, m: int, n: int) -> float:
     low = 0.5 * chi_square_threshold(false_alarm, m)
     if n == 1:
         return low
+    from scipy.optimize import brentq  # takes half as long to load as the rest of this package, and few need it
+
     high = 0.5 * chi_square_threshold(0.1 * false_alarm / n, m)  # beyond the limit of n independent looks
     return float(brentq(lambda T: math.log(glr_false_alarm(T, m, n) / false_alarm), low, high))
 

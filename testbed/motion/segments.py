@@ -11,15 +11,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicHermiteSpline, PPoly
 
 from nav.earth import STANDARD_GRAVITY
 from nav.samples import Array
 from testbed.schema import Section
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PPoly
 
 MAX_ACCELERATION = 5 * STANDARD_GRAVITY  # [m/s^2] in any direction, beyond that a slip of the keyboard
 MAX_CLIMB_ANGLE = math.radians(45.0)
@@ -284,6 +286,8 @@ def lay_track(segments: Sequence[Segment], speed: float = 0.0, height: float = 0
 
     Raises ValueError, beginning with its key, at the first segment that can't be.
     """
+    from scipy.interpolate import CubicHermiteSpline, PPoly  # slow to load, and flights have no need of it
+
     pieces: list[Array] = []
     ends, starts, legs = [np.zeros(1)], [], []
     start_speed, t, count = speed, 0.0, 0

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
-from pydantic import Field, PlainValidator, PrivateAttr, ValidationError, model_validator
+from pydantic import AfterValidator, Field, PlainValidator, PrivateAttr, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from testbed.data import data_dir
@@ -29,11 +29,11 @@ from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath, messages, mistakes
 from testbed.schema import LONGEST_RUN_S, Section
 from testbed.sensors import CONFIGS, SensorConfig, Site, faults
-from testbed.sensors.magnetometer import WMM_YEARS
+from testbed.sensors.magnetometer import covered
 
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
 
-Date: TypeAlias = Annotated[dt.date, Field(ge=dt.date(WMM_YEARS[0], 1, 1), lt=dt.date(WMM_YEARS[1], 1, 1))]
+Date: TypeAlias = Annotated[dt.date, AfterValidator(covered)]
 
 
 def _sensor(table: object) -> Section:
@@ -138,7 +138,7 @@ class Scenario(Section):
         default=0, ge=0, lt=2**63, description="of all random numbers: same scenario, same seed, same bits"
     )
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S, description="length of the run in simulated time")
-    date: Date = Field(default=dt.date(2026, 1, 1), description="for the geomagnetic field")
+    date: Date = Field(default=dt.date(2026, 1, 1), description="for the World Magnetic Model: of 2010 to 2029")
     truth: FlightTruth | KinematicTruth = Field(discriminator="source", description="the motion")
     plan: tuple[legs.Leg, ...] = Field(default=(), description="legs that a flight consists of, in order")
     sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(

@@ -54,6 +54,16 @@ def decimal_year(date: datetime.date) -> float:
     return date.year + (date - start).days / (end - start).days
 
 
+def covered(date: datetime.date) -> datetime.date:
+    """The same date. Raises ValueError when no magnetic model covers it."""
+    if not WMM_YEARS[0] <= date.year < WMM_YEARS[1]:
+        years = f"from {WMM_YEARS[0]} to {WMM_YEARS[1] - 1}"
+        raise ValueError(
+            f"there is no geomagnetic model for {date}: choose one {years}, as the World Magnetic Model is"
+        )
+    return date
+
+
 @lru_cache(maxsize=4)
 def _model(year: int) -> Any:
     from pygeomag import GeoMag  # type: ignore[import-untyped]
@@ -68,10 +78,10 @@ def geomagnetic_field_n(lat: float, lon: float, h: float, date: datetime.date) -
     which give the main field to about 0.14 uT and know no local anomaly. Raises UserError for a date that no model
     covers.
     """
-    if not WMM_YEARS[0] <= date.year < WMM_YEARS[1]:
-        raise UserError(
-            f"date: no geomagnetic model for {date.isoformat()}; choose one from {WMM_YEARS[0]} to {WMM_YEARS[1] - 1}"
-        )
+    try:
+        covered(date)
+    except ValueError as error:
+        raise UserError(f"date: {error}") from None
     at = _model(date.year).calculate(glat=lat / DEG, glon=lon / DEG, alt=h / 1000, time=decimal_year(date))
     return np.array([at.x, at.y, at.z]) * NANOTESLA
 

@@ -74,6 +74,11 @@ def line_of(text: str, start: str) -> int:
         ("duration_s = 200", 'duration_s = "200"', 'duration_s: must be a number, not "200"'),
         ("duration_s = 200", "duration_min = 4", "duration_min: unknown key: did you mean duration_s"),
         ("date = 2026-06-01", "date = 2026", "date: must be a date such as 2026-06-01, not 2026"),
+        (
+            "date = 2026-06-01",
+            "date = 2035-06-01",
+            "date: there is no geomagnetic model for 2035-06-01: choose one from 2010 to 2029, as World Magnetic",
+        ),
         ('source = "flight"', 'source = "fly"', 'truth.source: there is no source "fly": '),
         ('source = "flight"', "", "truth.source: is missing: add it, one of flight, kinematic"),
         ('aircraft = "loiter"', 'aircraft = "loitr"', 'truth.aircraft: there is no aircraft "loitr": did you mean'),
