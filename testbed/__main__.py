@@ -1,4 +1,4 @@
-"""The command line: ``testbed scenarios | run | check | report | export | campaign | papers | watch``.
+"""The command line: ``testbed scenarios | aircraft | run | check | report | export | campaign | papers | watch``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -97,6 +97,19 @@ def scenarios() -> None:
             raise UserError(f"{path}: {error}") from None
         table.add_row(path.stem, str(head.get("title")), f"{head.get('duration_s')} s")
     _console().print(table)
+
+
+@app.command()
+def aircraft(
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="A shipped aircraft, or the path of a folder.")
+    ] = None,
+) -> None:
+    """List the shipped aircraft, or show the limits, trims and modes of one."""
+    from testbed.report import aircraft as pages
+
+    for table in [pages.listed()] if name is None else pages.tables(name):
+        _console().print(table)
 
 
 @app.command()

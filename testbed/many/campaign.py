@@ -37,6 +37,7 @@ import testbed
 from nav.samples import Array
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
+from testbed.motion import aircraft
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource, Replay, save_motion
 from testbed.scenario import Scenario
@@ -176,7 +177,7 @@ def campaign(
     if runs < 1:
         raise UserError(f"--runs {runs}: give at least 1")
     folder = out.absolute()
-    _claim(folder, _setup(combinations[0].scenario, vary or {}, overrides))
+    _claim(folder, _setup([one.scenario for one in combinations], vary or {}, overrides))
     wanted = [(i, c.scenario.seed + k) for i, c in enumerate(combinations) for k in range(runs)]
     stored = {run: _load(folder, *run) for run in wanted}
     missing = [run for run, outcome in stored.items() if outcome is None]
@@ -223,14 +224,18 @@ def _combinations(
 # --- the folder
 
 
-def _setup(scenario: Scenario, vary: Mapping[str, Sequence[str]], overrides: Sequence[str]) -> dict[str, Any]:
+def _setup(
+    scenarios: Sequence[Scenario], vary: Mapping[str, Sequence[str]], overrides: Sequence[str]
+) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
     packages = ("numpy", "scipy", "numba", "jsbsim", "pygeomag")
+    flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
-        "scenario text": scenario.text,
+        "scenario text": scenarios[0].text,
         "overrides": list(overrides),
         "varied values": {key: list(values) for key, values in vary.items()},
         "code": _code(),
+        "aircraft": [aircraft.digest(name) for name in sorted(flown)],
         "versions": {package: version(package) for package in packages},
     }
 
@@ -245,6 +250,7 @@ def _code() -> str:
         (Path(nav.__file__).parent, "*.py"),
         (package, "*.py"),
         (data_dir("aircraft"), "*.xml"),
+        (data_dir("aircraft"), "*.toml"),
     ):
         for file in sorted(set(folder.rglob(pattern)) - shown):
             digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes())

@@ -6,6 +6,7 @@ its path. What JSBSim flies is the XML; nothing here needs JSBSim.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import tomllib
 from pathlib import Path
@@ -83,15 +84,14 @@ UNKNOWN_BODY = Usual(airspeed_mps=25.0, turn_rate_radps=0.06, load_change_g=0.1,
 
 
 class Current(Section):
-    """Electrical load: avionics and payload; a servo at rest, and beyond that at full rate; a drive motor.
+    """Electrical load: avionics and payload; a servo at rest, and beyond that at full rate.
 
-    ``motor_a`` is at full throttle, in proportion to it below; 0 with a petrol engine.
+    What an electric engine takes on top is JSBSim's to say.
     """
 
     payload_a: float = Field(ge=0, le=1000)
     servo_idle_a: float = Field(ge=0, le=100)
     servo_running_a: float = Field(ge=0, le=100)
-    motor_a: float = Field(ge=0, le=1000)
 
 
 class Envelope(Section):
@@ -201,6 +201,14 @@ def load(name_or_path: str) -> Envelope:
         raise UserError(f"{file}: can't be read: {error}") from None
     except ValidationError as error:
         raise UserError("\n".join(f"{file}: {line}" for line in _mistakes(error))) from None
+
+
+def digest(name_or_path: str) -> str:
+    """Digest of all files of an aircraft. Raises UserError when there is none."""
+    home, found = folder(name_or_path), hashlib.sha256()
+    for file in sorted(path for path in home.rglob("*") if path.is_file()):
+        found.update(file.relative_to(home).as_posix().encode() + b"\0" + file.read_bytes())
+    return found.hexdigest()
 
 
 def _mistakes(error: ValidationError) -> list[str]:

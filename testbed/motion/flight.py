@@ -51,6 +51,8 @@ TURBULENCE = {"light": (25.3, 3), "moderate": (50.6, 4), "severe": (76.0, 6)}
 SERVO_RATE = 10.0  # normalised travel per second at full rate
 SURFACES = ("aileron", "elevator", "rudder")  # ap/travel/<surface>-rad says how far each goes [rad]
 
+MOTOR_CURRENT = "propulsion/engine/current-amperes"
+
 # What is read on every tick: property and its unit in SI.
 STATE: Mapping[str, float] = {
     "position/lat-geod-rad": 1.0,
@@ -74,6 +76,7 @@ STATE: Mapping[str, float] = {
     "propulsion/total-fuel-lbs": POUND,
     **{f"fcs/{surface}-pos-rad": 1.0 for surface in SURFACES},  # over the aircraft's travel in `Aircraft.units`
     "fcs/throttle-pos-norm": 1.0,
+    MOTOR_CURRENT: 1.0,
 }
 # What is linearised: initial condition and rate of change, in JSBSim's units.
 LINEAR_STATE: Mapping[str, str] = {
@@ -219,7 +222,7 @@ class Flight:
         block.current[:] = load.payload_a + 4 * load.servo_idle_a
         for servo in range(4):
             block.current[:] += load.servo_running_a * servos[:, servo]
-        block.current[:] += load.motor_a * block.controls[:, 3]
+        block.current[:] += table[1:, 23]
         repeats = [steps for steps, _ in commands]
         held = np.repeat(np.array([values for _, values in commands]), repeats, axis=0)
         block.commands[:], block.leg[:] = held[:, :3], held[:, 3]
@@ -247,6 +250,8 @@ class Aircraft:
         for integrator, number in INTEGRATORS.items():
             self.fdm[f"simulation/integrator/{integrator}"] = number
         self.rate_hz = rate_hz
+        if self.fdm.get_property_manager().get_node(MOTOR_CURRENT) is None:
+            self.fdm[MOTOR_CURRENT] = 0.0  # an engine that burns fuel has none
         self._read = [self._node(name).get_double_value for name in STATE]
         tanks = (f"propulsion/tank[{number}]/contents-lbs" for number in itertools.count())
         self._tanks = list(itertools.takewhile(self.fdm.get_property_manager().get_node, tanks))

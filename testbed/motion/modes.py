@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from testbed.motion.flight import CALM, Aircraft
+from nav.earth import STANDARD_GRAVITY
+from testbed.motion.flight import CALM, POUND, Aircraft
 from testbed.motion.sections import Start
 
 
@@ -25,14 +26,30 @@ class Mode(NamedTuple):
     time_constant: float
 
 
-def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[Mode]:
-    """Short period, phugoid, Dutch roll, roll and spiral at a trimmed true airspeed [m/s], loops off, controls fixed.
+class Trim(NamedTuple):
+    """Straight and level, steady: true airspeed [m/s], angles [rad], travel and throttle as shares, thrust [N]."""
 
-    From central differences of JSBSim's own accelerations. The airframe is frozen at each perturbed state until the
-    engine has found its speed there, so thrust is what a fixed throttle gives.
-    """
+    airspeed: float
+    alpha: float
+    elevator: float
+    throttle: float
+    rpm: float
+    thrust: float
+
+
+def trim_and_modes(name: str, airspeed: float, alt_m: float) -> tuple[Trim, list[Mode]]:
+    """The trim of an aircraft at a true airspeed [m/s] and an altitude [m], and its modes there: `modes`."""
     aircraft = Aircraft(name, 200.0)
     aircraft.start(Start(lat_deg=0, lon_deg=0, alt_m=alt_m, heading_deg=0, airspeed_mps=airspeed), CALM)
+    fdm = aircraft.fdm
+    trim = Trim(
+        airspeed,
+        fdm["aero/alpha-rad"],
+        fdm["fcs/elevator-pos-rad"] / aircraft.travel["elevator"],
+        fdm["fcs/throttle-pos-norm"],
+        fdm["propulsion/engine/engine-rpm"],
+        fdm["propulsion/engine/thrust-lbs"] * POUND * STANDARD_GRAVITY,
+    )
     longitudinal, lateral = (np.linalg.eigvals(block) for block in aircraft.linearise())
     phugoid, _, short, _ = sorted(longitudinal, key=lambda s: (abs(s), s.imag))
     spiral, *dutch, roll = sorted(lateral, key=lambda s: (abs(s.real) if s.imag == 0 else 1.0, s.imag))
@@ -43,7 +60,16 @@ def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[M
         "roll": roll,
         "spiral": spiral,
     }
-    return [_mode(name, complex(s)) for name, s in named.items()]
+    return trim, [_mode(name, complex(s)) for name, s in named.items()]
+
+
+def modes(airspeed: float, alt_m: float = 800.0, name: str = "loiter") -> list[Mode]:
+    """Short period, phugoid, Dutch roll, roll and spiral at a trimmed true airspeed [m/s], loops off, controls fixed.
+
+    From central differences of JSBSim's own accelerations. The airframe is frozen at each perturbed state until the
+    engine has found its speed there, so thrust is what a fixed throttle gives.
+    """
+    return trim_and_modes(name, airspeed, alt_m)[1]
 
 
 def modes_table(airspeeds: Sequence[float] = (20.0, 25.0, 30.0, 35.0), alt_m: float = 800.0) -> str:
