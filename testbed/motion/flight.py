@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
+import subprocess
+import sys
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,6 +23,7 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.motion import aircraft as aircraft_files
 from testbed.motion.guidance import Guidance
+from testbed.motion.gusts import TURBULENCE
 from testbed.motion.legs import Leg
 from testbed.motion.paths import Feedback
 from testbed.motion.sections import FlightTruth, Start, Wind
@@ -43,10 +47,6 @@ SETTLING_S = 90.0  # of straight and level flight before the run starts
 # JSBSim's numbers for: second order Adams-Bashforth rates, Adams-Bashforth 3 position, and Buss's augmented second
 # order attitude, which is exact for a constant rate and needs no normalisation.
 INTEGRATORS = {"rate/rotational": 3, "rate/translational": 3, "position/rotational": 7, "position/translational": 4}
-
-# MIL-F-8785C: wind at 20 ft for the low-altitude model [ft/s] (15, 30 and 45 knots, fig. 8) and the probability of
-# exceedance curve of the high-altitude model (fig. 7: light 1e-2, moderate 1e-3, severe 1e-5; JSBSim counts them).
-TURBULENCE = {"light": (25.3, 3), "moderate": (50.6, 4), "severe": (76.0, 6)}
 
 SERVO_RATE = 10.0  # normalised travel per second at full rate
 SURFACES = ("aileron", "elevator", "rudder")  # ap/travel/<surface>-rad says how far each goes [rad]
@@ -93,6 +93,18 @@ ENGINE_SETTLING_S = 3.0
 
 MAX_ROLL, MAX_PITCH = math.radians(80.0), math.radians(60.0)  # beyond these control is lost
 WIDTH = len(STATE)
+
+PROBE = """
+import sys, jsbsim
+jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR))
+fdm = jsbsim.FGFDMExec(sys.argv[1])
+fdm.set_debug_level(0)
+fdm.set_aircraft_path(sys.argv[2])
+fdm.set_engine_path("engine")
+fdm.set_systems_path("systems")
+sys.exit(not fdm.load_model(sys.argv[3]))
+"""
+SAID = 40  # last words of JSBSim that are passed on
 
 
 class Flight:
@@ -264,13 +276,12 @@ class Aircraft:
         self.units = np.array(list({**STATE, **travels}.values()))  # of a row, in SI and shares of travel
 
     def _load(self) -> None:
-        """Let JSBSim read the model."""
-        try:
-            loaded = self.fdm.load_model(self._folder.name)
-        except jsbsim.BaseError as error:
-            raise UserError(f"{self._model}: JSBSim can't read it: {error}") from None
-        if not loaded:
-            raise UserError(f"{self._model}: JSBSim can't read it: its messages above say why")
+        """Let JSBSim read the model; one that is not shipped first in another process, as some mistakes abort it."""
+        shipped = data_dir("aircraft")
+        if self._folder.parent != shipped:
+            _probe(shipped, self._folder)
+        if not self.fdm.load_model(self._folder.name):
+            raise UserError(f"{self._model}: JSBSim can't read it")
 
     @property
     def _model(self) -> Path:
@@ -433,6 +444,16 @@ def _attitude_and_air(euler: Array, v_n: Array, wind_n: Array) -> tuple[Array, A
         speed = math.sqrt(air_b[0] * air_b[0] + air_b[1] * air_b[1] + air_b[2] * air_b[2])
         air[k, 0], air[k, 1], air[k, 2] = speed, math.atan2(air_b[2], air_b[0]), math.asin(air_b[1] / speed)
     return q_nb, air
+
+
+@functools.cache
+def _probe(shipped: Path, folder: Path) -> None:
+    """Raise UserError, with what JSBSim says, where it can't load the model in a folder."""
+    words = [sys.executable, "-c", PROBE, str(shipped), str(folder.parent), folder.name]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = " ".join((done.stdout + done.stderr).split()[-SAID:]) or "it says nothing"
+        raise UserError(f"{folder / folder.name}.xml: JSBSim can't read it: {said}")
 
 
 def _v_n(speed: float, heading_deg: float) -> tuple[float, float, float]:

@@ -100,7 +100,7 @@ def _speed_mistake(key: str, speed: float, alt: float, envelope: Envelope) -> It
     if speed < slowest:
         yield key, f"{at} is too near the stall: {slowest:.1f} is the least"
     elif speed > fastest or envelope.climb_limit(speed, alt) < LEAST_CLIMB:
-        yield key, f"{at} is more than engine and airframe stand"
+        yield key, f"{at} is more than engine and airframe stand: {fastest:.1f} is the most for the airframe"
 
 
 def _vertical_mistakes(at: str, leg: Leg, alt: float, to_alt: float, limit: float) -> Iterator[tuple[str, str]]:

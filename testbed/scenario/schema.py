@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime as dt
 import difflib
+import json
 import math
 import re
 import tomllib
@@ -209,6 +210,16 @@ class Scenario(Section):
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
         scenario._text, scenario._path, scenario._overrides = text, path, tuple(overrides)
         return scenario
+
+    @classmethod
+    def of_record(cls, said: Mapping[Any, Any]) -> Scenario:
+        """The scenario of a record, by the record's attributes; an aircraft in a folder is looked for where it was.
+
+        Raises KeyError or ValueError where the attributes are no record's, UserError as `load` does.
+        """
+        path = str(said.get("scenario_path", ""))
+        overrides = json.loads(said.get("overrides", "[]"))
+        return cls.parse(str(said["scenario"]), overrides, Path(path) if path else None)
 
     def site(self) -> Site:
         """Where and when the run starts."""

@@ -311,8 +311,7 @@ def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[s
 def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]:
     """How the aircraft flew; nothing when none did, or of a record whose scenario is no longer read."""
     try:
-        overrides = json.loads(dataset.attrs.get("overrides", "[]"))
-        scenario = Scenario.parse(str(dataset.attrs["scenario"]), overrides)
+        scenario = Scenario.of_record(dataset.attrs)
     except (KeyError, ValueError, UserError):
         return {}
     if not isinstance(scenario.truth, FlightTruth):

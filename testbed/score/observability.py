@@ -11,7 +11,6 @@ at all. What one local filter sees of its own is less.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -83,8 +82,7 @@ class _Way(NamedTuple):
 def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     """Visibility of each estimator that was ever aligned; none of a record whose scenario is no longer read."""
     try:
-        overrides = json.loads(dataset.attrs.get("overrides", "[]"))
-        scenario = Scenario.parse(str(dataset.attrs["scenario"]), overrides)
+        scenario = Scenario.of_record(dataset.attrs)
     except (KeyError, ValueError, UserError):
         return {}
     found = {}

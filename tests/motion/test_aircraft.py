@@ -7,11 +7,13 @@ from array import array
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from testbed.motion.aircraft import load
-from testbed.motion.flight import CALM, FOOT, POUND, Aircraft
+from testbed.motion.flight import CALM, FOOT, POUND, Aircraft, Flight
+from testbed.motion.legs import Leg
 from testbed.motion.modes import modes, modes_table
-from testbed.motion.sections import Start
+from testbed.motion.sections import FlightTruth, Start
 
 LOITER = load("loiter")
 AIRSPEEDS = [20.0, 22.5, 25.0, 27.5, 30.0, 32.5, 35.0]
@@ -186,3 +188,97 @@ def test_actuators_lag_and_keep_to_rate_and_travel(aircraft: Aircraft) -> None:
     respond(0.0)
     small = respond(0.02) / (0.02 * 0.35)
     assert small[7] == pytest.approx(1 - math.exp(-25 * 8 / 200), abs=0.08)  # a lag of 40 ms
+
+
+# --- the flying wing
+
+
+WING = load("flying_wing")
+
+
+@pytest.fixture(scope="module")
+def wing() -> Aircraft:
+    return Aircraft("flying_wing", 200.0)
+
+
+@pytest.mark.parametrize("airspeed", [12.5, 18.0, 25.0])
+def test_trims_of_the_wing(wing: Aircraft, airspeed: float) -> None:
+    wing.start(level(280.0, airspeed), CALM)
+    fdm = wing.fdm
+    assert np.abs(values(wing, *(f"accelerations/{axis}dot-ft_sec2" for axis in "uvw"))).max() * FOOT < 0.02
+    assert fdm["velocities/vt-fps"] * FOOT == pytest.approx(airspeed, abs=0.02)
+    alpha, elevator, throttle = values(wing, "aero/alpha-rad", "fcs/elevator-pos-rad", "fcs/throttle-pos-norm")
+    rho = fdm["atmosphere/rho-slugs_ft3"] * 515.378818
+    q_s = 0.5 * rho * airspeed**2 * 0.75
+    thrust, rps = fdm["propulsion/engine/thrust-lbs"] * POUND * 9.80665, fdm["propulsion/engine/engine-rpm"] / 60
+    # Published coefficients: lift carries the weight, thrust the drag, no moment is left.
+    assert q_s * (0.0867 + 4.0203 * alpha + 0.2781 * elevator) == pytest.approx(3.364 * 9.80, rel=0.02)
+    drag = q_s * (0.0197 + 0.0791 * alpha + 1.0555 * alpha**2 + 0.0633 * elevator**2)
+    assert thrust == pytest.approx(drag, rel=0.03)
+    assert 0.02275 - 0.4629 * alpha - 0.2292 * elevator == pytest.approx(0.0, abs=2e-3)
+    # The propeller's fit, and the motor: its power is what the propeller takes, at the current that the voltage drives.
+    j = airspeed / (rps * 0.3302)
+    assert thrust == pytest.approx((0.09357 - 0.06044 * j - 0.1079 * j**2) * rho * rps**2 * 0.3302**4, rel=0.02)
+    power = 2 * math.pi * (0.00523 + 0.00497 * j - 0.01664 * j**2) * rho * rps**3 * 0.3302**5
+    back_emf = rps * 60 / 700
+    current = (14.8 * throttle - back_emf) / 0.05
+    assert fdm["propulsion/engine/current-amperes"] == pytest.approx(current, abs=0.2)
+    assert power == pytest.approx(back_emf * (current - 1.0), rel=0.05)
+    assert 0.3 < throttle < 0.9
+
+
+def test_the_wing_stalls_where_its_envelope_says() -> None:
+    """Level at 1 g with the elevons that trim asks for: the greatest lift coefficient of the blended curve."""
+    alpha = np.linspace(0.0, 0.3, 301)
+    below, above = np.exp(-50 * (alpha - 0.26)), np.exp(50 * (alpha + 0.26))
+    share = (1 + below + above) / ((1 + below) * (1 + above))  # Beard and McLain, equation 4.10
+    curve = (1 - share) * (0.0867 + 4.0203 * alpha) + share * 2 * np.sin(alpha) ** 2 * np.cos(alpha)
+    trimmed = curve + 0.2781 * (0.02275 - 0.4629 * alpha) / 0.2292
+    stall = math.sqrt(3.364 * 9.80 / (0.5 * 1.225 * 0.75 * trimmed.max()))
+    assert WING.airspeed.stall_mps == pytest.approx(stall, rel=0.02)
+
+
+@pytest.mark.parametrize("airspeed", [12.5, 18.0, 25.0])
+def test_modes_of_the_wing_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
+    found = {mode.name: mode for mode in modes(airspeed, 0.0, "flying_wing")}
+    q_s, half = 0.5 * 1.225 * airspeed**2 * 0.75, 2 * airspeed
+    for mode in found.values():
+        assert mode.eigenvalue.real < 0
+    assert found["roll"].eigenvalue.real == pytest.approx(-0.4042 * q_s * 2.1**2 / half / 0.340, rel=0.2)
+    z_w = -q_s * 4.0203 / (3.364 * airspeed)
+    m_alpha, m_q = (q_s * 0.357143 / 0.165 * k for k in (-0.4629, -1.3012 * 0.357143 / half))
+    short = found["short period"]
+    assert abs(short.eigenvalue) == pytest.approx(math.sqrt(z_w * m_q - m_alpha), rel=0.2)
+    assert -2 * short.eigenvalue.real == pytest.approx(-(z_w + m_q), rel=0.2)
+    assert abs(found["phugoid"].eigenvalue) == pytest.approx(math.sqrt(2) * 9.8 / airspeed, rel=0.2)
+    assert abs(found["Dutch roll"].eigenvalue) == pytest.approx(math.sqrt(0.0283 * q_s * 2.1 / 0.400), rel=0.35)
+    assert 0.2 < found["Dutch roll"].damping < 0.7
+
+
+def test_the_wing_climbs_as_the_plan_check_believes(wing: Aircraft) -> None:
+    for airspeed, alt in [(12.5, 100.0), (18.0, 100.0), (25.0, 100.0), (27.0, 2500.0)]:
+        for rate in (WING.climb_limit(airspeed, alt), -WING.descent_limit(airspeed, alt)):
+            wing.start(level(alt, airspeed), CALM)
+            climbing(wing, airspeed, alt, 40.0, rate)
+            height, speed, throttle = values(wing, "position/geod-alt-ft", "velocities/vt-fps", "fcs/throttle-pos-norm")
+            assert height * FOOT - (alt + rate * 40) == pytest.approx(0.0, abs=0.5)
+            assert speed * FOOT == pytest.approx(airspeed, abs=0.2)
+            assert throttle < 0.97
+
+
+@pytest.mark.parametrize(
+    ("airspeed", "gusts"), [(12.5, "light"), (15.0, "moderate"), (18.0, "moderate"), (25.0, "moderate")]
+)
+def test_the_wing_flies_in_gusts(airspeed: float, gusts: str) -> None:
+    start = {"lat_deg": 34.0, "lon_deg": 108.0, "alt_m": 280.0, "heading_deg": 30.0, "airspeed_mps": airspeed}
+    wind = {"from_deg": 250.0, "speed_mps": 5.0, "turbulence": gusts}
+    truth = FlightTruth(source="flight", aircraft="flying_wing", start=start, wind=wind)  # type: ignore[arg-type]
+    plan = TypeAdapter(list[Leg]).validate_python([{"leg": "loiter", "radius_m": 250, "duration_s": 90}])
+    source = Flight(truth, plan, 3)
+    flown = source.advance(90 * 200)
+    assert source.failure == ""
+    assert len(flown) == 90 * 200
+    assert np.abs(flown.h - 280.0).max() < 8.0
+    assert np.std(flown.airspeed - airspeed) < 1.3
+    assert np.degrees(np.abs(flown.omega_b).std(axis=0)).max() < 8.0
+    assert np.abs(flown.controls[:, :3]).mean() < 0.3
