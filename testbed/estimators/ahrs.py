@@ -14,11 +14,10 @@ from nav.ahrs import Ahrs, AhrsConfig
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
 from nav.samples import Array
-from testbed.estimators.datasheet import FIELD_SIZE, PAYLOAD_CURRENT, SOFT_IRON_SHARE, imu_model
+from testbed.estimators.datasheet import FIELD_SIZE, SOFT_IRON_SHARE, imu_model
 from testbed.estimators.lane import Commanded, Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import (
-    USUAL_TURN_DEGPS,
     EstimatorSection,
     Gust,
     Mistake,
@@ -26,6 +25,7 @@ from testbed.estimators.section import (
     aid_mistakes,
     second_of_a_kind,
 )
+from testbed.motion.aircraft import UNKNOWN_BODY
 from testbed.schema import Heading, Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.magnetometer import MagnetometerConfig
@@ -33,7 +33,7 @@ from testbed.sensors.magnetometer import MagnetometerConfig
 AIDS = frozenset({"barometer", "magnetometer", "airspeed"})
 FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
 LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
-IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at TURN_RATE: so much more than noise
+IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at 0.06 rad/s: so much more than noise
 NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 LEVEL_BANK = math.radians(5.0)  # commanded; a straight in light turbulence takes 2.5 (99 % of the time)
 
@@ -65,8 +65,8 @@ class AhrsSection(EstimatorSection):
 
     kind: Literal["ahrs"] = "ahrs"
     aids: tuple[str, ...] = Field(description="sensors whose samples it uses, by their names")
-    turn_degps: TurnRate = USUAL_TURN_DEGPS
-    gust_mps: Gust = 1.0
+    turn_degps: TurnRate = None
+    gust_mps: Gust = None
     heading_deg: Heading | None = Field(default=None, description="at the start, of one without magnetometer")
     levelling: bool = Field(default=True, description="false: once it has begun, it goes by its gyros alone")
     level: LevelSection | None = Field(default=None, description="how it levels; none: as light turbulence wants")
@@ -130,16 +130,17 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
     magnetometer = aids.get("magnetometer")
     if isinstance(magnetometer, MagnetometerConfig):
         m = magnetometer.errors()
-        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * PAYLOAD_CURRENT)
-        lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * IRON_TURN_S * magnetometer.rate_hz)
+        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * rig.usual.current_a)
+        turn_s = IRON_TURN_S * (UNKNOWN_BODY.turn_rate_radps / rig.usual.turn_rate_radps)
+        lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * turn_s * magnetometer.rate_hz)
         told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
     ahrs = Ahrs(
         AhrsConfig(
-            imu_model(errors, math.radians(section.turn_degps)),
+            imu_model(errors, rig.turn_rate(section.turn_degps), usual=rig.usual),
             site.lat,
             site.h,
             tuple(aids),
-            airspeed_sigma=section.gust_mps,
+            airspeed_sigma=rig.gust_mps(section.gust_mps),
             literal=section.literal,
             **told,  # type: ignore[arg-type]
         ),

@@ -14,6 +14,7 @@ from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid
 from testbed.estimators.section import ImuStates
+from testbed.motion.aircraft import UNKNOWN_BODY, Usual
 from testbed.sensors import SensorConfig
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -25,25 +26,24 @@ from testbed.sensors.position_fix import PositionFixConfig
 from testbed.sensors.star_tracker import StarTrackerConfig
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
-TURN_RATE = 0.06  # of a usual turn of this aircraft [rad/s]
-LOAD_CHANGE = 0.1  # and the change of its load factor
-MANOEUVRE_S = 120.0  # between changes of these
+MANOEUVRE_S = 120.0  # between changes of turn and load
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
-PAYLOAD_CURRENT = 2.0  # the current that wiring carries in flight [A]
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
-GUST_TIME_S = 12.0  # 300 m, the length of gusts at the height of 300 m (MIL-F-8785C), at 25 m/s
+GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 
 
-def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE, states: ImuStates = "biases") -> ImuModel:
-    """The datasheet as the filter's error model; ``turn_rate`` [rad/s] is the usual one.
+def imu_model(
+    errors: ImuErrors, turn_rate: float | None = None, states: ImuStates = "biases", usual: Usual = UNKNOWN_BODY
+) -> ImuModel:
+    """The datasheet as the filter's error model; ``turn_rate`` [rad/s] counts in place of the ``usual`` one.
 
     Misalignment and g-sensitivity make a bias that changes with every manoeuvre: a random walk. Of the gyros it is as
-    large as a turn makes it; of the accelerometers as a change of load does, `LOAD_CHANGE`. In turns slower than
-    `TURN_RATE` the load changes by less, with the square of their rate: n^2 = 1 + (v turn_rate / g)^2.
+    large as a turn makes it; of the accelerometers as the usual change of load does. In turns slower than
+    the usual one the load changes by less, with the square of their rate: n^2 = 1 + (v turn_rate / g)^2.
 
     With ``states`` "biases" scale factors do so too, and in-run instability (Gauss-Markov, sigma and tau) becomes a
     random walk of the same driving noise, q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two
@@ -55,7 +55,8 @@ def imu_model(errors: ImuErrors, turn_rate: float = TURN_RATE, states: ImuStates
     turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
     pull = beside.gyro_g_sensitivity * STANDARD_GRAVITY
     changes = math.sqrt(1 / MANOEUVRE_S)
-    load_change = LOAD_CHANGE * min(1.0, turn_rate / TURN_RATE) ** 2
+    turn_rate = usual.turn_rate_radps if turn_rate is None else turn_rate
+    load_change = usual.load_change_g * min(1.0, turn_rate / usual.turn_rate_radps) ** 2
     return ImuModel(
         gyro_noise=beside.gyro_noise,
         accel_noise=beside.accel_noise,
@@ -107,7 +108,7 @@ def own_aid(name: str, section: SensorConfig, imu: ImuErrors, slip_mps: float | 
     return None
 
 
-def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float) -> dict[str, object]:
+def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float, usual: Usual) -> dict[str, object]:
     """The keys of `InsConfig` that one sensor of each kind decides on."""
     told: dict[str, object] = {}
     gnss = kinds.get("gnss")
@@ -134,7 +135,7 @@ def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: fl
             "magnetometer_sigma": m.noise,
             "magnetometer_error_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
             "magnetometer_anomaly_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
-            "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * PAYLOAD_CURRENT),
+            "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * usual.current_a),
         }
     airspeed = kinds.get("airspeed")
     if isinstance(airspeed, AirspeedConfig):
@@ -143,7 +144,7 @@ def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: fl
             "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * gust_mps),
             "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
             "gust_sigma": gust_mps,
-            "gust_correlation_s": GUST_TIME_S,
+            "gust_correlation_s": GUST_LENGTH / usual.airspeed_mps,
             "wind_walk": WIND_WALK,
             "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
         }

@@ -35,7 +35,6 @@ from testbed.estimators.rig import Rig
 from testbed.estimators.section import (
     ONE_EACH,
     SEVERAL,
-    USUAL_TURN_DEGPS,
     Engine,
     EstimatorSection,
     Gust,
@@ -142,8 +141,8 @@ class FederatedSection(EstimatorSection):
     kind: Literal["federated"] = "federated"
     locals: tuple[LocalSection, ...] = Field(default=(), description="the local filters")
     states: States = "biases"
-    turn_degps: TurnRate = USUAL_TURN_DEGPS
-    gust_mps: Gust = 1.0
+    turn_degps: TurnRate = None
+    gust_mps: Gust = None
     handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: Slip | None = None
     structure: Literal["no_reset", "full_reset", "partial"] = Field(
@@ -213,8 +212,8 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
         other = own_aid(name, sensor, errors, section.nonholonomic_mps)
         if other is not None:
             return other
-        told = aid_settings({sensor.kind: sensor}, errors, section.gust_mps)
-        return InsConfig(imu_model(errors), (sensor.kind,), **told).aid_of(sensor.kind, name)  # type: ignore[arg-type]
+        told = aid_settings({sensor.kind: sensor}, errors, rig.gust_mps(section.gust_mps), rig.usual)
+        return InsConfig(imu_model(errors, usual=rig.usual), (sensor.kind,), **told).aid_of(sensor.kind, name)  # type: ignore[arg-type]
 
     used = dict.fromkeys(name for local in section.locals for name in local.aids)
     # Without a receiver or magnetometer among the aids, the first in the file serves the alignment.
@@ -235,7 +234,7 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
     )
     federated = Federated(
         Config(
-            imu_model(errors, math.radians(section.turn_degps), section.states),
+            imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
             local_filters,
             structure=section.structure,
             sharing=section.sharing,

@@ -21,7 +21,6 @@ from testbed.estimators.rig import Rig
 from testbed.estimators.section import (
     ONE_EACH,
     SEVERAL,
-    USUAL_TURN_DEGPS,
     Engine,
     EstimatorSection,
     Gust,
@@ -73,8 +72,8 @@ class InsSection(EstimatorSection):
     kind: Literal["ins"] = "ins"
     aids: tuple[str, ...] = Field(description="sensors whose samples it uses, by their names")
     states: States = "biases"
-    turn_degps: TurnRate = USUAL_TURN_DEGPS
-    gust_mps: Gust = 1.0
+    turn_degps: TurnRate = None
+    gust_mps: Gust = None
     handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: Slip | None = None
     engine: Engine = "linear"
@@ -106,7 +105,8 @@ def build(section: InsSection, rig: Rig) -> Lane:
         if sensor.kind in INS_AIDS:
             offered.setdefault(sensor.kind, name)
     errors = rig.imu(section.imu).errors()
-    told = aid_settings({kind: sensors[name] for kind, name in offered.items()}, errors, section.gust_mps)
+    kinds: Mapping[str, SensorConfig] = {kind: sensors[name] for kind, name in offered.items()}
+    told = aid_settings(kinds, errors, rig.gust_mps(section.gust_mps), rig.usual)
     if section.course is not None:
         # With the wind, course says what the constraint of no sideslip says: both would count it twice.
         slip = told.pop("sideslip_sigma", 0.0) if "airspeed" in aids else 0.0
@@ -115,7 +115,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
     learning, fading = section.sage_husa, section.fading
     ins = Ins(
         InsConfig(
-            imu_model(errors, math.radians(section.turn_degps), section.states),
+            imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
             aids,
             tuple(aid for aid in others.values() if aid is not None),
             mounting_sigma=errors.accel_misalignment,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from testbed.motion.aircraft import UNKNOWN_BODY, Usual
+from testbed.motion.gusts import UNKNOWN_AIR
 from testbed.sensors import SensorConfig, Site
 from testbed.sensors.imu import ImuConfig
 
@@ -16,6 +19,8 @@ class Rig:
 
     ``site`` is the area of operation and the date, known within kilometres; ``tick_rate_hz`` the rate of the motion;
     ``seed`` that of the run, for what an estimator draws itself. Files that a scenario names lie in ``folder``.
+    ``usual`` is how the aircraft, or a body of which nothing is known, usually flies; ``expected_gust_mps`` how strong
+    the gusts are that its plan meets, rms.
     """
 
     sensors: Mapping[str, SensorConfig]
@@ -23,6 +28,8 @@ class Rig:
     tick_rate_hz: float
     seed: int
     folder: Path = field(default_factory=Path)
+    usual: Usual = UNKNOWN_BODY
+    expected_gust_mps: float = UNKNOWN_AIR
 
     def imu(self, name: str) -> ImuConfig:
         """The section of an IMU. Raises ValueError when ``name`` is no IMU."""
@@ -30,6 +37,14 @@ class Rig:
         if not isinstance(section, ImuConfig):
             raise ValueError(f"{name!r} is a sensor of kind {section.kind!r}, not an IMU")
         return section
+
+    def turn_rate(self, told_degps: float | None) -> float:
+        """The rate of turn [rad/s] that an estimator is told, or else the usual one."""
+        return self.usual.turn_rate_radps if told_degps is None else math.radians(told_degps)
+
+    def gust_mps(self, told: float | None) -> float:
+        """The gusts [m/s] that an estimator is told to expect, or else those of the scenario."""
+        return self.expected_gust_mps if told is None else told
 
     def lag_s(self, names: Iterable[str]) -> float:
         """The largest latency [s] of the aids of these names."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Literal, TypeAlias
 
@@ -25,10 +24,18 @@ States: TypeAlias = Annotated[
     ImuStates, Field(description="full: in-run instability and scale factors of the IMU too, as states")
 ]
 TurnRate: TypeAlias = Annotated[
-    float, Field(ge=0, le=360, description="usual rate of turn: how far scale errors count")
+    float | None,
+    Field(ge=0, le=360, description="usual rate of turn: how far scale errors count; none: the aircraft's usual one"),
 ]
-USUAL_TURN_DEGPS = math.degrees(0.06)
-Gust: TypeAlias = Annotated[float, Field(ge=0, le=20, description="turbulence that the filter expects, 1 sigma")]
+Gust: TypeAlias = Annotated[
+    float | None,
+    Field(
+        ge=0,
+        le=20,
+        description="turbulence that the filter expects, 1 sigma; none: what MIL-F-8785C gives for the scenario's"
+        " turbulence at the plan's altitudes, 1 m/s where none is asked for",
+    ),
+]
 Slip: TypeAlias = Annotated[
     float, Field(gt=0, le=10, description="slip of wheels where body velocity aids; none: no constraint")
 ]

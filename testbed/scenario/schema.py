@@ -26,6 +26,7 @@ from testbed.estimators import registry
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
 from testbed.motion import aircraft, legs
+from testbed.motion.gusts import expected_gust
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath, messages, mistakes
 from testbed.schema import LONGEST_RUN_S, Section
@@ -229,7 +230,11 @@ class Scenario(Section):
     def rig(self, seed: int) -> Rig:
         """What builders of estimators may know of a run with this seed."""
         folder = self._path.parent if self._path else Path()
-        return Rig(self.sensors, self.site(), self.truth.rate_hz, seed, folder)
+        usual = aircraft.UNKNOWN_BODY
+        if isinstance(self.truth, FlightTruth):
+            usual = aircraft.load(self.truth.aircraft).usual
+        gust_mps = expected_gust(self.truth, self.plan)
+        return Rig(self.sensors, self.site(), self.truth.rate_hz, seed, folder, usual, gust_mps)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
