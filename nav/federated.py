@@ -116,7 +116,6 @@ from nav.reference import (
 from nav.samples import (
     Array,
     Estimate,
-    FixType,
     GnssSample,
     ImuSamples,
     Sample,
@@ -355,7 +354,7 @@ class Federated:
 
         One report per part of the sample and local filter that has its sensor.
         """
-        if isinstance(sample, GnssSample) and sample.fix_type is not FixType.FIX_3D:
+        if isinstance(sample, GnssSample) and not sample.has_fix:
             return []
         trouble = aiding.problem(sample)
         if trouble:

@@ -53,7 +53,6 @@ from nav.samples import (
     Array,
     BarometerSample,
     Estimate,
-    FixType,
     GnssSample,
     ImuSamples,
     MagnetometerSample,
@@ -288,7 +287,7 @@ class Ins:
         One report per aid; an unsound sample is refused and reported; none for a GNSS sample without fix, for a kind
         that is not among the aids, and during alignment.
         """
-        if isinstance(sample, GnssSample) and sample.fix_type is not FixType.FIX_3D:
+        if isinstance(sample, GnssSample) and not sample.has_fix:
             self._monitor.heard(sample.t)
             return []
         trouble = aiding.problem(sample)

@@ -26,6 +26,11 @@ class FixType(IntEnum):
     FIX_3D = 3
 
 
+def has_fix(fix_type: FixType | npt.NDArray[np.integer]) -> bool | npt.NDArray[np.bool_]:
+    """Whether a receiver has a fix that can be navigated by: of three dimensions. The one place that decides it."""
+    return fix_type >= FixType.FIX_3D
+
+
 class Status(IntFlag):
     """What an estimator says of itself."""
 
@@ -75,6 +80,11 @@ class GnssSample:
     hdop: float
     vdop: float
     sensor: str = "gnss"
+
+    @property
+    def has_fix(self) -> bool:
+        """Whether there is a position that can be navigated by."""
+        return bool(has_fix(self.fix_type))
 
 
 @dataclass(frozen=True, slots=True)

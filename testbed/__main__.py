@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     import xarray
     from rich.console import Console
 
-    from testbed.loop.loop import Publisher, RunResult
+    from testbed.loop.links import Publisher
+    from testbed.loop.loop import RunResult
     from testbed.loop.requests import Recorded
     from testbed.scenario import Scenario
 
@@ -474,7 +475,7 @@ def _connect(
             given = ", ".join(f"--mavlink-{name}" for name, value in options.items() if value)
             raise UserError(f"{given}: there is no link: add --mavlink URL, or leave it out")
         return []
-    from testbed.loop.loop import shown_estimator
+    from testbed.loop.links import shown_estimator
     from testbed.mavlink import MavlinkPublisher, log_path
 
     shown_estimator(scenario, estimator)

@@ -21,7 +21,7 @@ from rich.console import Console
 import testbed.__main__ as cli
 from testbed.data import data_dir
 from testbed.errors import UserError
-from testbed.loop import loop
+from testbed.loop import links, loop
 from testbed.many import progress
 from testbed.motion import flight
 from testbed.record import reader as record
@@ -405,7 +405,7 @@ def test_parse_vary_refuses(texts: Sequence[str]) -> None:
 def told(console: Console) -> None:
     with progress.shown(console, "a title [with] brackets") as tell:
         for k in range(101):
-            now = loop.Progress(36.0 * k, 3600.0, 87.65, "GNSS denied" if 30 <= k < 60 else "leg [2]")
+            now = links.Progress(36.0 * k, 3600.0, 87.65, "GNSS denied" if 30 <= k < 60 else "leg [2]")
             tell(*progress.of_run(now))
 
 

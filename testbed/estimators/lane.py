@@ -91,6 +91,11 @@ class Lane:
         return Tracked(increments, votes, reports, estimates)
 
     @property
+    def failure(self) -> str:
+        """Why it has ended by an error of its own, empty while it has not (`testbed.estimators.custom.Adapter`)."""
+        return str(getattr(self.horizon.estimator, "failure", ""))
+
+    @property
     def imu(self) -> str:
         """The first IMU."""
         return next(iter(self.imus))

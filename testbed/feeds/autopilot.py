@@ -40,7 +40,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -52,6 +52,7 @@ from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
 from nav.samples import AirspeedSample, Array, BarometerSample, Estimate, ImuSamples, Sample, Status, UpdateReport
 from testbed.estimators.lane import Lane, Tracked
+from testbed.feeds.feed import Turn
 from testbed.feeds.known import commanded, handed_over
 from testbed.motion.paths import Feedback
 from testbed.motion.table import MotionSource, TruthBlock
@@ -96,15 +97,6 @@ class Steered(MotionSource, Protocol):
         ...
 
 
-class Flown(NamedTuple):
-    """What came of some ticks: truth, what every sensor delivered, and what the estimators flown on made of it."""
-
-    block: TruthBlock
-    imu: dict[str, ImuSamples]
-    samples: dict[str, Sequence[Sample]]
-    tracked: dict[str, Tracked]
-
-
 class Autopilot:
     """Flies a motion on estimates, frame by frame. ``events`` are (time, severity, text), for the loop to take.
 
@@ -116,7 +108,7 @@ class Autopilot:
         feedback = scenario.autopilot.feedback
         self.events: deque[tuple[float, str, str]] = deque()
         self.closed = False
-        self.truth_s = 0.0  # wall time that the motion took
+        self.motion_s = 0.0  # wall time that the motion took
         self._source, self._sense = source, sense
         self._filters = {name: filters[name] for name in feedback.estimators}
         self._attitude, self._position = feedback.attitude, feedback.position
@@ -141,21 +133,21 @@ class Autopilot:
             self._air = AirData(airspeed, barometer, scenario.site().h)
             self._reckons = config.attitude_only
 
-    def advance(self, ticks: int, wanted: Sequence[int]) -> Flown:
+    def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
         """The next ``ticks`` rows, fewer when the motion ends; estimates are kept of the rows ``wanted``, ascending."""
-        turns: list[Flown] = []
+        turns: list[Turn] = []
         done = 0
         while done < ticks:
             before = time.perf_counter()
             block = self._source.advance(min(ticks - done, self._frame - self._tick % self._frame))
-            self.truth_s += time.perf_counter() - before
+            self.motion_s += time.perf_counter() - before
             if not len(block):
                 break
             first, last = bisect_left(wanted, done), bisect_left(wanted, done + len(block))
             here = [float(block.t[k - done]) for k in wanted[first:last]]
             turns.append(self._turn(block, here))
             done += len(block)
-        return _join(turns) if turns else Flown(TruthBlock.empty(self._tick, 0), {}, {}, {})
+        return _join(turns) if turns else Turn(TruthBlock.empty(self._tick, 0), {}, {}, {})
 
     def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
         """Remove and give the events up to a time."""
@@ -164,7 +156,7 @@ class Autopilot:
             taken.append(self.events.popleft())
         return taken
 
-    def _turn(self, block: TruthBlock, wanted: list[float]) -> Flown:
+    def _turn(self, block: TruthBlock, wanted: list[float]) -> Turn:
         """Sense and estimate over the rows of one frame, or of a part of it; at its end, feed back."""
         if block.tick == 0:
             for one in self._filters.values():
@@ -182,7 +174,7 @@ class Autopilot:
         if ends:
             self._feed_back(t, block, {name: _sound(one.estimates[-1]) for name, one in tracked.items()})
         kept = {name: one._replace(estimates=one.estimates[: len(wanted)]) for name, one in tracked.items()}
-        return Flown(block, imu, samples, kept)
+        return Turn(block, imu, samples, kept)
 
     def _integrate(self, imu: ImuSamples) -> None:
         """Add what is possible of the increments; rates are unknown when nothing is."""
@@ -403,18 +395,18 @@ def _at_centre(
     )
 
 
-def _join(turns: Sequence[Flown]) -> Flown:
+def _join(turns: Sequence[Turn]) -> Turn:
     """Consecutive turns as one."""
     if len(turns) == 1:
         return turns[0]
     columns = {
-        field.name: np.concatenate([getattr(turn.block, field.name) for turn in turns])
+        field.name: np.concatenate([getattr(turn.reference, field.name) for turn in turns])
         for field in fields(TruthBlock)
         if field.name != "tick"
     }
     first = turns[0]
-    return Flown(
-        TruthBlock(first.block.tick, **columns),
+    return Turn(
+        TruthBlock(first.reference.tick, **columns),
         {name: _join_imu([turn.imu[name] for turn in turns]) for name in first.imu},
         {name: [sample for turn in turns for sample in turn.samples[name]] for name in first.samples},
         {

@@ -1,6 +1,6 @@
 """What may be asked of a run while it goes on: plain data, so that it can be recorded and replayed.
 
-Whoever watches a run (`testbed.loop.loop.Publisher`) hands its requests over when the loop looks, at the start of a
+Whoever watches a run (`testbed.loop.links.Publisher`) hands its requests over when the loop looks, at the start of a
 turn. Those that change what is computed take effect at that tick and are recorded with it; replayed at the same
 ticks they give the same bits. The others only say when the loop goes on.
 

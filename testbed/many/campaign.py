@@ -309,7 +309,7 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
 
 def _share_truth(folder: Path, combinations: Sequence[Combination]) -> Path | None:
     """Fly once the motion that all runs have in common, if they have, and give the folder where it lies."""
-    from testbed.loop.loop import motion
+    from testbed.feeds.simulated import motion
 
     first = combinations[0].scenario
     if not all(_same_motion(first, c.scenario) for c in combinations) or not _seed_leaves_motion(first):
@@ -469,7 +469,8 @@ def _result(future: Any, task: _Task) -> Outcome | Failure:
 
 def _fly(task: _Task) -> Outcome | Failure:
     """Fly one run. Called on a worker."""
-    from testbed.loop.loop import motion, run
+    from testbed.feeds.simulated import motion
+    from testbed.loop.loop import run
 
     try:
         if _code() != task.code:

@@ -30,6 +30,7 @@ from xml.etree import ElementTree
 from testbed import measures
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
+from testbed.feeds.closed import NEVER_CLOSED
 from testbed.loop import loop
 from testbed.report import page as report
 from testbed.results import start_anew
@@ -216,7 +217,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
     started = time.perf_counter()
     try:
         result = loop.run(task.scenario, out=task.folder, progress=lambda now: tell(now.t / now.duration))
-        failure = loop.NEVER_CLOSED if loop.NEVER_CLOSED in result.remarks else ""
+        failure = NEVER_CLOSED if NEVER_CLOSED in result.remarks else ""
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
             failure = f"the flight ended after {t:.0f} s: {result.failure}"

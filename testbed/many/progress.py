@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from testbed.loop import loop
+    from testbed.loop import links
 
 PLAIN_LINES = 10  # for the whole
 PLAIN_EVERY_S = 5.0  # wall time
@@ -52,7 +52,7 @@ def _plain(console: Console) -> Tell:
     return tell
 
 
-def of_run(now: loop.Progress) -> tuple[float, str]:
+def of_run(now: links.Progress) -> tuple[float, str]:
     """The fraction of a run that is done; simulated time, real-time factor and what is going on."""
     factor = f"{now.realtime_factor:.3g} × real time"
     return now.t / now.duration, f"{_clock(now.t)} of {_clock(now.duration)}  {factor}  {now.activity}"

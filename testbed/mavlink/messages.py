@@ -24,7 +24,6 @@ from nav.samples import (
     Array,
     BarometerSample,
     Estimate,
-    FixType,
     GnssSample,
     MagnetometerSample,
     PositionSample,
@@ -123,13 +122,13 @@ class Snapshot:
     def gnss_fix(self) -> GnssSample | None:
         """The receiver's newest epoch if it has a fix."""
         sample = self.newest(GnssSample)
-        return sample if sample and sample.fix_type != FixType.NO_FIX else None
+        return sample if sample and sample.has_fix else None
 
     @cached_property
     def fixed(self) -> bool:
         """Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer."""
         return any(
-            isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.fix_type != FixType.NO_FIX)
+            isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.has_fix)
             for sample in self.samples.values()
             if self.t - sample.t_arrival < self.silent_s[sample.sensor]
         )

@@ -14,7 +14,6 @@ import numpy as np
 
 from nav.local_filter import ISOLATED, OUTSIDE
 from nav.samples import Array, Estimate, ImuSamples, Sample, Status, UpdateReport
-from testbed.loop.loop import patience
 from testbed.loop.requests import Request, settings
 from testbed.mavlink import messages, mission
 from testbed.mavlink.answers import Answers, Talk
@@ -28,6 +27,7 @@ from testbed.mavlink.stream import BESIDE_VEHICLES, PUBLISH_HZ, STREAMS, VEHICLE
 from testbed.motion.table import TruthBlock
 from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig
+from testbed.sensors.timing import patience
 
 HEARD_A_TURN = 4096  # bytes that are taken from each link at a time; the rest waits, or is lost
 HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s

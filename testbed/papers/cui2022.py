@@ -28,7 +28,8 @@ from testbed.estimators import registry
 from testbed.estimators.federated import FederatedSection
 from testbed.estimators.ins import InsSection
 from testbed.feeds.known import handed_over
-from testbed.loop.loop import motion, run
+from testbed.feeds.simulated import motion
+from testbed.loop.loop import run
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report.page import AXIS_COLOURS, COLOURS, FAULT

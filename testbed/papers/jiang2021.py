@@ -20,7 +20,7 @@ from nav.samples import Array, Sample
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane
-from testbed.loop import loop
+from testbed.feeds.simulated import motion
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.results import write_result
@@ -92,7 +92,7 @@ def fly(seed: int) -> dict[Case, Flown]:
     found = {}
     for flight in FLIGHTS:
         chosen = scenario(flight)
-        truth = loop.motion(chosen, seed).advance(round(chosen.duration_s * chosen.truth.rate_hz) + 1)
+        truth = motion(chosen, seed).advance(round(chosen.duration_s * chosen.truth.rate_hz) + 1)
         sensed: dict[str, Any] = {
             name: sensors.build(name, config, chosen.truth.rate_hz, seed, chosen.site()).sense(truth)
             for name, config in chosen.sensors.items()

@@ -22,7 +22,7 @@ from nav.weighting import inflation
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.feeds.known import handed_over
-from testbed.loop import loop
+from testbed.feeds.simulated import motion
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.results import write_result
 from testbed.scenario import Scenario
@@ -74,7 +74,7 @@ def fly(run: str, seed: int) -> dict[str, Flown]:
 def navigate(chosen: Scenario, seed: int) -> dict[str, Flown]:
     """Every estimator of a scenario, by name, all of them started with the same errors."""
     rate = round(chosen.truth.rate_hz)
-    source = loop.motion(chosen, seed)
+    source = motion(chosen, seed)
     sensed = {name: sensors.build(name, config, rate, seed, chosen.site()) for name, config in chosen.sensors.items()}
     faults = Faults(chosen.fault, chosen.sensors, seed)
     filters = registry.build(chosen.estimator, chosen.rig(seed))

@@ -46,13 +46,15 @@ import numpy.typing as npt
 from nav import earth
 from nav.detection import Verdict
 from nav.local_filter import ISOLATED, OUTSIDE
-from nav.samples import Array, FixType, Status
+from nav.samples import Array, Status, has_fix
 from testbed.errors import UserError
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
 from testbed.results import write_result
 from testbed.scenario import Scenario
+from testbed.schema import LONGEST_RUN_S
 from testbed.sensors.faults import FaultTruth
+from testbed.sensors.timing import patience
 
 if TYPE_CHECKING:
     import xarray
@@ -63,7 +65,6 @@ RECOVERED_M = 5.0  # horizontal error that counts as recovered
 RECOVERED_HOLD_S = 30.0  # and for how long it has to stay there
 OUTAGE_MARKS_S = (60, 120, 300, 600)
 SAME_TIME_S = 1e-6
-SILENT = 2.5  # sample intervals without a sample, after which a receiver counts as having no fix
 SUSTAINED_S = 2.0  # for how long an alarm has to go on to be a sustained one,
 SUSTAINED_SHARE = 0.8  # and at how many of the looks
 ON_CIRCLE_M = 5.0  # as near as guidance keeps to it in light turbulence
@@ -249,19 +250,19 @@ def outages(dataset: xarray.DataTree) -> list[Window]:
     receivers = _receivers(dataset)
     for name in receivers:
         t = column(dataset, f"sensors/{name}/time")
-        fix = column(dataset, f"sensors/{name}/fix_type") > FixType.NO_FIX
+        fix = np.asarray(has_fix(column(dataset, f"sensors/{name}/fix_type")))
         when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), t)
-        interval = float(np.median(np.diff(t))) if len(t) > 1 else np.inf
-        silent = np.flatnonzero(np.diff(t, append=column(dataset, "truth/time")[-1]) > SILENT * interval)
+        interval = float(np.median(np.diff(t))) if len(t) > 1 else LONGEST_RUN_S
+        silent = np.flatnonzero(np.diff(t, append=column(dataset, "truth/time")[-1]) > patience(1 / interval))
         fix, when = np.insert(fix, silent + 1, False), np.insert(when, silent + 1, t[silent] + interval)
         first = np.flatnonzero(np.diff(fix, prepend=~fix[:1]))
         changes += [(float(when[k]), name, bool(fix[k])) for k in first]
-    has_fix: dict[str, bool] = {}
+    fixes: dict[str, bool] = {}
     windows: list[Window] = []
     start: float | None = None
     for t_change, name, fixed in sorted(changes):
-        has_fix[name] = fixed
-        if start is None and not any(has_fix.values()):
+        fixes[name] = fixed
+        if start is None and not any(fixes.values()):
             start = t_change
         elif start is not None and fixed:
             windows.append((start, t_change))

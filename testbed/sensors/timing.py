@@ -19,6 +19,7 @@ from testbed.schema import Section
 from testbed.sensors.noise import Process, stream
 from testbed.sensors.units import PERCENT
 
+SILENT_S = 0.5  # beyond its period, or half of it if that is longer, before a sensor that says nothing is silent
 TICK_TOLERANCE = 1e-6  # of a tick: what 1/3 Hz and 0.1 s lose as decimal numbers
 
 
@@ -57,6 +58,11 @@ class AidingTiming(Section):
     rate_hz: float = Field(10.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
     offset_s: float = Field(0.0, ge=0, le=3600, description="time of the first sample, a whole number of ticks")
     latency_s: float = Field(0.0, ge=0, le=10, description="from the time of validity to the time of arrival")
+
+
+def patience(rate_hz: float) -> float:
+    """After how long [s] without a sample a sensor of this rate counts as silent, everywhere in the house."""
+    return 1 / rate_hz + max(SILENT_S, 0.5 / rate_hz)
 
 
 @dataclass(frozen=True, slots=True)

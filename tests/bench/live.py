@@ -14,7 +14,7 @@ from typing import Any
 
 from bench.measure import MAIN, TWO_ESTIMATORS, Effort, Row
 
-from testbed.loop import loop
+from testbed.loop import links, loop
 from testbed.scenario import Scenario
 
 LIVE_S = 25
@@ -62,7 +62,7 @@ def live(effort: Effort) -> Iterator[Row]:
 class _Timed:
     """A publisher, and the processor time that it takes."""
 
-    def __init__(self, publisher: loop.Publisher) -> None:
+    def __init__(self, publisher: links.Publisher) -> None:
         self.period_s, self.asks = publisher.period_s, publisher.asks
         self.seconds = 0.0
         self.publish = self._timed(publisher.publish)

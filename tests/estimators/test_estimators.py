@@ -19,7 +19,7 @@ from nav.unscented import Scaling
 from nav.weighting import MahalanobisInflation, SageHusa
 from testbed import Scenario, papers, run
 from testbed.errors import UserError
-from testbed.loop.loop import motion
+from testbed.feeds.simulated import motion
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import KinematicStart
 from testbed.score import metrics

@@ -14,6 +14,7 @@ from worlds.loop import Watcher, same
 from nav.samples import FixType, GnssSample, Sample
 from testbed import Scenario, results, run, sensors
 from testbed.errors import UserError
+from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.motion import flight
 from testbed.motion.table import MotionSource, TruthBlock
@@ -86,7 +87,7 @@ def test_crash_leaves_a_readable_record(tmp_path: Path) -> None:
             return ""
 
     with pytest.raises(RuntimeError, match="simulator broke"):
-        run(scenario, out=tmp_path, source=Failing(loop.motion(scenario, scenario.seed)))
+        run(scenario, out=tmp_path, source=Failing(motion(scenario, scenario.seed)))
     dataset = record.load(tmp_path / "run.nc")
     t = dataset["estimators/ins"]["time"].values
     assert t[0] == 0.0
@@ -168,7 +169,7 @@ def test_what_an_earlier_run_left_goes_when_the_next_one_starts(tmp_path: Path) 
         rate_hz, failure = 200.0, ""
 
         def __init__(self, rows: int) -> None:
-            self.inner, self.left = loop.motion(scenario, 1), rows
+            self.inner, self.left = motion(scenario, 1), rows
 
         def advance(self, ticks: int) -> TruthBlock:
             if not self.left:

@@ -515,11 +515,11 @@ def test_what_is_asked_with_a_restart_is_asked_of_the_run_that_begins() -> None:
 
 
 def test_a_motion_that_was_handed_over_is_not_begun_anew() -> None:
-    from testbed.loop import loop
+    from testbed.feeds.simulated import motion
 
     short = scenario(6)
     station = Station([(2.0, Restart()), (2.0, Change("SIM_WIND_SPD", 5.0))])
-    result = run(short, links=[station], source=loop.motion(short, 1))
+    result = run(short, links=[station], source=motion(short, 1))
     assert "refused: this motion can't be flown again" in station.told()
     assert len(result.dataset["truth/time"]) == 61
 

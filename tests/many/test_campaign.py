@@ -24,6 +24,7 @@ from worlds import synthetic_run
 from testbed import Scenario, run
 from testbed.__main__ import app
 from testbed.errors import UserError
+from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.many import campaign as campaigns
 from testbed.many.campaign import Combination, Failure, Outcome, Progress, campaign
@@ -161,7 +162,7 @@ def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
 def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
     overrides = ["duration_s=30", "truth.wind.turbulence=none"]
     scenario = Scenario.load("u_turn", overrides)
-    save_motion(loop.motion(scenario, scenario.seed), 30 * 200 + 1, tmp_path / "truth")
+    save_motion(motion(scenario, scenario.seed), 30 * 200 + 1, tmp_path / "truth")
     direct = run(scenario, seed=5)
     replayed = run(scenario, seed=5, source=Replay(tmp_path / "truth"))
     for node in direct.dataset.subtree:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from nav import earth, strapdown
 from testbed.errors import UserError
-from testbed.loop.loop import motion
+from testbed.feeds.simulated import motion
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import KinematicStart
 from testbed.motion.segments import lay_track

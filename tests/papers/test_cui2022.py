@@ -21,7 +21,7 @@ from nav.local_filter import GnssAid, LocalFilter, Seat
 from nav.samples import Array, FixType, GnssSample
 from testbed import papers, run
 from testbed.estimators.datasheet import imu_model
-from testbed.loop.loop import motion
+from testbed.feeds.simulated import motion
 from testbed.papers import Claim, cui2022
 from testbed.scenario import Scenario
 from testbed.score import metrics

@@ -13,7 +13,7 @@ from worlds.lanes import lanes
 
 from nav.federated import Federated
 from testbed import papers
-from testbed.loop.loop import motion
+from testbed.feeds.simulated import motion
 from testbed.papers import zhou2025
 from testbed.papers.zhou2025 import (
     CASES,

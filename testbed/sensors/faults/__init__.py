@@ -37,7 +37,7 @@ from pydantic import Field, field_validator
 
 from nav.earth import isa_pressure, pressure_altitude
 from nav.rotation import quat_from_rotvec, quat_multiply
-from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
+from nav.samples import Array, GnssSample, ImuSamples, Sample
 from testbed.schema import Section
 from testbed.sensors.gnss import displaced
 from testbed.sensors.noise import stream
@@ -563,7 +563,7 @@ class _Running:
     def act(self, sample: Any) -> Any:
         """What becomes of a sample, None when it is lost."""
         fault = self._fault
-        if isinstance(sample, GnssSample) and sample.fix_type is FixType.NO_FIX and not isinstance(fault, _Losing):
+        if isinstance(sample, GnssSample) and not sample.has_fix and not isinstance(fault, _Losing):
             return sample  # there is nothing in it that could be wrong
         if isinstance(fault, (Stuck, Delay)):
             self._remember(fault, sample)

@@ -1,0 +1,64 @@
+"""What a run is made of, whoever makes it: the reference motion, and what every sensor delivered on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+from nav.samples import ImuSamples, Sample
+from testbed.estimators.lane import Tracked
+from testbed.motion.table import MotionSource, TruthBlock
+from testbed.sensors import AidingSensor
+from testbed.sensors.faults import Faults
+
+
+class Turn(NamedTuple):
+    """What came of some ticks: the reference, increments by IMU, and the samples by aiding sensor.
+
+    ``tracked`` is what those estimators made of it that the motion itself follows; the others run in the loop.
+    """
+
+    reference: TruthBlock
+    imu: Mapping[str, ImuSamples]
+    samples: Mapping[str, Sequence[Sample]]
+    tracked: Mapping[str, Tracked] = {}
+
+
+class Feed(Protocol):
+    """A source of turns. ``faults``, ``aiding`` and ``source`` are what requests act on (`testbed.loop.requests`)."""
+
+    rate_hz: float
+    faults: Faults
+    aiding: dict[str, AidingSensor]
+    source: MotionSource
+
+    @property
+    def motion_s(self) -> float:
+        """Wall time [s] that the motion took so far."""
+        ...
+
+    @property
+    def failure(self) -> str:
+        """Why the motion ended early, empty when it did not."""
+        ...
+
+    def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
+        """The next ``ticks`` rows, fewer when the motion ends; estimates are needed of the rows ``wanted``."""
+        ...
+
+    def activity(self) -> str:
+        """What is going on at the end of the newest turn."""
+        ...
+
+    def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
+        """Remove and give its own events (time, severity, text) up to a time."""
+        ...
+
+    def remark(self) -> str:
+        """What else the caller should know at the end, empty when nothing."""
+        ...
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+        ...

@@ -1,0 +1,121 @@
+"""What a run has to tell: denial and reacquisition, silence, refusals, alignment, legs, faults, an early end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from nav.samples import Estimate, GnssSample, Sample, Status, UpdateReport
+from testbed.scenario import Scenario
+from testbed.sensors.faults import FaultTruth
+from testbed.sensors.imu import ImuConfig
+from testbed.sensors.timing import patience
+
+REFUSALS = 10  # of an aid in a row, before it is worth an event
+Emit: TypeAlias = Callable[[float, str, str], None]  # time [s], severity, text
+
+BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time
+
+
+@dataclass(slots=True)
+class EventWatch:
+    """Turns changes in samples, reports, estimates and legs into events."""
+
+    emit: Emit
+    faults: Sequence[FaultTruth] = ()
+    patience: dict[str, float] = field(default_factory=dict)  # how long an aiding sensor may say nothing
+    heard: dict[str, float] = field(default_factory=dict)  # when it last did, or at first should
+    silent: set[str] = field(default_factory=set)
+    fix: dict[str, bool] = field(default_factory=dict)
+    aligned: dict[str, bool] = field(default_factory=dict)
+    refusals: dict[tuple[str, str], int] = field(default_factory=dict)  # in a row
+    unsound: dict[tuple[str, str], float] = field(default_factory=dict)  # when last reported
+    leg: float = -2.0
+    t: float = -math.inf
+
+    @classmethod
+    def of(cls, emit: Emit, faults: Sequence[FaultTruth], scenario: Scenario) -> EventWatch:
+        """The watch over the sensors of a scenario."""
+        aiding = {name: one for name, one in scenario.sensors.items() if not isinstance(one, ImuConfig)}
+        return cls(
+            emit,
+            faults,
+            {name: patience(one.rate_hz) for name, one in aiding.items()},
+            {name: one.offset_s + one.latency_s for name, one in aiding.items()},
+        )
+
+    @property
+    def denied(self) -> bool:
+        """Whether no GNSS receiver has a fix, or says so; one that has said nothing yet doesn't count."""
+        return bool(self.fix) and not any(has and name not in self.silent for name, has in self.fix.items())
+
+    def sample(self, sample: Sample) -> None:
+        """A sample has arrived: it may end a silence or a denial, or begin one."""
+        if sample.sensor in self.silent:
+            self.silent.remove(sample.sensor)
+            self.emit(sample.t_arrival, "info", f"{sample.sensor} heard again")
+        self.heard[sample.sensor] = sample.t_arrival
+        if not isinstance(sample, GnssSample):
+            return
+        before = self.fix.get(sample.sensor)
+        if before is not None and before != sample.has_fix:
+            severity, what = ("info", "reacquired") if sample.has_fix else ("warning", "denied")
+            self.emit(sample.t, severity, f"{sample.sensor} {what}")
+        self.fix[sample.sensor] = sample.has_fix
+
+    def report(self, estimator: str, report: UpdateReport) -> None:
+        """An unsound sample is an event; the gate turns a sound one away now and then, so only a run of those is."""
+        what = report.aid if report.aid.startswith(report.sensor) else f"{report.aid} of {report.sensor}"
+        key = (estimator, what)
+        if report.weight > 0.0:
+            if self.refusals.pop(key, 0) >= REFUSALS:
+                self.emit(report.t, "info", f"{estimator}: {what} accepted again")
+        elif math.isnan(report.nis):
+            key = (estimator, report.sensor)  # a sample may serve several aids
+            if report.t - self.unsound.get(key, -BAD_SAMPLE_QUIET_S) >= BAD_SAMPLE_QUIET_S:
+                self.emit(report.t, "warning", f"{estimator}: {report.sensor} refused, {report.reason}")
+                self.unsound[key] = report.t
+        else:
+            self.refusals[key] = self.refusals.get(key, 0) + 1
+            if self.refusals[key] == REFUSALS:
+                text = f"{estimator}: {what} refused {REFUSALS} times in a row, {report.reason}"
+                self.emit(report.t, "warning", text)
+
+    def estimate(self, estimator: str, estimate: Estimate) -> None:
+        """An estimator may have aligned."""
+        aligned = Status.ALIGNED in estimate.status
+        if aligned and not self.aligned.get(estimator, False):
+            self.emit(estimate.t, "info", f"{estimator} aligned")
+        self.aligned[estimator] = aligned
+
+    def row(self, t: float, leg: float, plan: Sequence[str]) -> None:
+        """The run has come to ``t``: a leg may have begun, a sensor be overdue, a fault begin or end."""
+        if leg != self.leg and 0 <= leg < len(plan):
+            self.emit(t, "info", f"leg {int(leg) + 1}/{len(plan)} {plan[int(leg)]}")
+        self.leg = leg
+        for name, most in self.patience.items():
+            if name not in self.silent and t > self.heard[name] + most:
+                self.silent.add(name)
+                self.emit(t, "warning", f"{name} silent")
+        edges = [(one.start, "begins", one) for one in self.faults] + [(one.end, "ends", one) for one in self.faults]
+        for when, what, one in sorted(edges, key=lambda edge: edge[0]):
+            if self.t < when <= t:
+                self.emit(when, "info", f"fault {one.name} {what}: {one}")
+        self.t = t
+
+
+def plan_flown(scenario: Scenario, end: float) -> tuple[str, str]:
+    """Severity and text of a plan that ended before the run; a denial that it never reached is worth a warning."""
+    text = f"plan flown: the run ends at {end:.0f} s of {scenario.duration_s:g} s"
+    missed = [
+        f"{name} denied from {window[0]:g} s"
+        for name, config in scenario.sensors.items()
+        for window in getattr(config, "denied", ())
+        if window[0] >= end
+    ]
+    missed += [
+        f"fault of {fault.sensor} from {fault.window[0]:g} s" for fault in scenario.fault if fault.window[0] >= end
+    ]
+    return ("warning", f"{text}, before {', '.join(missed)}") if missed else ("info", text)

@@ -1,0 +1,113 @@
+"""Whoever watches a run, and how all of them are told."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from testbed.errors import UserError
+from testbed.loop.requests import Request
+from testbed.motion.table import TruthBlock
+from testbed.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a run stands: simulated time and duration [s], simulated over wall time, what is going on."""
+
+    t: float
+    duration: float
+    realtime_factor: float
+    activity: str
+
+
+class Publisher(Protocol):
+    """Whoever watches a run: handed plain data every ``period_s`` of simulated time.
+
+    ``asks`` says whether it may ever ask for something; without, `requests` is not called.
+    """
+
+    period_s: float
+    asks: bool
+
+    def publish(
+        self,
+        truth: TruthBlock,
+        estimate: Estimate,
+        samples: Mapping[str, Sample],
+        imu: ImuSamples | None,
+        others: Sequence[tuple[str, Estimate]],
+        reports: Sequence[UpdateReport],
+    ) -> None:
+        """One row of truth; the shown estimator's estimate and its reports since the last call; the newest sample of
+        each sensor; increments up to the row or beyond; the other estimators' estimates.
+        """
+        ...
+
+    def requests(self) -> Sequence[Request]:
+        """Answer what has come in since the last call, and hand over what is asked of the run; never waits.
+
+        Called before every turn, and while the run is paused every 20 ms of wall time.
+        """
+        ...
+
+    def settings(self, values: Mapping[str, float]) -> None:
+        """The values in force of what may change (`testbed.loop.requests.settings`): first and at each change."""
+        ...
+
+    def event(self, t: float, severity: str, text: str) -> None:
+        """Something happened at ``t``; severity is info, warning or error."""
+        ...
+
+    def close(self) -> None:
+        """The run is over."""
+        ...
+
+
+def shown_estimator(scenario: Scenario, asked: str | None = None) -> str:
+    """The estimator that links show: the one asked for, or the first. Raises UserError when there is none such."""
+    names = [one.name for one in scenario.estimator]
+    if not names:
+        raise UserError("the scenario has no [[estimator]], so a link has nothing to show: add one, or leave it out")
+    if asked is None:
+        return names[0]
+    if asked not in names:
+        raise UserError(f"--estimator {asked}: the scenario has no such estimator: choose from {', '.join(names)}")
+    return asked
+
+
+@dataclass(slots=True)
+class Listeners:
+    """All that are told of a run: its ``links``, its record by ``write_event``, and who asked for progress."""
+
+    links: Sequence[Publisher]
+    progress: Callable[[Progress], None] | None
+    duration_s: float
+    write_event: Callable[[float, str, str], None]
+    started: float = field(default_factory=time.perf_counter)  # wall time
+
+    def emit(self, t: float, severity: str, text: str) -> None:
+        """Tell and record an event."""
+        self.write_event(t, severity, text)
+        for link in self.links:
+            link.event(t, severity, text)
+
+    def say(self, t: float, severity: str, text: str) -> None:
+        """Tell what is no part of the record: how the run is paced."""
+        for link in self.links:
+            link.event(t, severity, text)
+        self.advance(t, text)
+
+    def settings(self, values: Mapping[str, float]) -> None:
+        """Tell the values in force of what may change."""
+        for link in self.links:
+            link.settings(values)
+
+    def advance(self, t: float, activity: str) -> None:
+        """Tell how far the run has come."""
+        if self.progress is not None:
+            factor = t / max(time.perf_counter() - self.started, 1e-9)
+            self.progress(Progress(t, self.duration_s, factor, activity))
