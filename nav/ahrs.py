@@ -45,6 +45,7 @@ from nav.samples import (
     Estimate,
     ImuSamples,
     MagnetometerSample,
+    Outcome,
     Sample,
     Status,
     UpdateReport,
@@ -466,12 +467,14 @@ def _fuse(s: _State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: s
     """Update the error states with ``z`` = H x + noise."""
     nu = z - H @ s.x
     S, nis = update(s.x, s.P, H, R, nu, math.inf)
-    return UpdateReport(t, sensor, aid, nu, S, nis, math.inf, 1.0)
+    return UpdateReport(t, sensor, aid, nu, S, nis, math.inf, 1.0, Outcome.FUSED)
 
 
 def _refused(sample: Sample, reason: str) -> UpdateReport:
     aid = MAGNETIC_HEADING if isinstance(sample, MagnetometerSample) else KINDS[type(sample)]
-    return UpdateReport(sample.t, sample.sensor, aid, np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, reason)
+    return UpdateReport(
+        sample.t, sample.sensor, aid, np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, Outcome.UNSOUND, reason
+    )
 
 
 def _azimuth(x_n: Array) -> float:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from enum import Enum
+from enum import Enum, auto
 from functools import cache
 from typing import NamedTuple, Protocol
 
@@ -540,10 +540,10 @@ class ChiSquareGate:
 class Verdict(Enum):
     """What to do with a GNSS fix."""
 
-    FUSE = ""
-    REJECT = "outside the gate"
-    PROBATION = "on probation after an outage"
-    RECOVER = "outside the gate, but consistent for long: covariance reset"
+    FUSE = auto()
+    REJECT = auto()  # outside the gate
+    PROBATION = auto()  # not to be used before it has been consistent for a while after an outage
+    RECOVER = auto()  # outside the gate, but consistent for so long that the filter must be wrong
 
 
 @dataclass

@@ -81,7 +81,6 @@ from nav.alignment import AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import (
-    ISOLATED,
     OUTSIDE,
     Aid,
     AirspeedAid,
@@ -90,9 +89,12 @@ from nav.local_filter import (
     LocalFilter,
     Look,
     MagnetometerAid,
+    Ruling,
     Watch,
     Watched,
     refusals,
+    report_on,
+    without_position,
 )
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -118,6 +120,7 @@ from nav.samples import (
     Estimate,
     GnssSample,
     ImuSamples,
+    Outcome,
     Sample,
     Status,
     UpdateReport,
@@ -422,7 +425,7 @@ class Federated:
     def _use(self, state: State, filter_: LocalFilter, sample: Sample) -> list[UpdateReport]:
         aid = filter_.aids[sample.sensor]
         reports: list[UpdateReport] = []
-        withheld = ""
+        withheld: Ruling | None = None
         for part, _ in aid.parts:
             look = filter_.look(self._reference, state, aid, part, sample)
             if look is None:
@@ -432,19 +435,20 @@ class Federated:
                 if report.weight > 0:
                     self._last_fused, self._last_refused = sample.t, -math.inf
                 else:
-                    withheld = f"position {report.reason}"
+                    withheld = without_position(Ruling(report.outcome, report.reason))
                     self._recover(state, sample)
             reports.append(report)
         return reports
 
     def _use_look(
-        self, state: State, filter_: LocalFilter, sample: Sample, part: str, look: Look, withheld: str
-    ) -> UpdateReport:
+        self, state: State, filter_: LocalFilter, sample: Sample, part: str, look: Look,
+        withheld: Ruling | None,
+    ) -> UpdateReport:  # fmt: skip
         t, watch = sample.t, filter_.watches[sample.sensor, part]
         nu, S, nis = filter_.innovate(state, look)
         withheld = withheld or look.withheld
-        if look.withheld:
-            return UpdateReport(t, sample.sensor, part, nu, S, nis, math.nan, 0.0, withheld)
+        if withheld is not None and look.withheld is not None:
+            return report_on(sample, part, nu, S, nis, math.nan, withheld)
         watches = filter_.of_sensor[sample.sensor]
         suspect = any(w.suspect for w in watches)
         judged = self._against_master(state, filter_, sample, part) if suspect else (nu, S)
@@ -461,17 +465,18 @@ class Federated:
                 look = again
                 nu, S, nis = filter_.innovate(state, look)
         suspect, out = any(w.suspect for w in watches), any(w.out for w in watches)
-        weight, reason = 0.0, withheld
-        if not withheld and not out:
+        isolated = Ruling(Outcome.ISOLATED, "isolated")
+        ruling = withheld or isolated
+        if withheld is None and not out:
             used = decision.axis_mask & ~watch.isolated if suspect else decision.axis_mask
             policy = self._policy(filter_, watch)
-            weight, reason = filter_.take(self._reference, state, look, nu, S, used, watch.noise, policy, t)
+            ruling = filter_.take(self._reference, state, look, nu, S, used, watch.noise, policy, t)
         if out or watch.suspect:
-            reason = ISOLATED
-        elif decision.alarm and not withheld:
-            reason = OUTSIDE
+            ruling = isolated._replace(weight=ruling.weight)
+        elif decision.alarm and withheld is None:
+            ruling = OUTSIDE._replace(weight=ruling.weight)
         threshold = decision.threshold if math.isclose(decision.statistic, nis, rel_tol=1e-6) else math.nan
-        return UpdateReport(t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
+        return report_on(sample, part, nu, S, nis, threshold, ruling)
 
     def _policy(self, filter_: LocalFilter, watch: Watch) -> Policy | None:
         """What becomes of R in the look that ``watch`` has just judged: its own policy, then the normalised weight."""

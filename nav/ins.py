@@ -19,6 +19,7 @@ from nav.alignment import AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
 from nav.error_model import POS, VEL, Block, ImuModel
 from nav.local_filter import (
+    OUTSIDE,
     Aid,
     AirspeedAid,
     BarometerAid,
@@ -27,8 +28,11 @@ from nav.local_filter import (
     LocalFilter,
     MagnetometerAid,
     Policy,
+    Ruling,
     aid_blocks,
     refusals,
+    report_on,
+    without_position,
 )
 from nav.motion import TurnDetector
 from nav.reference import (
@@ -56,6 +60,7 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    Outcome,
     Sample,
     Status,
     UpdateReport,
@@ -70,6 +75,13 @@ KINDS: dict[type[Sample], str] = {
     BarometerSample: "barometer",
     MagnetometerSample: "magnetometer",
     AirspeedSample: "airspeed",
+}
+
+RULINGS = {
+    Verdict.FUSE: Ruling(Outcome.FUSED, weight=1.0),
+    Verdict.REJECT: OUTSIDE,
+    Verdict.PROBATION: Ruling(Outcome.WITHHELD, "on probation after an outage"),
+    Verdict.RECOVER: Ruling(Outcome.FUSED, "outside the gate, but consistent for long: covariance reset", weight=1.0),
 }
 
 
@@ -356,16 +368,15 @@ class Ins:
         use_velocity = with_velocity and self.config.gnss_use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
-        weight, reason = 0.0, verdict.value
+        ruling = RULINGS[verdict]
         if verdict is Verdict.FUSE:
-            weight, reason = self._filter.weigh(self._reference, state, sample, "gnss_position", look, S)
+            ruling = self._filter.weigh(self._reference, state, sample, "gnss_position", look, S)
         elif verdict is Verdict.RECOVER:
-            weight = 1.0
             wide = self._filter.look(self._reference, state, aid, "gnss_position", sample)
             assert wide is not None
             S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
-        withheld = "" if weight else f"position {reason}"
-        reports = [UpdateReport(sample.t, sample.sensor, "gnss_position", nu, S, nis, threshold, weight, reason)]
+        withheld = None if ruling.weight else without_position(ruling)
+        reports = [report_on(sample, "gnss_position", nu, S, nis, threshold, ruling)]
         if use_velocity:
             velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None

@@ -31,6 +31,7 @@ from nav.samples import (
     BodyVelocitySample,
     GnssSample,
     MagnetometerSample,
+    Outcome,
     PositionSample,
     Sample,
     StarSample,
@@ -43,8 +44,26 @@ Axes: TypeAlias = tuple[float, float, float]
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Watch`
-OUTSIDE, ISOLATED, LEFT_OUT = "outside the gate", "isolated", "left out by the measurement policy"
-NO_RATES = "how fast the sensor swings about the IMU isn't known before the first increment"
+
+
+class Ruling(NamedTuple):
+    """What becomes of one part of a sample: the last three fields of its `UpdateReport`."""
+
+    outcome: Outcome
+    reason: str = ""
+    weight: float = 0.0
+
+
+FUSED = Ruling(Outcome.FUSED, weight=1.0)
+OUTSIDE = Ruling(Outcome.OUTSIDE_GATE, "outside the gate")
+LEFT_OUT = Ruling(Outcome.WEAKENED, "left out by the measurement policy")
+TOO_SLOW = Ruling(Outcome.OUT_OF_RANGE, "too slow for the pitot tube")
+NO_RATES = Ruling(Outcome.WITHHELD, "how fast the sensor swings about the IMU isn't known before the first increment")
+
+
+def without_position(position: Ruling) -> Ruling:
+    """What becomes of the velocity of a fix whose position was not used."""
+    return Ruling(Outcome.WITHHELD, f"position {position.reason}")
 
 
 class Policy(Protocol):
@@ -60,7 +79,9 @@ class Policy(Protocol):
 
 
 class Look(NamedTuple):
-    """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,), why it must not be used.
+    """A measurement at the nominal state: innovation (m,), Jacobian (m, n), variances (m,).
+
+    ``withheld`` says why it must not be used, None when it may.
 
     ``at_points`` (7, m) are the innovations at the sigma points of an unscented filter; ``told`` (m,) are the variances
     as the sensor has them, where R is what they were learned to be.
@@ -69,7 +90,7 @@ class Look(NamedTuple):
     nu: Array
     H: Array
     R: Array
-    withheld: str = ""
+    withheld: Ruling | None = None
     at_points: Array | None = None
     told: Array | None = None
 
@@ -183,7 +204,7 @@ class GnssAid:
             state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven,
             self.arm, seat.starts[1], sample.v_n,
         )  # fmt: skip
-        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else ""
+        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         return Look(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]), unknown)
 
     def _course(self, sample: GnssSample, seat: Seat) -> Look | None:
@@ -310,7 +331,7 @@ class AirspeedAid:
         """See `Aid`."""
         assert isinstance(sample, AirspeedSample)
         state, (wind, gust, scale) = seat.state, seat.starts
-        slow = "" if sample.eas >= self.minimum else "too slow for the pitot tube"
+        slow = None if sample.eas >= self.minimum else TOO_SLOW
         if part == "airspeed":
             nu, H = aiding.airspeed(state.q_nb, state.v_n, state.lla, seat.x, wind, gust, scale, sample.eas)
             return Look(nu, H, self._R[0], slow)
@@ -367,7 +388,7 @@ class BodyVelocityAid:
         axes, R, nonholonomic, arm = self._told
         state, (scale, error) = seat.state, seat.starts
         there = state.q_nb, state.v_n, state.lla, seat.x, state.rates[0], state.errors, seat.reference.driven, arm
-        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else ""
+        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         if part == "nonholonomic":
             return Look(*aiding.nonholonomic(*there), nonholonomic, unknown)
         if not aiding.measures(sample, axes):
@@ -455,10 +476,20 @@ def refusals(sample: Sample, aid: Aid, reason: str, now: float) -> list[UpdateRe
     t = sample.t if math.isfinite(sample.t) else now
     return [
         UpdateReport(
-            t, sample.sensor, part, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan, 0.0, reason
+            t, sample.sensor, part, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan,
+            0.0, Outcome.UNSOUND, reason,
         )
         for part, m in aid.parts
-    ]
+    ]  # fmt: skip
+
+
+def report_on(
+    sample: Sample, part: str, nu: Array, S: Array, nis: float, threshold: float, ruling: Ruling
+) -> UpdateReport:
+    """The report on one part of a sample."""
+    return UpdateReport(
+        sample.t, sample.sensor, part, nu, S, nis, threshold, ruling.weight, ruling.outcome, ruling.reason
+    )
 
 
 @dataclass(frozen=True)
@@ -685,24 +716,22 @@ class LocalFilter:
         return S, nis
 
     def fuse(
-        self, reference: Reference, state: State, sample: Sample, part: str, look: Look, withheld: str = ""
-    ) -> UpdateReport:
-        """Gate, policy and correction of a closed filter, whatever ``withheld`` says against its use."""
+        self, reference: Reference, state: State, sample: Sample, part: str, look: Look,
+        withheld: Ruling | None = None,
+    ) -> UpdateReport:  # fmt: skip
+        """Gate, policy and correction of a closed filter; without correction where ``withheld`` says why."""
         withheld = withheld or look.withheld
         threshold = self.gate.threshold(len(look.nu))
         nu, H, R, at_points = look.nu, look.H, look.R, look.at_points
         simple = part not in self.policies and part not in self.fadings and part not in self.noises
         limit = threshold if simple and not withheld else -math.inf
         S, nis = self.absorb(reference, state, nu, H, R, limit, at_points)
-        reason = withheld or ("" if nis <= threshold else OUTSIDE)
-        weight = 0.0 if reason else 1.0
-        if not simple and not reason:
-            weight, reason = self.weigh(reference, state, sample, part, look, S)
-        return UpdateReport(sample.t, sample.sensor, part, nu, S, nis, threshold, weight, reason)
+        ruling = withheld or (FUSED if nis <= threshold else OUTSIDE)
+        if not simple and ruling is FUSED:
+            ruling = self.weigh(reference, state, sample, part, look, S)
+        return report_on(sample, part, nu, S, nis, threshold, ruling)
 
-    def weigh(
-        self, reference: Reference, state: State, sample: Sample, part: str, look: Look, S: Array
-    ) -> tuple[float, str]:
+    def weigh(self, reference: Reference, state: State, sample: Sample, part: str, look: Look, S: Array) -> Ruling:
         """Correct a closed filter with a look that passed its gate, as fading and policy say: see `take`."""
         fading = self.fadings.get(part)
         factor = fading.factor(look.nu, S) if fading is not None else 1.0
@@ -727,27 +756,28 @@ class LocalFilter:
         noise: SageHusa | None,
         policy: Policy | None,
         t: float,
-    ) -> tuple[float, str]:
-        """Correct with the ``used`` axes as far as the policy lets them: (mean factor on the information, reason).
+    ) -> Ruling:
+        """Correct with the ``used`` axes as far as the policy lets them; what was used teaches ``noise``.
 
-        What was used teaches ``noise``.
+        The weight is the mean factor on the information.
         """
         if policy is None and noise is None and used.all():
             self.absorb(reference, state, nu, look.H, look.R, math.inf, look.at_points)
-            return 1.0, ""
+            return FUSED
         R = np.where(used, look.R, np.inf)
         if policy is not None and used.any():
             R[used] = policy.adapt(nu[used], S[np.ix_(used, used)], look.R[used], t)
             used = np.isfinite(R)
             if not used.any():
-                return 0.0, LEFT_OUT
+                return LEFT_OUT
         if noise is not None:
             noise.learn(nu, S - np.diag(look.R), R)
         if used.any():
             at_points = None if look.at_points is None else look.at_points[:, used]
             self.absorb(reference, state, nu[used], look.H[used], R[used], math.inf, at_points)
         told = look.R if look.told is None else look.told
-        return float(np.mean(told / R)), ""
+        weight = float(np.mean(told / R))
+        return Ruling(Outcome.FUSED if weight >= 1.0 else Outcome.WEAKENED, weight=weight)
 
 
 @njit

@@ -31,6 +31,18 @@ def has_fix(fix_type: FixType | npt.NDArray[np.integer]) -> bool | npt.NDArray[n
     return fix_type >= FixType.FIX_3D
 
 
+class Outcome(IntEnum):
+    """What became of an aiding sample, or of the part of it that a report is on."""
+
+    FUSED = 0  # used as it is
+    WEAKENED = 1  # used with less information than it claims, as a measurement policy says; at weight 0 left out by it
+    OUTSIDE_GATE = 2  # its innovation was refused by gate or detector, on one axis at least
+    ISOLATED = 3  # its sensor is out of use, on one axis at least, until it has been sound for a while
+    WITHHELD = 4  # not used for another reason than itself, such as probation or a refused position
+    OUT_OF_RANGE = 5  # a sound reading, but where the sensor tells nothing: too slow for a pitot tube
+    UNSOUND = 6  # refused before an innovation was formed: no number, impossible, or too late
+
+
 class Status(IntFlag):
     """What an estimator says of itself."""
 
@@ -167,7 +179,7 @@ class UpdateReport:
     ``t`` is the sample's time of validity; ``aid`` the measurement's name, such as ``gnss_position``; ``innovation``
     (m,) = measurement - prediction; ``S`` (m, m) its covariance before the update; ``nis`` = innovation' S^-1
     innovation; ``threshold`` the gate for it; ``weight`` the factor on the information of the sample (1 taken as
-    it is, 0 rejected).
+    it is, 0 rejected), the mean over the axes; ``outcome`` what became of it, ``reason`` the same in words for people.
     """
 
     t: float
@@ -178,7 +190,8 @@ class UpdateReport:
     nis: float
     threshold: float
     weight: float
-    reason: str = ""  # why it was refused or weakened, empty when it was simply fused
+    outcome: Outcome
+    reason: str = ""  # why it was refused or weakened, empty when it was simply fused; no code reads it
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,14 +11,12 @@ import numpy as np
 
 from nav.alignment import InitialState
 from nav.horizon import FusionHorizon
-from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Handover
 from testbed.sensors.noise import stream
-
-VOTED_OUT, DISAGREE = "voted out", "the units left disagree"
 
 
 class Tracked(NamedTuple):
@@ -116,9 +114,10 @@ class Lane:
         return used, [
             UpdateReport(
                 ballot.t, name, "imu_parity", none, none.reshape(0, 0), float(statistic), ballot.threshold,
-                0.0 if failed else 1.0, VOTED_OUT if failed else DISAGREE if ballot.ambiguous else "",
+                *((0.0, Outcome.ISOLATED, "voted out") if failed else (1.0, Outcome.FUSED, doubt)),
             )
             for ballot in ballots
+            for doubt in ("the units left disagree" if ballot.ambiguous else "",)
             for name, statistic, failed in zip(self.imus, ballot.statistic, ballot.failed, strict=True)
         ]  # fmt: skip
 

@@ -47,10 +47,19 @@ import numpy as np
 from nav import aiding
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, pressure_altitude, radii, wrap_longitude
-from nav.local_filter import ISOLATED, OUTSIDE
 from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
-from nav.samples import AirspeedSample, Array, BarometerSample, Estimate, ImuSamples, Sample, Status, UpdateReport
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    Estimate,
+    ImuSamples,
+    Outcome,
+    Sample,
+    Status,
+    UpdateReport,
+)
 from testbed.estimators.lane import Lane, Tracked
 from testbed.feeds.feed import Turn
 from testbed.feeds.known import commanded, handed_over
@@ -283,7 +292,7 @@ class AirData:
     def advance(self, t: float) -> None:
         """Use what has arrived by ``t`` [s]."""
         for report in self._reports:
-            self._judge(report.weight > 0.0 and report.reason not in (OUTSIDE, ISOLATED))
+            self._judge(report.outcome in (Outcome.FUSED, Outcome.WEAKENED) and report.weight > 0.0)
         self._reports.clear()
         arrived = [sample for sample in self._coming if sample.t_arrival <= t]
         self._coming = [sample for sample in self._coming if sample.t_arrival > t]

@@ -12,8 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from nav.local_filter import ISOLATED, OUTSIDE
-from nav.samples import Array, Estimate, ImuSamples, Sample, Status, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, Status, UpdateReport
 from testbed.loop.requests import Request, settings
 from testbed.mavlink import messages, mission
 from testbed.mavlink.answers import Answers, Talk
@@ -329,8 +328,8 @@ class MavlinkPublisher:
         ratio = float(np.float64(report.nis) / report.threshold)
         self._ratios[report.aid] = math.sqrt(ratio) if ratio >= 0 else math.nan
         part = report.sensor, report.aid
-        self._isolated[part] = report.reason == ISOLATED
-        if report.reason == OUTSIDE:
+        self._isolated[part] = report.outcome is Outcome.ISOLATED
+        if report.outcome is Outcome.OUTSIDE_GATE:
             self._refused[part] = self._refused.get(part, 0) + 1
         elif report.weight > 0:
             self._refused[part] = 0

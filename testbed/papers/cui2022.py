@@ -21,8 +21,7 @@ from nav.detection import Detector, Eraim, Glr, chi_square_threshold
 from nav.earth import position_difference_n
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
-from nav.local_filter import ISOLATED
-from nav.samples import Array, Estimate
+from nav.samples import Array, Estimate, Outcome
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.estimators.federated import FederatedSection
@@ -175,17 +174,17 @@ def _errors(tree: xarray.DataTree, name: str) -> tuple[Array, dict[str, Array]]:
 
 
 def _looks(tree: xarray.DataTree, name: str, part: str) -> tuple[Array, Array, Array, Array]:
-    """Of the looks of one part the times, the chi-square statistics, the weights and the reasons, each (N,)."""
+    """Of the looks of one part the times, the chi-square statistics, the weights and the outcomes, each (N,)."""
     own = f"estimators/{name}/innovations/{part}"
-    t, nis, weight, reason = (column(tree, f"{own}/{key}") for key in ("sample_time", "nis", "weight", "reason"))
-    return t, nis, weight, reason.astype(str)
+    t, nis, weight, outcome = (column(tree, f"{own}/{key}") for key in ("sample_time", "nis", "weight", "outcome"))
+    return t, nis, weight, outcome
 
 
 def _refused(tree: xarray.DataTree, name: str) -> tuple[int, int, int]:
     """(looks with an axis refused, looks while an axis was isolated, all looks) of a run."""
     looks = [_looks(tree, name, part)[2:] for part in metrics.aids(tree, name)]
     refused, isolated = (sum(int(np.sum(m)) for m in which) for which in
-                         ([w < 1 for w, _ in looks], [r == ISOLATED for _, r in looks]))  # fmt: skip
+                         ([w < 1 for w, _ in looks], [o == Outcome.ISOLATED for _, o in looks]))  # fmt: skip
     return refused, isolated, sum(len(w) for w, _ in looks)
 
 

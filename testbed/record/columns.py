@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from nav.samples import FixType, Status
+from nav.samples import FixType, Outcome, Status
 from testbed.motion.table import COLUMNS
 
-FORMAT = "navigation-testbed run 1"
+FORMAT = "navigation-testbed run 2"
 
 # What the components of a vector mean: the labels of its dimension.
 AXES: dict[str, tuple[str, ...]] = {
@@ -184,7 +184,16 @@ REPORT = {
     "nis": Variable("1", "normalised innovation squared"),
     "threshold": Variable("1", "gate for nis"),
     "weight": Variable("1", "factor on the information of the sample: 1 taken as it is, 0 rejected"),
-    "reason": Variable("", "why it was refused or weakened, empty when simply fused", dtype="S64"),
+    "outcome": Variable(
+        "1",
+        "what became of the sample, -1 where nothing was written",
+        dtype="i1",
+        attributes={
+            "flag_values": " ".join(str(int(f)) for f in Outcome),
+            "flag_meanings": " ".join(f.name.lower() for f in Outcome),
+        },
+    ),
+    "reason": Variable("", "why it was refused or weakened, for people; empty when simply fused", dtype="S64"),
 }
 
 FAULT = {

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from testbed.errors import UserError
-from testbed.record.columns import AXES, FORMAT, Variable
+from testbed.record import format1
+from testbed.record.columns import AXES, FORMAT, REPORT, Variable
 from testbed.record.tables import Data
 
 if TYPE_CHECKING:
@@ -32,14 +33,25 @@ def load(path: Path) -> xarray.DataTree:
         raise UserError(f"{path}: not a record of a run (not netCDF-4/HDF5)")
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != FORMAT:
+            written = file.attrs.get("format")
+            if written not in (FORMAT, format1.FORMAT):
                 raise UserError(f"{path}: netCDF-4/HDF5, but not a record of a run of this version ({FORMAT!r})")
             columns: dict[str, dict[str, tuple[Variable, Data]]] = {}
             _read_group(file, "", columns)
             attributes = {name: _plain(value) for name, value in file.attrs.items()}
+        if written == format1.FORMAT:
+            _upgrade(columns)
         return tree(columns, attributes)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path}: damaged record ({error}); run the scenario again") from error
+
+
+def _upgrade(columns: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
+    """Give the reports of a record of the first format their outcomes."""
+    for path, group in columns.items():
+        if path.split("/")[2:3] == ["innovations"]:
+            reason, nis, weight = (group[name][1] for name in ("reason", "nis", "weight"))
+            group["outcome"] = REPORT["outcome"], format1.outcomes(reason, nis, weight)
 
 
 def _plain(value: Any) -> Any:

@@ -170,6 +170,7 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
                     block["innovation"][k], block["S"][k] = report.innovation, report.S
     for name in ("nis", "threshold", "weight"):
         block[name] = _scalars(reports, name)
+    block["outcome"] = _scalars(reports, "outcome", REPORT["outcome"].dtype)
     sensors = {r.sensor for r in reports}
     names = sensors if len(sensors) == 1 else [r.sensor for r in reports]
     block["sensor"] = np.resize(_text(list(names), REPORT["sensor"].dtype), len(reports))

@@ -577,7 +577,7 @@ def innovations(run: _Run, name: str) -> Figure | None:
         own = f"innovations/{aid}"
         t, weight = run.estimate(name, f"{own}/sample_time"), run.estimate(name, f"{own}/weight")
         S, z = run.estimate(name, f"{own}/S"), run.estimate(name, f"{own}/innovation")
-        refused = scores.refused(weight, run.estimate(name, f"{own}/reason").astype(str))
+        refused = scores.refused(weight, run.estimate(name, f"{own}/outcome"))
         gate = np.sqrt(run.estimate(name, f"{own}/threshold"))
         with np.errstate(invalid="ignore", divide="ignore"):
             normalised = z / np.sqrt(np.diagonal(S, axis1=1, axis2=2))

@@ -44,9 +44,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nav import earth
-from nav.detection import Verdict
-from nav.local_filter import ISOLATED, OUTSIDE
-from nav.samples import Array, Status, has_fix
+from nav.samples import Array, Outcome, Status, has_fix
 from testbed.errors import UserError
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
@@ -476,28 +474,25 @@ class _Reports:
     judged: Mask
 
 
-def refused(weight: Array, reason: npt.NDArray[np.str_]) -> Mask:
+def refused(weight: Array, outcome: npt.NDArray[Any]) -> Mask:
     """Which samples (N,) were not used, or not with every axis."""
-    return (weight <= 0) | np.isin(reason, (OUTSIDE, ISOLATED))
+    return (weight <= 0) | np.isin(outcome, (Outcome.OUTSIDE_GATE, Outcome.ISOLATED))
 
 
 def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     own = f"estimators/{estimator}/innovations/{aid}"
-    reason, value = column(dataset, f"{own}/reason").astype(str), column(dataset, f"{own}/nis")
+    outcome, value = column(dataset, f"{own}/outcome"), column(dataset, f"{own}/nis")
     weight = column(dataset, f"{own}/weight")
     used = weight > 0
-    tested = np.isfinite(value)  # an unsound sample has no innovation
-    withheld = np.char.endswith(reason, Verdict.PROBATION.value)
-    withheld |= np.char.startswith(reason, "position ") & tested  # velocity, whose position was refused
-    alarm = refused(weight, reason) & ~withheld
+    alarm = refused(weight, outcome) & (outcome != Outcome.WITHHELD)
     return _Reports(
         t=column(dataset, f"{own}/sample_time"),
         sensor=column(dataset, f"{own}/sensor").astype(str),
         nis=value,
         used=used,
-        gated=alarm & (reason == OUTSIDE),
+        gated=outcome == Outcome.OUTSIDE_GATE,
         alarm=alarm,
-        judged=(used | alarm) & tested,
+        judged=(used | alarm) & np.isfinite(value),  # an unsound sample has no innovation
     )
 
 

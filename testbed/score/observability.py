@@ -142,7 +142,7 @@ def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, in
         mine &= column(dataset, f"{own}/sensor").astype(str) == sensor
     total = total[mine]
     weight = np.repeat(total[:, None], m, axis=1)
-    cut = scores.refused(total, column(dataset, f"{own}/reason")[mine].astype(str))
+    cut = scores.refused(total, column(dataset, f"{own}/outcome")[mine])
     if cut.any():
         nu, S = (column(dataset, f"{own}/{what}")[mine][cut] for what in ("innovation", "S"))
         order = np.argsort(np.argsort(-np.abs(nu) / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), axis=1), axis=1)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from nav.local_filter import ISOLATED
+from nav.samples import Outcome
 from testbed import Scenario, run
 from testbed.score import metrics
 
@@ -31,9 +31,10 @@ NO_RESET = f'{{name="no_reset", kind="federated", structure="no_reset", locals={
 def fly(scenario: Scenario, seed: int) -> tuple[dict[str, float], dict[str, int]]:
     """Metrics of a run, and how many parts of samples each estimator had isolated."""
     result = run(scenario, seed=seed)
+    own = "estimators/{}/innovations/{}/outcome"
     isolated = {
         name: sum(
-            int(np.sum(metrics.column(result.dataset, f"estimators/{name}/innovations/{aid}/reason") == ISOLATED))
+            int(np.sum(metrics.column(result.dataset, own.format(name, aid)) == Outcome.ISOLATED))
             for aid in metrics.aids(result.dataset, name)
         )
         for name in metrics.names(result.dataset)

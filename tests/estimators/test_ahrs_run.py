@@ -20,11 +20,11 @@ from worlds.lanes import lanes
 
 from nav.ahrs import Ahrs
 from nav.motion import LowDynamics
-from nav.samples import AirspeedSample, UpdateReport
+from nav.samples import AirspeedSample, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
 from testbed.many import campaign
-from testbed.many.campaign import CampaignResult, Combination, Outcome
+from testbed.many.campaign import CampaignResult, Combination
 from testbed.mavlink import MavlinkPublisher
 from testbed.record import reader as record
 from testbed.record.export import export
@@ -193,7 +193,7 @@ def test_levelling_is_recorded_as_what_it_is(flown: Any) -> None:
 def test_a_sample_that_is_refused_is_recorded(tmp_path: Path) -> None:
     flight = scenario(AHRS, overrides=("duration_s=1",))
     refused = Ahrs(config(AHRS)).refuse(AirspeedSample(0.5, 0.5, math.nan), "not finite")
-    level = UpdateReport(1.0, "accelerometer", "level", np.zeros(2), np.eye(2), 0.0, math.inf, 1.0)
+    level = UpdateReport(1.0, "accelerometer", "level", np.zeros(2), np.eye(2), 0.0, math.inf, 1.0, Outcome.FUSED)
     recorder = Recorder(tmp_path / "run.nc", flight, 1)
     recorder.reports("ahrs", [*refused, level])
     recorder.close()
@@ -293,7 +293,7 @@ def test_a_campaign_counts_degrees(flown: Any, tmp_path: Path) -> None:
     assert np.nanmean(history["ahrs.nees"]) > 0.0
     own = Scenario.load("u_turn", [f"estimator=[{AHRS}, {INS}, {BLIND}, {GYROS}]", "expect={}"])
     combination = Combination({}, own)
-    outcomes = [Outcome(0, seed, result.metrics, history) for seed in (1, 2)]
+    outcomes = [campaign.Outcome(0, seed, result.metrics, history) for seed in (1, 2)]
     statistics = campaign_report.statistics([combination], outcomes)
     gathered = CampaignResult(tmp_path, [combination], outcomes, [], statistics)
     made = campaign_report.figures(gathered)

@@ -13,7 +13,7 @@ import pymap3d
 import pytest
 from worlds.loop import Watcher, same
 
-from nav.samples import AirspeedSample, BarometerSample, Estimate, UpdateReport
+from nav.samples import AirspeedSample, BarometerSample, Estimate, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import autopilot
@@ -242,8 +242,9 @@ def test_a_motion_flown_before_cant_follow() -> None:
 # --- air data
 
 
-def report(weight: float, reason: str = "") -> UpdateReport:
-    return UpdateReport(0.0, "airspeed", "airspeed", np.zeros(1), np.eye(1), 1.0, 9.0, weight, reason)
+def report(weight: float, outcome: Outcome | None = None) -> UpdateReport:
+    outcome = outcome if outcome is not None else Outcome.FUSED if weight else Outcome.OUTSIDE_GATE
+    return UpdateReport(0.0, "airspeed", "airspeed", np.zeros(1), np.eye(1), 1.0, 9.0, weight, outcome)
 
 
 def test_air_data_knows_only_what_has_arrived() -> None:
@@ -280,7 +281,7 @@ def test_an_airspeed_that_does_not_change_is_stuck(values: list[float], known: b
 def test_the_autopilot_trusts_the_airspeed_as_the_estimator_does() -> None:
     air = AirData("airspeed", "barometer", 0.0)
     assert hear(air, 0.0, 25.0, [report(1.0), report(0.0), report(0.0), report(1.0)]) == pytest.approx(25.0)
-    assert math.isnan(hear(air, 0.1, None, [report(0.0), report(0.5, "isolated"), report(0.0)]))
+    assert math.isnan(hear(air, 0.1, None, [report(0.0), report(0.5, Outcome.ISOLATED), report(0.0)]))
     assert math.isnan(hear(air, 0.2, 50.0, [report(1.0), report(1.0)]))
     assert 25.0 <= hear(air, 0.3, 26.0, [report(1.0)]) < 26.0
 

@@ -17,6 +17,7 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    Outcome,
     Status,
     UpdateReport,
 )
@@ -234,7 +235,9 @@ def broken_run(deal, status, fix):
     ]
     imu = ImuSamples(deal.vector(2), deal.vector(2), deal.vector(6).reshape(2, 3), deal.vector(6).reshape(2, 3))
     others = [("second", estimate(deal, status)), ("third", estimate(deal, status))]
-    reports = [UpdateReport(now, "gnss", "gnss_position", deal.vector(3), np.eye(3), deal(), deal(), 1.0)]
+    reports = [
+        UpdateReport(now, "gnss", "gnss_position", deal.vector(3), np.eye(3), deal(), deal(), 1.0, Outcome.FUSED)
+    ]
     return truth, estimate(deal, status), {s.sensor: s for s in samples}, imu, others, reports
 
 

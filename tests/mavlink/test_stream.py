@@ -33,6 +33,7 @@ from nav.samples import (
     AirspeedSample,
     BarometerSample,
     ImuSamples,
+    Outcome,
     Status,
     UpdateReport,
 )
@@ -358,7 +359,7 @@ def test_dead_reckoning_drops_the_absolute_position_flag(tmp_path):
 
 def test_innovations_over_their_gates(tmp_path):
     def report(aid, nis):
-        return UpdateReport(0.0, "any", aid, np.zeros(1), np.eye(1), nis, 4.0, 1.0)
+        return UpdateReport(0.0, "any", aid, np.zeros(1), np.eye(1), nis, 4.0, 1.0, Outcome.FUSED)
 
     now = [report("gnss_position", 1.0), report("gnss_velocity", 16.0), report("barometer", math.nan)]
     heard = log_of(tmp_path, range(1), reports=lambda t: now)
@@ -539,8 +540,8 @@ def test_several_links_say_the_same(tmp_path):
 # Health: what stations are told of sensors that fail
 
 
-def report(t, *, weight, reason):
-    return UpdateReport(t, "gnss", "gnss_position", np.zeros(3), np.eye(3), 30.0, 11.3, weight, reason)
+def report(t, *, weight, outcome):
+    return UpdateReport(t, "gnss", "gnss_position", np.zeros(3), np.eye(3), 30.0, 11.3, weight, outcome)
 
 
 def last(heard, name, field):
@@ -585,11 +586,11 @@ def test_slow_sensor_is_not_silent(tmp_path):
     assert all(message.onboard_control_sensors_health & bit for message in status)
 
 
-@pytest.mark.parametrize("how", ["isolated", "outside the gate"])
+@pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE])
 def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     def reports(t):
         doubted = 1.0 <= t < 3.0
-        return [report(t, weight=0.0, reason=how) if doubted else report(t, weight=1.0, reason="")]
+        return [report(t, weight=0.0, outcome=how) if doubted else report(t, weight=1.0, outcome=Outcome.FUSED)]
 
     heard = log_of(tmp_path, range(25), reports=reports)
     assert last(heard, "GNSS_INTEGRITY", "spoofing_state") == mav.GPS_SPOOFING_STATE_NOT_SPOOFED
@@ -600,12 +601,12 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert last(heard, "ESTIMATOR_STATUS", "flags") & mav.ESTIMATOR_GPS_GLITCH
     assert last(heard, "EKF_STATUS_REPORT", "flags") & mav.EKF_GPS_GLITCHING
     healthy = bool(last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS)
-    assert healthy == (how != "isolated")
-    assert [message.text for message in heard["STATUSTEXT"]] == ["gnss isolated"] * (how == "isolated")
+    assert healthy == (how is not Outcome.ISOLATED)
+    assert [message.text for message in heard["STATUSTEXT"]] == ["gnss isolated"] * (how is Outcome.ISOLATED)
     heard = log_of(tmp_path, range(110), reports=reports)
     assert last(heard, "GNSS_INTEGRITY", "spoofing_state") == mav.GPS_SPOOFING_STATE_NOT_SPOOFED
     assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
-    assert how != "isolated" or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
+    assert how is not Outcome.ISOLATED or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
 
 
 def test_receiver_without_fix_shows_as_jammed_not_spoofed(tmp_path):

@@ -24,7 +24,7 @@ from nav.federated import (
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import BarometerAid, GnssAid, LocalFilter, MagnetometerAid, Watched
-from nav.samples import BarometerSample, FixType, ImuSamples, Status
+from nav.samples import BarometerSample, FixType, ImuSamples, Outcome, Status
 from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
 INFORMATION = Config(CONSUMER, (Local("only", ()),))
@@ -346,7 +346,7 @@ def test_a_spoofed_receiver_is_isolated_and_readmitted(kind, structure, with_vel
     assert 221 < last.t < 224
     assert federated.isolated() == []
     north = [r for r in reports if r.sensor == "gnss" and r.aid == "gnss_position" and 120 < r.t < 220]
-    assert all(r.reason == "isolated" and r.weight < 1 for r in north)
+    assert all(r.outcome is Outcome.ISOLATED and r.weight < 1 for r in north)
     assert all(r.weight == 1 for r in reports if r.sensor == "gnss" and r.t > 224 and not r.reason)
     assert np.mean([r.weight for r in reports if r.sensor == "gnss2"]) > 0.995
     wrong, sigma = error(estimates[-1], truth), np.sqrt(np.diag(estimates[-1].covariance))
@@ -516,7 +516,7 @@ def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
     assert max(horizontal(estimates, truth, 50).values()) < 2.0
     during = [r for r in reports if r.sensor == "gnss" and 61 < r.t < 80]
     assert len(during) > 180
-    assert all((r.weight, r.reason) == (0.0, "isolated") for r in during)
+    assert all((r.weight, r.outcome) == (0.0, Outcome.ISOLATED) for r in during)
     assert {e.part for e in federated.events} == {"gnss_velocity"}
 
 

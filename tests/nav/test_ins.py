@@ -26,7 +26,7 @@ from nav.alignment import InitialState
 from nav.detection import GnssMonitor, Verdict
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Status
+from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
 
 ARM = (0.5, 0.1, -0.3)
 CONFIG = InsConfig(CONSUMER, gnss_arm_b=ARM, sideslip_sigma=None, gnss_use_velocity=True)
@@ -157,7 +157,7 @@ def test_outage_and_reacquisition():
     assert status[41.0] & Status.GNSS_FUSED
     assert status[43.0] & Status.DEAD_RECKONING
     assert status[92.0] & Status.GNSS_FUSED
-    assert [r.reason for r in reports if 90 <= r.t < 90.9] == ["on probation after an outage"] * 5
+    assert [r.outcome for r in reports if 90 <= r.t < 90.9] == [Outcome.WITHHELD] * 5
     assert max(e for t, e in errors.items() if t > 100) < 3.0
     assert not any(40 <= r.t < 90 for r in reports)
 
@@ -193,7 +193,7 @@ def test_a_filter_too_sure_of_itself_gives_in_to_consistent_gnss():
     errors = {round(e.t, 3): np.hypot(*error(e, truth)[:2]) for e in estimates}
     position = [r for r in reports if r.aid == "gnss_position" and r.t >= 90]
     assert errors[90.0] > 30
-    assert position[0].reason == "on probation after an outage"
+    assert position[0].outcome is Outcome.WITHHELD
     assert any("covariance reset" in r.reason for r in position)
     assert all(r.weight == 0 for r in position if r.t < 93.9)
     assert max(e for t, e in errors.items() if 97 < t < 100) < 5.0
@@ -260,6 +260,7 @@ def test_broken_samples_are_reported_and_not_fused():
         assert [r.aid for r in reports] == [aid for aid in sizes if aid.startswith(sample.sensor)]
         for report in reports:
             assert report.weight == 0
+            assert report.outcome is Outcome.UNSOUND
             assert report.reason
             assert report.S.shape == (sizes[report.aid], sizes[report.aid])
             assert report.innovation.shape == (sizes[report.aid],)
@@ -286,9 +287,9 @@ def test_slow_air_is_not_fused():
     ins = Ins(dataclasses.replace(CONFIG, sideslip_sigma=1.0), field)
     ins.start(true_start(flight(30)))
     reports = ins.update(AirspeedSample(0.0, 0.0, 2.0))
-    assert [(r.aid, r.weight, r.reason) for r in reports] == [
-        ("airspeed", 0.0, "too slow for the pitot tube"),
-        ("sideslip", 0.0, "too slow for the pitot tube"),
+    assert [(r.aid, r.weight, r.outcome) for r in reports] == [
+        ("airspeed", 0.0, Outcome.OUT_OF_RANGE),
+        ("sideslip", 0.0, Outcome.OUT_OF_RANGE),
     ]
     assert [r.weight for r in ins.update(AirspeedSample(0.0, 0.0, 25.0))] == [1.0, 1.0]
 

@@ -12,6 +12,7 @@ from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import AirspeedAid, BarometerAid, Change, GnssAid, LocalFilter, Watch, aid_blocks
+from nav.samples import Outcome
 
 
 class Scripted:
@@ -126,8 +127,8 @@ def test_an_infinite_variance_leaves_the_axis_out():
     sigma = np.sqrt(np.diag(estimate.covariance))
     assert sigma[1] > 3 * sigma[0]
     nothing, reports = run({"gnss_position": Times(math.inf, math.inf, math.inf)})
-    assert {(r.weight, r.reason) for r in reports if r.aid == "gnss_position"} == {
-        (0.0, "left out by the measurement policy")
+    assert {(r.weight, r.outcome, r.reason) for r in reports if r.aid == "gnss_position"} == {
+        (0.0, Outcome.WEAKENED, "left out by the measurement policy")
     }
     assert {r.weight for r in reports if r.aid == "gnss_velocity"} == {0.0}  # a position not used withholds it
     assert np.isfinite(error(nothing, flight(60))).all()

@@ -21,7 +21,7 @@ import xarray
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import ImuSamples, UpdateReport
+from nav.samples import ImuSamples, Outcome, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record
@@ -220,7 +220,7 @@ def test_a_report_without_innovation_keeps_its_place(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.nc", scenario(), 3)
     fused = synthetic_run._report(1.0, "gnss", "gnss_position", 3, np.random.default_rng(0))
     refused = UpdateReport(
-        np.nan, "gnss", "gnss_position", np.empty(0), np.empty((0, 0)), np.nan, np.nan, 0.0, "broken"
+        np.nan, "gnss", "gnss_position", np.empty(0), np.empty((0, 0)), np.nan, np.nan, 0.0, Outcome.UNSOUND, "broken"
     )
     for reports in ([refused], [fused, refused], [fused], [fused]):
         recorder.reports("ins", reports)
@@ -229,6 +229,7 @@ def test_a_report_without_innovation_keeps_its_place(tmp_path: Path) -> None:
     recorder.close()
     innovations = load(tmp_path / "run.nc")["estimators/ins/innovations"]
     assert innovations["gnss"]["reason"].values.tolist() == ["broken"] * 4
+    assert innovations["gnss"]["outcome"].values.tolist() == [Outcome.UNSOUND] * 4
     position = innovations["gnss_position"]
     assert position["reason"].values.tolist() == ["broken", "", "broken", "", ""]
     np.testing.assert_array_equal(np.isnan(position["innovation"].values[:, 0]), [True, False, True, False, False])

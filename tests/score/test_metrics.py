@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import FixType, GnssSample
+from nav.samples import FixType, GnssSample, Outcome
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.score import metrics
@@ -165,13 +165,12 @@ def test_error_at_marks_of_the_outage(run: Any, computed: dict[str, float]) -> N
     assert "ins.outage_position_horizontal_at_300s_m" not in computed
 
 
-def relabel(run: Any, aid: str, t: float, weight: float, reason: str, nis: float | None = None) -> None:
+def relabel(run: Any, aid: str, t: float, weight: float, outcome: Outcome, nis: float | None = None) -> None:
     """Make one report of a made-up run say something else."""
     reports = run[f"estimators/ins/innovations/{aid}"]
     k = int(np.flatnonzero(np.isclose(reports["sample_time"].values, t))[0])
     reports["weight"].values[k] = weight
-    reports["reason"] = reports["reason"].astype("U64")
-    reports["reason"].values[k] = reason
+    reports["outcome"].values[k] = outcome
     if nis is not None:
         reports["nis"].values[k] = nis
 
@@ -181,7 +180,7 @@ def take_all(run: Any, *aids: str) -> None:
     for aid in aids:
         reports = run[f"estimators/ins/innovations/{aid}"]
         reports["weight"].values[:] = 1.0
-        reports["reason"].values[:] = ""
+        reports["outcome"].values[:] = Outcome.FUSED
 
 
 def test_nis_is_of_all_that_the_gate_judged(run: Any, computed: dict[str, float]) -> None:
@@ -198,12 +197,12 @@ def test_what_was_withheld_is_not_the_gate_s() -> None:
     for aid in ("gnss_position", "gnss_velocity"):
         run[f"estimators/ins/innovations/{aid}"]["nis"].values[:] = 2.0
         take_all(run, aid)
-    relabel(run, "gnss_position", 70.0, 0.0, "outside the gate", 50.0)
-    relabel(run, "gnss_velocity", 70.0, 0.0, "position outside the gate", 700.0)
+    relabel(run, "gnss_position", 70.0, 0.0, Outcome.OUTSIDE_GATE, 50.0)
+    relabel(run, "gnss_velocity", 70.0, 0.0, Outcome.WITHHELD, 700.0)
     for t in (72.0, 72.2, 72.4):
-        relabel(run, "gnss_position", t, 0.0, "on probation after an outage", 700.0)
-        relabel(run, "gnss_velocity", t, 0.0, "position on probation after an outage", 700.0)
-    relabel(run, "gnss_position", 80.0, 0.0, "position is not finite", float("nan"))
+        relabel(run, "gnss_position", t, 0.0, Outcome.WITHHELD, 700.0)
+        relabel(run, "gnss_velocity", t, 0.0, Outcome.WITHHELD, 700.0)
+    relabel(run, "gnss_position", 80.0, 0.0, Outcome.UNSOUND, float("nan"))
     looks = 201 - 3 - 1  # from 60 s to 100 s at 5 Hz, less probation and the unsound one
     found = metrics.compute(run)
     assert found["ins.rejected_fraction.gnss_position"] == pytest.approx(1 / looks)
@@ -284,10 +283,10 @@ def faulty(*injected: tuple[Any, ...], chunk: int = 200) -> Any:
     return run
 
 
-def refuse(run: Any, aid: str, start: float, end: float, reason: str = "outside the gate") -> None:
+def refuse(run: Any, aid: str, start: float, end: float, outcome: Outcome = Outcome.OUTSIDE_GATE) -> None:
     t = run[f"estimators/ins/innovations/{aid}"]["sample_time"].values
     for when in t[(t > start - 1e-6) & (t < end - 1e-6)]:
-        relabel(run, aid, when, 0.0, reason)
+        relabel(run, aid, when, 0.0, outcome)
 
 
 def test_faults_are_scored_by_name() -> None:
@@ -295,7 +294,7 @@ def test_faults_are_scored_by_name() -> None:
     assert next((f.name, f.start, f.end) for f in metrics.faults(run)) == ("jump", 100.0, 120.0)
     refuse(run, "gnss_velocity", 102.0, 120.0)  # one aid of the sensor is enough
     for aid in ("gnss_position", "gnss_velocity"):
-        refuse(run, aid, 120.0, 121.0, "on probation after an outage")  # and it is not used yet
+        refuse(run, aid, 120.0, 121.0, Outcome.WITHHELD)  # and it is not used yet
     refuse(run, "barometer", 80.0, 80.2)  # by chance
     refuse(run, "barometer", 132.0, 133.0)  # after the fault that it missed
     found = metrics.compute(run)
@@ -318,39 +317,39 @@ def test_one_axis_refused_is_an_alarm() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0))
     t = run["estimators/ins/innovations/gnss_position"]["sample_time"].values
     for when in t[(t > 103.0 - 1e-6) & (t < 122.0 - 1e-6)]:
-        relabel(run, "gnss_position", when, 2 / 3, "outside the gate" if when < 104 else "isolated")
+        relabel(run, "gnss_position", when, 2 / 3, Outcome.OUTSIDE_GATE if when < 104 else Outcome.ISOLATED)
     found = metrics.compute(run)
     assert found["ins.detection_delay_s.jump"] == pytest.approx(3.0)
     assert found["ins.coverage.jump"] == pytest.approx(0.85)
     assert found["ins.end_lag_s.jump"] == pytest.approx(2.0)
     assert found["ins.isolation_correct.jump"] == 1
     assert found["ins.false_alarms_per_look"] == 0.0
-    relabel(run, "gnss_position", 150.0, 2 / 3, "outside the gate")
+    relabel(run, "gnss_position", 150.0, 2 / 3, Outcome.OUTSIDE_GATE)
     assert metrics.compute(run)["ins.false_alarms_per_look"] > 0.0
 
 
 def test_faults_that_overlap_end_when_they_end() -> None:
     run = faulty(("long", "gnss", 100.0, 130.0), ("short", "gnss", 105.0, 110.0), ("next", "gnss", 140.0, 150.0))
     refuse(run, "gnss_position", 100.0, 133.0)
-    refuse(run, "gnss_velocity", 100.0, 133.0, "position outside the gate")
+    refuse(run, "gnss_velocity", 100.0, 133.0, Outcome.WITHHELD)
     found = metrics.compute(run)
     assert found["ins.end_lag_s.long"] == pytest.approx(3.0)
     assert "ins.end_lag_s.short" not in found  # nobody can tell
     assert found["ins.missed.next"] == 1
     healthy_s = (100.0 - 60.0) + (200.1 - 160.0)
     assert found["ins.false_alarms_per_look"] == 0.0
-    relabel(run, "barometer", 190.0, 0.0, "outside the gate")
-    relabel(run, "barometer", 158.0, 0.0, "outside the gate")
+    relabel(run, "barometer", 190.0, 0.0, Outcome.OUTSIDE_GATE)
+    relabel(run, "barometer", 158.0, 0.0, Outcome.OUTSIDE_GATE)
     assert metrics.compute(run)["ins.false_alarms_per_h"] == pytest.approx(3600 / healthy_s, rel=1e-3)
 
 
 def test_axes_left_out_of_a_sample_that_is_used_are_an_alarm() -> None:
     run = faulty(("slow", "gnss", 100.0, 120.0))
     for t in np.arange(104.0, 121.9, 0.2):  # one axis of three
-        relabel(run, "gnss_position", t, 2 / 3, "isolated", 300.0)
-    relabel(run, "gnss_position", 150.0, 2 / 3, "outside the gate", 40.0)
-    relabel(run, "gnss_position", 160.0, 1.0, "outside the gate, but consistent for long: covariance reset")
-    relabel(run, "gnss_position", 170.0, 0.5, "")  # a policy's weight
+        relabel(run, "gnss_position", t, 2 / 3, Outcome.ISOLATED, 300.0)
+    relabel(run, "gnss_position", 150.0, 2 / 3, Outcome.OUTSIDE_GATE, 40.0)
+    relabel(run, "gnss_position", 160.0, 1.0, Outcome.FUSED)
+    relabel(run, "gnss_position", 170.0, 0.5, Outcome.WEAKENED)  # a policy's weight
     found = metrics.compute(run)
     assert found["ins.detection_delay_s.slow"] == pytest.approx(4.0)
     assert found["ins.coverage.slow"] == pytest.approx(0.8)

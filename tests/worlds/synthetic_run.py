@@ -18,6 +18,7 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    Outcome,
     Status,
     UpdateReport,
 )
@@ -188,7 +189,14 @@ def _report(t: float, sensor: str, aid: str, m: int, rng: np.random.Generator) -
     threshold = {1: 10.8, 3: 16.3}[m]
     refused = nis > threshold
     return UpdateReport(
-        t, sensor, aid, z, S, nis, threshold, 0.0 if refused else 1.0, "outside the gate" if refused else ""
+        t,
+        sensor,
+        aid,
+        z,
+        S,
+        nis,
+        threshold,
+        *((0.0, Outcome.OUTSIDE_GATE, "outside the gate") if refused else (1.0, Outcome.FUSED)),
     )
 
 
