@@ -12,7 +12,7 @@ import pytest
 from worlds.loop import Watcher, same
 
 from nav.samples import FixType, GnssSample, Sample
-from testbed import Scenario, results, run, sensors
+from testbed import RunResult, Scenario, results, run, sensors
 from testbed.errors import UserError
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
@@ -45,12 +45,20 @@ def test_a_known_mounting_is_undone_and_truth_is_taken_at_the_imu() -> None:
     assert found["ins.heading_max_deg"] < 0.01
 
 
+LATE = Scenario.load("u_turn", [*SHORT, "sensors.gnss.latency_s=0.13"])
+
+
+@pytest.fixture(scope="module")
+def in_one_chunk() -> RunResult:
+    return run(LATE)
+
+
 @pytest.mark.parametrize("batch_s", [0.065, 0.25, 7.0])
-def test_result_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch, batch_s: float) -> None:
-    scenario = Scenario.load("u_turn", [*SHORT, "sensors.gnss.latency_s=0.13"])
-    reference = run(scenario)
+def test_result_does_not_depend_on_the_chunk(
+    in_one_chunk: RunResult, monkeypatch: pytest.MonkeyPatch, batch_s: float
+) -> None:
     monkeypatch.setattr(loop, "BATCH_S", batch_s)
-    assert same(reference.dataset, run(scenario).dataset)
+    assert same(in_one_chunk.dataset, run(LATE).dataset)
 
 
 def test_events_tell_of_denial_reacquisition_and_legs() -> None:
