@@ -525,17 +525,15 @@ def _fly(
 def _conclude(
     dataset: xarray.DataTree, metrics: Mapping[str, float], run_file: Path, report: bool, force: bool
 ) -> None:
-    from testbed.report import page as reports
-    from testbed.score import observability as visibility
+    from testbed.report import page, tables
 
     console = _console()
-    console.print(reports.summary_table(metrics))
-    faults = reports.fault_table(metrics)
+    console.print(tables.summary(metrics))
+    faults = tables.fault_table(metrics)
     if faults is not None:
         console.print(faults)
     if report:
-        seen = visibility.of_run(dataset)
-        print(f"report: {reports.write_report(dataset, metrics, run_file.parent, seen, force)}")
+        print(f"report: {page.write_report(dataset, metrics, run_file.parent, force)}")
     print(f"record: {run_file}")
 
 

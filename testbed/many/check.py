@@ -35,7 +35,6 @@ from testbed.loop import loop
 from testbed.report import page as report
 from testbed.results import start_anew
 from testbed.scenario import Bounds, Scenario
-from testbed.score import observability as visibility
 from testbed.score.metrics import column
 
 if TYPE_CHECKING:
@@ -231,8 +230,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         clear(task.folder)
         return outcome
     try:
-        seen = visibility.of_run(result.dataset)
-        report.write_report(result.dataset, result.metrics, task.folder, seen)
+        report.write_report(result.dataset, result.metrics, task.folder)
     except Exception as error:
         return replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
     return outcome

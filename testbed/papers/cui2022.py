@@ -31,7 +31,7 @@ from testbed.feeds.simulated import motion
 from testbed.loop.loop import run
 from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
-from testbed.report.page import AXIS_COLOURS, COLOURS, FAULT
+from testbed.report.style import AXIS_COLOURS, COLOURS, FAULT
 from testbed.results import write_result
 from testbed.score import metrics
 from testbed.score.metrics import column

@@ -196,7 +196,7 @@ def draw(runs: Sequence[dict[Case, Flown]], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from testbed.report.page import COLOURS, SHADE
+    from testbed.report.style import COLOURS, SHADE
 
     run = runs[0]
     figure = Figure(figsize=(9.0, 7.2), dpi=100, layout="constrained")

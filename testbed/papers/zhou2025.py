@@ -22,7 +22,7 @@ from nav.detection import ChiSquare, Detector, Glr, Reset, Sprt, eq20, exponenti
 from nav.samples import Array
 from testbed.loop import loop
 from testbed.papers import Claim, Job, Paper, scenario
-from testbed.report.page import COLOURS, FAULT
+from testbed.report.style import COLOURS, FAULT
 from testbed.results import write_result
 from testbed.score import metrics
 from testbed.sensors.noise import stream

@@ -260,7 +260,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from testbed.report.page import COLOURS, SHADE
+    from testbed.report.style import COLOURS, SHADE
 
     seeds = len(results) // len(RUNS)
     first = {run: results[k * seeds] for k, run in enumerate(RUNS)}

@@ -13,27 +13,22 @@ import csv
 import io
 import json
 import math
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from nav.samples import Array
-from testbed.results import write_result
+from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
+from testbed.report.page import Shown, png, render
+from testbed.results import REPORT, write_result
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
     from rich.table import Table
 
     from testbed.many.campaign import CampaignResult, Combination, Outcome
 
 TABLE, SUMMARY = "campaign.csv", "campaign.json"
-NEES_DOF = 3  # north, east, down
-CONFIDENCE = (0.025, 0.975)
 
 # The main metrics and how tables call them. All are errors: the worst is the largest, but for `BEST_LARGE`.
 QUANTITIES: Mapping[str, str] = {
@@ -107,15 +102,6 @@ class Statistics:
     consistency: Sequence[Consistency]
 
 
-def nees_bounds(runs: npt.ArrayLike) -> Array:
-    """Two-sided 95 % bounds (2, ...) of the mean position NEES per degree of freedom over ``runs`` independent runs."""
-    from scipy.stats import chi2
-
-    dof = NEES_DOF * np.asarray(runs, dtype=float)
-    bounds: Array = np.array([chi2.ppf(p, dof) / dof for p in CONFIDENCE])
-    return bounds
-
-
 def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Statistics:
     """Spread and consistency of every estimator, one combination after the other."""
     spreads: list[Spread] = []
@@ -161,36 +147,35 @@ def _consistency(combination: int, estimator: str, outcomes: Sequence[Outcome]) 
     )
 
 
-def nees_mean(outcomes: Sequence[Outcome], estimator: str) -> tuple[Array, npt.NDArray[np.int64]]:
-    """NEES per degree of freedom over time, mean over the runs that have one, and how many these are."""
-    nees = _stack(outcomes, f"{estimator}.nees")
-    runs = np.isfinite(nees).sum(axis=0)
-    return np.where(runs > 0, np.nansum(nees, axis=0) / np.maximum(runs, 1), np.nan), runs
-
-
-def _stack(outcomes: Sequence[Outcome], name: str) -> Array:
-    """One row per run, NaN after its end: a motion that ends by itself ends sooner in some gusts than in others."""
-    rows = [outcome.history[name] for outcome in outcomes]
-    longest = max(map(len, rows))
-    return np.array([np.pad(row, (0, longest - len(row)), constant_values=np.nan) for row in rows])
-
-
-def _longest(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
-    """History of the run that lasted longest; all have the same times as far as they go."""
-    return max((outcome.history for outcome in outcomes), key=lambda history: len(history["time"]))
-
-
 # --- files
 
 
 def save(result: CampaignResult) -> None:
-    """Write campaign.csv (one line per run), campaign.json (statistics and failures) and the figures."""
+    """Write campaign.csv (one line per run), campaign.json (statistics and failures), the figures, and report.html."""
     write_result(result.path / TABLE, _csv(result).encode())
     write_result(result.path / SUMMARY, json.dumps(_json(result), indent=1).encode())
-    for name, figure in figures(result).items():
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=120)
-        write_result(result.path / f"{name}.png", buffer.getvalue())
+    shown = []
+    for name, (caption, figure) in figures(result).items():
+        picture = png(figure)
+        write_result(result.path / f"{name}.png", picture)
+        shown.append(Shown("Figures", caption, picture))
+    if shown:
+        write_result(result.path / REPORT, _page(result, shown).encode())
+
+
+def _page(result: CampaignResult, shown: Sequence[Shown]) -> str:
+    """One page with tables and figures, which needs nothing else."""
+    of_runs = len(result.outcomes) + len(result.failures)
+    return render(
+        "campaign.html",
+        title=f"{result.combinations[0].scenario.title}: a campaign of {of_runs} runs",
+        figures=shown,
+        tables=[(table.title, table.rows) for table in texts(result)],
+        failures=[
+            (f"{result.combinations[failure.combination]} seed {failure.seed}".strip(), failure.message)
+            for failure in result.failures
+        ],
+    )
 
 
 def _csv(result: CampaignResult) -> str:
@@ -223,40 +208,60 @@ def _json(result: CampaignResult) -> dict[str, Any]:
 # --- tables
 
 
-def tables(result: CampaignResult) -> list[Table]:
-    """The tables for a console: errors, then consistency."""
-    from rich import box
-    from rich.markup import escape  # varied values and units may hold brackets
-    from rich.table import Table
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A table as text: its title, and its rows, the head first. The first ``words`` columns are no numbers."""
 
+    title: str
+    rows: Sequence[Sequence[str]]
+    words: int
+
+
+def texts(result: CampaignResult) -> list[Text]:
+    """The tables of a campaign: errors, then consistency."""
     keys = list(result.combinations[0].values)
 
     def values(combination: int) -> list[str]:
-        return [escape(value) for value in result.combinations[combination].values.values()]
+        return list(result.combinations[combination].values.values())
 
-    errors = Table(title="Errors over the runs", box=box.SIMPLE, title_justify="left")
-    consistency = Table(title="Consistency over the runs", box=box.SIMPLE, title_justify="left")
-    for table, names in ((errors, ["estimator", "error", *keys]), (consistency, ["estimator", *keys])):
-        for name in names:
-            table.add_column(escape(name))
-    for name in ("median", "95 %", "worst", "of seed", "runs"):
-        errors.add_column(name, justify="right")
-    for name in ("NEES/dof", "bounds", "inside", "false alarms/h", "runs"):
-        consistency.add_column(name, justify="right")
-
+    errors = [["estimator", "error", *keys, "median", "95 %", "worst", "of seed", "runs"]]
     spreads = result.statistics.spreads
     for estimator, metric in dict.fromkeys((s.estimator, s.metric) for s in spreads):
         rows = [s for s in spreads if (s.estimator, s.metric) == (estimator, metric)]
         for i, s in enumerate(rows):
-            names = [estimator, escape(_called(metric))] if i == 0 else ["", ""]
+            names = [estimator, _called(metric)] if i == 0 else ["", ""]
             numbers = [_number(s.median), _number(s.p95), _number(s.worst), str(s.worst_seed), str(s.runs)]
-            errors.add_row(*names, *values(s.combination), *numbers, end_section=bool(keys) and s is rows[-1])
+            errors.append([*names, *values(s.combination), *numbers])
+    consistency = [["estimator", *keys, "NEES/dof", "bounds", "inside", "false alarms/h", "runs"]]
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
     for c in sorted(result.statistics.consistency, key=lambda c: estimators.index(c.estimator)):
         bounds = f"{c.lower:.2f} – {c.upper:.2f}"
         numbers = [f"{c.nees:.2f}", bounds, f"{100 * c.inside:.0f} %", _number(c.false_alarms_per_h), str(c.runs)]
-        consistency.add_row(c.estimator, *values(c.combination), *numbers)
-    return [errors, consistency]
+        consistency.append([c.estimator, *values(c.combination), *numbers])
+    return [
+        Text("Errors over the runs", errors, 2 + len(keys)),
+        Text("Consistency over the runs", consistency, 1 + len(keys)),
+    ]
+
+
+def tables(result: CampaignResult) -> list[Table]:
+    """The same for a console. Where it is narrow, names are folded and numbers are not."""
+    from rich import box
+    from rich.markup import escape  # varied values and units may hold brackets
+    from rich.table import Table
+
+    varied = bool(result.combinations[0].values)
+    made = []
+    for text in texts(result):
+        table = Table(title=text.title, box=box.SIMPLE, title_justify="left")
+        head, *rows = text.rows
+        for k, name in enumerate(head):
+            number = k >= text.words
+            table.add_column(escape(name), justify="right" if number else "left", no_wrap=number, overflow="fold")
+        for row, following in zip(rows, [*rows[1:], ["end"]], strict=True):
+            table.add_row(*map(escape, row), end_section=varied and bool(following[0]))
+        made.append(table)
+    return made
 
 
 def _called(metric: str) -> str:
@@ -270,160 +275,3 @@ def _number(value: float) -> str:
         return "–"
     digits = 0 if value == 0.0 else max(0, 2 - math.floor(math.log10(abs(value))))
     return f"{value:.{min(digits, 4)}f}"
-
-
-# --- figures
-
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-_LINEAR_UP_TO = 30.0  # times the smallest error; a wider distribution gets a logarithmic axis
-_MOST_COLUMNS = 3  # more combinations than this share a panel
-
-
-def figures(result: CampaignResult) -> dict[str, Figure]:
-    """The campaign's figures by file name: error envelopes, NEES, one distribution per varied key."""
-    if not result.outcomes:
-        return {}
-    keys = list(result.combinations[0].values)
-    made = {"errors": _error_figure(result), "nees": _nees_figure(result)}
-    for key in keys:
-        name = "distribution_" + re.sub(r"\W+", "_", key).strip("_")
-        made[name] = _distribution_figure(result, key, lambda c, key=key: c.values[key])  # type: ignore[misc]
-    if not keys:
-        made["distribution"] = _distribution_figure(result, "", lambda _: "all runs")
-    return made
-
-
-def _panels(result: CampaignResult, title: str, columns: int = 1) -> tuple[Figure, npt.NDArray[Any]]:
-    """Panels (estimators, columns) with outages shaded and time below."""
-    from matplotlib.figure import Figure
-
-    estimators = [e.name for e in result.combinations[0].scenario.estimator]
-    figure = Figure(figsize=(5.0 + 4.0 * columns, 1.4 + 2.8 * len(estimators)), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(len(estimators), columns, sharex=True, sharey="row", squeeze=False)
-    outages = _outages(result)
-    for axes in panels.flat:
-        axes.grid(alpha=0.3)
-        for start, end in outages:
-            axes.axvspan(start, end, color="0.9", zorder=0)
-    for row, estimator in zip(panels, estimators, strict=True):
-        row[0].set_title(estimator, loc="left", fontsize="medium")
-    for axes in panels[-1]:
-        axes.set_xlabel("time [s]    (shaded: no GNSS fix)" if outages else "time [s]")
-    return figure, panels
-
-
-def _outages(result: CampaignResult) -> list[tuple[float, float]]:
-    """Windows without a fix, when they are the same in all runs."""
-    longest = _longest(result.outcomes)
-    time, outage = longest["time"], longest["outage"]
-    if not all(np.array_equal(o.history["outage"], outage[: len(o.history["outage"])]) for o in result.outcomes):
-        return []
-    edges = np.flatnonzero(np.diff(outage, prepend=0.0, append=0.0))
-    times = np.append(time, time[-1])
-    return [(float(times[start]), float(times[end])) for start, end in edges.reshape(-1, 2)]
-
-
-def _groups(result: CampaignResult) -> Iterator[tuple[str, Any, list[Outcome]]]:
-    """Label, colour and outcomes of every combination that has any."""
-    import matplotlib
-
-    many = len(result.combinations) > len(_COLOURS)
-    for i, combination in enumerate(result.combinations):
-        own = [outcome for outcome in result.outcomes if outcome.combination == i]
-        colour = matplotlib.colormaps["viridis"](i / len(result.combinations)) if many else _COLOURS[i]
-        if own:
-            yield str(combination), colour, own
-
-
-def _error_figure(result: CampaignResult) -> Figure:
-    """Median, 5 to 95 % and claimed sigma; a column for each of a few combinations, medians alone for many."""
-    groups = list(_groups(result))
-    apart = len(groups) <= _MOST_COLUMNS
-    runs = max(len(own) for _, _, own in groups)
-    figure, panels = _panels(result, f"Errors over {runs} runs", len(groups) if apart else 1)
-    for axes, (label, _, _) in zip(panels[0] if apart else (), groups, strict=False):
-        axes.set_title(label, loc="right", fontsize="medium")
-    for row, estimator in zip(panels, result.combinations[0].scenario.estimator, strict=True):
-        for i, (label, colour, own) in enumerate(groups):
-            axes = row[i if apart else 0]
-            error = _stack(own, f"{estimator.name}.error")
-            known = np.flatnonzero(np.isfinite(error).any(axis=0))
-            time, error = _longest(own)["time"][known], error[:, known]
-            low, median, high = np.nanpercentile(error, (5, 50, 95), axis=0)
-            axes.plot(time, median, color=colour, linewidth=1.4, label="median" if apart else label)
-            if apart:
-                claimed = np.nanmedian(_stack(own, f"{estimator.name}.sigma")[:, known], axis=0)
-                axes.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0, label="5 – 95 %")
-                axes.plot(time, claimed, color="0.2", linewidth=1.0, linestyle="--", label="claimed 1 σ, median")
-        row[0].set_ylabel("roll, pitch error [deg]" if estimator.attitude_only else "horizontal error [m]")
-        _logarithmic(row[0])
-    panels[0, -1].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-def _nees_figure(result: CampaignResult) -> Figure:
-    groups = list(_groups(result))
-    runs = max(len(own) for _, _, own in groups)
-    figure, panels = _panels(result, f"NEES per degree of freedom, mean over {runs} runs")
-    low, high = nees_bounds(runs)
-    for axes, estimator in zip(panels[:, 0], result.combinations[0].scenario.estimator, strict=True):
-        axes.axhspan(low, high, color="0.75", linewidth=0, label="95 % bounds")
-        axes.axhline(1.0, color="0.4", linewidth=0.8)
-        for label, colour, own in groups:
-            mean, _ = nees_mean(own, estimator.name)
-            axes.plot(_longest(own)["time"], mean, color=colour, linewidth=1.0, label=label or "mean")
-        axes.set_ylabel(f"{'attitude' if estimator.attitude_only else 'position'} NEES / dof")
-        _logarithmic(axes, 0.1, 10.0)
-    panels[0, 0].legend(fontsize="small", loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-def _logarithmic(axes: Axes, least: float = math.inf, most: float = 0.0) -> None:
-    """A logarithmic axis from ``least`` to ``most`` at the least, with plain numbers.
-
-    The numbers between the powers of ten are there only where they have room.
-    """
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.set_ylim(min(low, least), max(high, most))
-    plain = FuncFormatter(lambda x, _: f"{x:,.0f}" if x >= 1.0 else f"{x:g}")
-    axes.yaxis.set_major_formatter(plain)
-    axes.yaxis.set_minor_formatter(plain if high < 6.0 * low else NullFormatter())
-
-
-def _distribution_figure(result: CampaignResult, key: str, value_of: Callable[[Combination], str]) -> Figure:
-    """A panel for each estimator: a box of one metric per value, with every run as a dot."""
-    from matplotlib.figure import Figure
-
-    estimators = result.combinations[0].scenario.estimator
-    denied = any(".outage_" in key for o in result.outcomes for key in o.metrics)
-    values = list(dict.fromkeys(value_of(c) for c in result.combinations))
-    figure = Figure(figsize=(3.0 + 1.5 * len(values), 1.4 + 2.8 * len(estimators)), layout="constrained")
-    figure.suptitle("Largest error of each run\n(box: quartiles, whiskers: 5 and 95 %)", fontsize="medium")
-    panels = figure.subplots(len(estimators), 1, sharex=True, squeeze=False)[:, 0]
-    for axes, estimator in zip(panels, estimators, strict=True):
-        metric = "roll_pitch_max_deg" if estimator.attitude_only else "position_horizontal_max_m"
-        metric = f"outage_{metric}" if denied else metric
-        found: dict[str, list[float]] = {value: [] for value in values}
-        for o in result.outcomes:
-            if f"{estimator.name}.{metric}" in o.metrics:
-                found[value_of(result.combinations[o.combination])].append(o.metrics[f"{estimator.name}.{metric}"])
-        for x, errors in enumerate(found.values()):
-            line = {"color": _COLOURS[0], "linewidth": 2}
-            axes.boxplot(errors, positions=[x], widths=0.5, whis=(5, 95), showfliers=False, medianprops=line)
-            axes.plot(x + np.linspace(-0.15, 0.15, len(errors)), errors, "o", color="0.3", markersize=3, alpha=0.6)
-        axes.set_title(estimator.name, loc="left", fontsize="medium")
-        axes.set_ylabel(QUANTITIES[metric])
-        axes.grid(alpha=0.3, axis="y")
-        known = [error for errors in found.values() for error in errors]
-        if known and max(known) > _LINEAR_UP_TO * min(known):
-            _logarithmic(axes)
-        else:
-            axes.set_ylim(bottom=0.0)
-    panels[-1].set_xticks(range(len(values)), values)
-    panels[-1].set_xlim(-0.6, len(values) - 0.4)
-    panels[-1].set_xlabel(key)
-    return figure

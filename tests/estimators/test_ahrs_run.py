@@ -30,7 +30,11 @@ from testbed.record import reader as record
 from testbed.record.export import export
 from testbed.record.recorder import Recorder
 from testbed.report import campaign as campaign_report
+from testbed.report import campaign_figures, tables
 from testbed.report import page as report
+from testbed.report.figures import consistency, flight
+from testbed.report.figures import errors as errors_figures
+from testbed.report.run import Run
 from testbed.score import metrics
 
 INS = '{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}'
@@ -222,22 +226,22 @@ def lines(axes: Any) -> set[str]:
 
 
 def test_figures_compare_what_there_is(flown: Any) -> None:
-    every = report._Run(flown[0].dataset)
-    position, height, tilt, heading = report.comparison(every).axes
+    every = Run(flown[0].dataset)
+    position, height, tilt, heading = errors_figures.comparison(every).axes
     assert lines(position) == lines(height) == {"ins"}
     assert lines(tilt) == lines(heading) == {"ahrs", "ins", "blind", "gyros"}
-    assert "ahrs" not in lines(report.ground_track(every).axes[0]) | lines(report.flight(every).axes[0])
-    alone = report._Run(flown[0].dataset)
+    assert "ahrs" not in lines(flight.ground_track(every).axes[0]) | lines(flight.flight(every).axes[0])
+    alone = Run(flown[0].dataset)
     del alone.errors["ins"]
-    assert len(report.comparison(alone).axes) == 2
-    assert len(report.consistency(alone).axes) == 1
-    assert len(report.motion_errors(alone, "ahrs").axes) == 3
+    assert len(errors_figures.comparison(alone).axes) == 2
+    assert len(consistency.consistency(alone).axes) == 1
+    assert len(errors_figures.motion_errors(alone, "ahrs").axes) == 3
 
 
 def test_table_has_no_rows_that_nobody_can_fill(flown: Any) -> None:
     def printed(found: dict[str, float]) -> str:
         out = io.StringIO()
-        Console(file=out, width=160).print(report.summary_table(found))
+        Console(file=out, width=160).print(tables.summary(found))
         return out.getvalue()
 
     alone = {key: value for key, value in flown[0].metrics.items() if not key.startswith("ins.")}
@@ -296,12 +300,15 @@ def test_a_campaign_counts_degrees(flown: Any, tmp_path: Path) -> None:
     outcomes = [campaign.Outcome(0, seed, result.metrics, history) for seed in (1, 2)]
     statistics = campaign_report.statistics([combination], outcomes)
     gathered = CampaignResult(tmp_path, [combination], outcomes, [], statistics)
-    made = campaign_report.figures(gathered)
-    assert [axes.get_ylabel() for axes in made["errors"].axes[:2]] == [
+    made = campaign_figures.figures(gathered)
+    assert [axes.get_ylabel() for axes in made["errors"].figure.axes[:2]] == [
         "roll, pitch error [deg]",
         "horizontal error [m]",
     ]
-    assert [axes.get_ylabel() for axes in made["nees"].axes[:2]] == ["attitude NEES / dof", "position NEES / dof"]
+    assert [axes.get_ylabel() for axes in made["nees"].figure.axes[:2]] == [
+        "attitude NEES / dof",
+        "position NEES / dof",
+    ]
     campaign_report.save(gathered)
     kept = json.loads((tmp_path / "campaign.json").read_text())
     of_ahrs = {spread["metric"] for spread in kept["spreads"] if spread["estimator"] == "ahrs"}

@@ -31,6 +31,7 @@ from testbed.many.campaign import Combination, Failure, Outcome, Progress, campa
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
+from testbed.report import campaign_figures
 from testbed.score import metrics
 
 AT_REST = """
@@ -446,9 +447,9 @@ def test_scheduler_without_workers(at_rest: Path, tmp_path: Path, monkeypatch: p
 def test_nees_bounds_are_those_of_the_tables() -> None:
     # Chi-square with 150 degrees of freedom: 117.985 and 185.800 at 2.5 and 97.5 % (NIST/SEMATECH e-Handbook, 1.3.6.7.4
     # gives 100: 74.222 and 129.561).
-    np.testing.assert_allclose(campaign_report.nees_bounds(50) * 150, [117.985, 185.800], atol=1e-3)
+    np.testing.assert_allclose(campaign_figures.nees_bounds(50) * 150, [117.985, 185.800], atol=1e-3)
     # Three degrees of freedom for a single run: 0.216 and 9.348.
-    np.testing.assert_allclose(campaign_report.nees_bounds(1) * 3, [0.216, 9.348], atol=1e-3)
+    np.testing.assert_allclose(campaign_figures.nees_bounds(1) * 3, [0.216, 9.348], atol=1e-3)
 
 
 def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float = 1.0) -> Outcome:
@@ -473,7 +474,8 @@ def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float 
 
 
 def made_up_campaign(tmp_path: Path, values: list[str], runs: int = 30) -> campaigns.CampaignResult:
-    scenario: Any = SimpleNamespace(estimator=[SimpleNamespace(name="ins", attitude_only=False)])
+    estimator = SimpleNamespace(name="ins", attitude_only=False)
+    scenario: Any = SimpleNamespace(title="Made up", estimator=[estimator], fault=())
     combinations = [Combination({"wind": value} if value else {}, scenario) for value in values]
     rng = np.random.default_rng(2)
     outcomes = [made_up(i, seed, rng, 1.0 + i) for i in range(len(values)) for seed in range(runs)]
@@ -520,11 +522,11 @@ def test_history_is_the_error_once_a_second() -> None:
 @pytest.mark.parametrize("values", [[""], ["0", "5"], ["0", "1", "2", "3", "4", "5", "6"]])
 def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
     result = made_up_campaign(tmp_path, values, runs=5)
-    drawn = campaign_report.figures(result)
+    drawn = campaign_figures.figures(result)
     assert set(drawn) == {"errors", "nees", "distribution" if values == [""] else "distribution_wind"}
-    for figure in drawn.values():
-        figure.canvas.draw()
-    panels = drawn["nees"].axes
+    for one in drawn.values():
+        one.figure.canvas.draw()
+    panels = drawn["nees"].figure.axes
     assert panels[0].get_ylabel() == "position NEES / dof"
     assert len(panels[0].get_lines()) == 1 + len(values)
 
@@ -538,18 +540,18 @@ def test_nothing_flown_draws_nothing(tmp_path: Path) -> None:
 
 def test_outages_that_differ_between_runs_are_not_shaded(tmp_path: Path) -> None:
     result = made_up_campaign(tmp_path, [""], runs=2)
-    assert campaign_report._outages(result) == [(100.0, 200.0)]
+    assert campaign_figures._outages(result) == [(100.0, 200.0)]
     result.outcomes[1].history["outage"][150:] = 1.0
-    assert campaign_report._outages(result) == []
+    assert campaign_figures._outages(result) == []
 
 
 def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
     result = made_up_campaign(tmp_path, [""], runs=3)
     history = result.outcomes[0].history
     result.outcomes[0] = Outcome(0, 0, result.outcomes[0].metrics, {k: v[:150] for k, v in history.items()})  # type: ignore[index]
-    mean, runs = campaign_report.nees_mean(result.outcomes, "ins")
+    mean, runs = campaign_figures.nees_mean(result.outcomes, "ins")
     assert (runs[149], runs[150], len(mean)) == (3, 2, 400)
     assert np.isfinite(mean[10:]).all()
-    assert campaign_report._outages(result) == [(100.0, 200.0)]
-    drawn = campaign_report.figures(result)["errors"]
+    assert campaign_figures._outages(result) == [(100.0, 200.0)]
+    drawn = campaign_figures.figures(result)["errors"].figure
     assert drawn.axes[0].get_lines()[0].get_xdata()[-1] == 399.0

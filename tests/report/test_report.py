@@ -17,6 +17,9 @@ from worlds.synthetic_run import Errors, circle, scenario
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.report import page as report
+from testbed.report import style, tables
+from testbed.report.figures import consistency, imu
+from testbed.report.run import Run
 from testbed.results import start_anew
 from testbed.score import metrics
 from testbed.sensors.faults import FaultTruth
@@ -38,7 +41,7 @@ RUNS: dict[str, dict[str, Any]] = {
 
 def printed(found: dict[str, float]) -> str:
     out = io.StringIO()
-    Console(file=out, width=160).print(report.summary_table(found))
+    Console(file=out, width=160).print(tables.summary(found))
     return out.getvalue()
 
 
@@ -51,7 +54,7 @@ def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> N
     images = sorted(p.name for p in tmp_path.glob("*.png"))
     assert {"flight.png", "ground_track.png"} <= set(images)
     assert text.count("data:image/png;base64,") == len(images)
-    assert not re.findall(r"(?:src|href)='(?!data:)", text)
+    assert not re.findall(r"""(?:src|href)=["'](?!data:|#)""", text)
     assert "A made-up circle" in text
     assert ("never aligned" in text) == (kind in ("never aligned", "shortest"))
     assert printed(found)
@@ -106,34 +109,34 @@ def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
     assert cells["rise"] == ["ins", "missed", "0%", "0.0", "no"]
     assert cells["unseen"][0] == "none looked"
     assert "gnss x step 3 m, 80 to 100 s" in page
-    table = report.fault_table(found)
+    table = tables.fault_table(found)
     out = io.StringIO()
     Console(file=out, width=160).print(table)
     assert re.search(r"jump\W+ins\W+2\.0\W+90%", out.getvalue())
     assert "detected after [s]" in out.getvalue()
-    assert report.fault_table({"ins.position_horizontal_rms_m": 1.0}) is None
-    figure = report.innovations(report._Run(run), "ins")
+    assert tables.fault_table({"ins.position_horizontal_rms_m": 1.0}) is None
+    figure = consistency.innovations(Run(run), "ins")
     assert figure is not None
     shaded = [
         ax.get_title(loc="left").partition(":")[0]
         for ax in figure.axes
         for patch in ax.patches
-        if to_hex(patch.get_facecolor()).upper() == report.FAULT
+        if to_hex(patch.get_facecolor()).upper() == style.FAULT
     ]
     assert shaded == ["gnss_position", "gnss_velocity", "barometer"]
 
 
 def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
     run = synthetic_run.dataset(300.0)
-    clean = report._imu_error(report._Run(run), "ins")
+    clean = imu._imu_error(Run(run), "ins")
     increments = run["sensors/imu/dtheta"].values
     increments[200 * 100 : 200 * 100 + 3] = [[np.nan] * 3, [np.inf, 0, 0], [1e300, 0, 0]]
-    broken = report._imu_error(report._Run(run), "ins")
+    broken = imu._imu_error(Run(run), "ins")
     assert clean is not None
     assert broken is not None
-    apart = np.abs(broken[0] - 100.0) > 31
-    np.testing.assert_allclose(broken[1][apart], clean[1][apart], atol=1e-9)
-    assert np.isnan(broken[1][np.abs(broken[0] - 100.0) < 29]).all()
+    apart = np.abs(broken["t"] - 100.0) > 31
+    np.testing.assert_allclose(broken["gyro"][apart], clean["gyro"][apart], atol=1e-9)
+    assert np.isnan(broken["gyro"][np.abs(broken["t"] - 100.0) < 29]).all()
 
 
 def test_table_sets_gnss_and_outage_side_by_side() -> None:
@@ -160,8 +163,8 @@ def test_thinning_keeps_every_peak_and_every_gap() -> None:
     y = np.random.default_rng(0).normal(size=t.size)
     y[12_345], y[77_777] = 50.0, -50.0
     y[40_000:50_000] = np.nan
-    t_thin, y_thin = report.thin(t, y)
-    assert len(t_thin) <= 2.2 * report.BINS
+    t_thin, y_thin = style.thin(t, y)
+    assert len(t_thin) <= 2.2 * style.BINS
     assert (np.diff(t_thin) >= 0).all()
     assert {12_345.0, 77_777.0} <= set(t_thin)
     inside = (t_thin > 40_200) & (t_thin < 49_800)

@@ -14,6 +14,9 @@ from nav.samples import Array
 from testbed import Scenario, run
 from testbed.papers import cheng2020, scenario
 from testbed.report import page as report
+from testbed.report import tables
+from testbed.report.figures import observability as figures
+from testbed.report.run import Run
 from testbed.score import metrics
 from testbed.score import observability as visibility
 from testbed.score.metrics import column
@@ -59,7 +62,7 @@ def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tm
     level = [found["improved"].names.index(f"accel_bias {axis}") for axis in "xy"]
     assert np.isinf(found["improved"].seen_from()[level]).all()
 
-    page = report.write_report(straight, metrics.compute(straight), tmp_path, found).read_text(encoding="utf-8")
+    page = report.write_report(straight, metrics.compute(straight), tmp_path).read_text(encoding="utf-8")
     assert "<tr><td>in steps of</td><td>5 s</td><td>5 s</td></tr>" in page
     assert "<tr><td>phi down</td><td>from 5 s</td><td>never (0.00)</td></tr>" in page
     assert (tmp_path / "visibility.png").stat().st_size > 5000
@@ -178,7 +181,7 @@ def test_a_record_without_its_scenario_has_none() -> None:
     dataset = run(cheng2020.selected(["improved"], ["duration_s=5"])).dataset
     dataset.attrs["scenario"] = "title = 3"
     assert visibility.of_run(dataset) == {}
-    assert report._html_seen({}) == ""
+    assert tables.seen({}) == []
 
 
 def test_a_receiver_may_have_any_name() -> None:
@@ -191,17 +194,19 @@ def test_a_receiver_may_have_any_name() -> None:
 
 def test_the_figure_is_pale_where_only_the_past_helps() -> None:
     dataset = run(Scenario.load("static_bench", ["duration_s=12", "expect={}"])).dataset
-    drawn = report._Run(dataset)
+    drawn = Run(dataset)
     t = np.array([2.0, 7.0, 12.0])
     share, alone = np.array([[1.0, 0.0], [1.0, 0.5]]), np.array([[1.0, 0.0], [0.0, 0.5]])
     name = metrics.names(dataset)[0]
     own = Visibility(["phi north", "wind 1"], t, np.array([1, 2]), share, share, alone)
-    figure = report.visibility(drawn, {name: own})
+    drawn.seen = {name: own}
+    figure = figures.visibility(drawn)
     assert figure is not None
     (image,) = figure.axes[0].images
     cells = np.asarray(image.get_array())
     np.testing.assert_allclose(cells[..., :3], np.broadcast_to(to_rgb(drawn.colours[name]), (2, 2, 3)))
-    np.testing.assert_allclose(cells[..., 3], [[1.0, report.PALE], [0.0, 0.5]])
+    np.testing.assert_allclose(cells[..., 3], [[1.0, figures.PALE], [0.0, 0.5]])
     assert image.get_extent()[:2] == [2.0, 12.0]
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == own.names
-    assert report.visibility(drawn, {}) is None
+    drawn.seen = {}
+    assert figures.visibility(drawn) is None

@@ -1,0 +1,136 @@
+"""Where it flew, how high and how fast, and in what wind."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from nav.samples import Array
+from testbed.report.figures.plot import Plot
+from testbed.report.run import Run
+from testbed.report.style import (
+    FAINT,
+    FAR,
+    GUIDE,
+    SHADE,
+    TRUTH,
+    keys_of,
+    layer,
+    patch,
+    sheet,
+    stride,
+    thin,
+)
+from testbed.score import metrics as scores
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def ground_track(run: Run) -> Figure:
+    """Where it flew and where each estimator thought it was."""
+    truth = run.track(run.truth("lat"), run.truth("lon"))
+    believed = {name: run.track(run.estimate(name, "lat"), run.estimate(name, "lon")) for name in run.positioned}
+    low, high = np.nanmin(truth, axis=0), np.nanmax(truth, axis=0)
+    extent = max(float((high - low).max()), 0.02)
+    far = any(
+        np.isfinite(points).any() and max(np.nanmax(points - high), np.nanmax(low - points)) > extent / FAR
+        for points in believed.values()
+    )
+    drawn = sheet(1, 2 if far else 1, height=5.2, shared=False)
+    for ax in drawn.axes[0]:
+        _tracks(run, ax, truth, believed)
+    first = drawn.axes[0, 0]
+    first.set_ylabel("north of the start [km]")
+    first.set_aspect("equal", adjustable="box" if far else "datalim")
+    if far:
+        centre, half = (low + high) / 2, 0.62 * extent
+        first.set_xlim(centre[1] - half, centre[1] + half)
+        first.set_ylim(centre[0] - half, centre[0] + half)
+        first.set_title("around the true track", fontsize=10)
+        drawn.axes[0, 1].set_title("as far as the estimates go", fontsize=10)
+        drawn.axes[0, 1].set_aspect("equal", adjustable="datalim")
+    keys = keys_of(drawn.axes.flat)
+    if run.windows:
+        keys["no GNSS fix"] = patch(SHADE)
+    drawn.legend(keys, 0.3 if far else 0.1)
+    return drawn.figure
+
+
+def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> None:
+    denied = scores.inside(run.t, run.windows)
+    ax.plot(truth[:, 1], truth[:, 0], color=TRUTH, lw=1.0, label="truth", zorder=4)
+    if denied.any():
+        gap = np.where(denied[:, None], truth, np.nan)
+        wide = 12 if believed else 7
+        ax.plot(gap[:, 1], gap[:, 0], color=SHADE, lw=wide, solid_capstyle="round", zorder=0)
+    for rank, (name, points) in enumerate(believed.items()):
+        ax.plot(points[:, 1], points[:, 0], **run.lines[name], **layer(rank, len(believed)), label=name)
+    ax.plot(truth[0, 1], truth[0, 0], "o", color=TRUTH, ms=7, label="start", zorder=5)
+    ax.plot(truth[-1, 1], truth[-1, 0], "s", color=TRUTH, ms=7, label="end", zorder=5)
+    ax.set_xlabel("east of the start [km]")
+
+
+def flight(run: Run) -> Figure:
+    """Height and speed of the flight."""
+    drawn = sheet(2, height=2.5, gap=0.2)
+    top, bottom = drawn.axes[:, 0]
+    truth = run.truth("h")
+    top.plot(*thin(run.t, truth), color=TRUTH, lw=1.0, label="truth", zorder=4)
+    for rank, name in enumerate(run.positioned):
+        line = thin(run.estimate(name, "time"), run.estimate(name, "h"))
+        top.plot(*line, **run.lines[name], **layer(rank, len(run.positioned)), label=name)
+    margin = max(0.15 * float(np.nanmax(truth) - np.nanmin(truth)), 20.0)
+    top.set_ylim(np.nanmin(truth) - margin, np.nanmax(truth) + margin)
+    top.set_ylabel("height above\nellipsoid [m]")
+    bottom.plot(*thin(run.t, run.truth("airspeed")), color=TRUTH, lw=1.2, label="true airspeed")
+    ground = np.hypot(run.truth("v_n")[:, 0], run.truth("v_n")[:, 1])
+    bottom.plot(*thin(run.t, ground), color=GUIDE, lw=1, ls="--", label="true speed over ground")
+    bottom.set_ylabel("speed [m/s]")
+    run.against_time(drawn)
+    return drawn.figure
+
+
+def wind(run: Run) -> Figure | None:
+    """Estimated wind over the true one."""
+    names = [name for name in run.aligned if run.has(f"estimators/{name}/wind")]
+    if not names:
+        return None
+    drawn = sheet(2, height=2.2)
+    for k, (ax, label) in enumerate(zip(drawn.axes[:, 0], ("from south [m/s]", "from west [m/s]"), strict=True)):
+        true = run.truth("wind_n")[:, k]
+        ax.plot(*thin(run.t, true), color=TRUTH, lw=0.5, label="truth, turbulence included", zorder=1)
+        everything = [true]
+        for name in names:
+            t, value, sigma = (run.estimate(name, q) for q in ("time", "wind", "sigma_wind"))
+            some = stride(len(t))
+            low, high = value[some, k] - 3 * sigma[some, k], value[some, k] + 3 * sigma[some, k]
+            ax.fill_between(t[some], low, high, color=run.colours[name], alpha=FAINT / len(names) ** 0.5, lw=0)
+            ax.plot(t[some], value[some, k], **run.lines[name], lw=1.4, label=name, zorder=3)
+            everything.append(value[:, k])
+        _centre(ax, np.concatenate(everything))
+        ax.set_ylabel(label)
+    run.against_time(drawn)
+    return drawn.figure
+
+
+def _centre(ax: Any, values: Array) -> None:
+    middle, spread = float(np.nanmedian(values)), max(float(np.nanmax(np.abs(values))), 2.0)
+    ax.set_ylim(middle - spread, middle + spread)
+
+
+PLOTS = (
+    Plot(
+        "ground_track",
+        "Ground track. Thin black line: truth, drawn over all else; coloured lines: where each estimator thought it"
+        " was, wider below narrower so that none hides another. Wide grey line: no GNSS fix.",
+        ground_track,
+        timed=False,
+    ),
+    Plot("flight", "Height and speed. Black: truth; coloured lines: estimates.", flight),
+    Plot(
+        "wind", "Wind over ground. Black: truth with its turbulence; coloured lines: estimates; bands: ±3 sigma.", wind
+    ),
+)
