@@ -49,12 +49,12 @@ def line_of(index: int) -> dict[str, Any]:
     return {"color": COLOURS[index % len(COLOURS)], "ls": DASHES[index // len(COLOURS) % len(DASHES)]}
 
 
-def layer(rank: int, count: int) -> dict[str, Any]:
+def layer(rank: int, count: int, thinnest: float = 2.0) -> dict[str, Any]:
     """Width and order of the line at ``rank`` of ``count`` that may lie on each other: the last is the widest, below.
 
     So each shows beside those above it, and truth, at order 4 and one point wide, above them all.
     """
-    return {"lw": 2.0 + min(0.9, 6.0 / max(count, 1)) * rank, "zorder": 3 - 0.05 * rank}
+    return {"lw": thinnest * (1 + min(0.45, 3 / max(count, 1)) * rank), "zorder": 3 - 0.05 * rank}
 
 
 def tints(colour: str) -> list[str]:
@@ -94,12 +94,12 @@ class Sheet:
     axes: Any
     height: float
     gap: float
-    left: float = LEFT
-    right: float = RIGHT
+    margins: tuple[float, float]
 
     def legend(self, keys: Mapping[str, Any], title: float = 0.0) -> None:
         """One legend above all panels, of as many lines as it takes, and ``title`` [in] for panels' titles below it."""
-        room = WIDTH - self.left - self.right
+        left, right = self.margins
+        room = WIDTH - left - right
         longest = KEY + CHARACTER * max(map(len, keys), default=1)
         columns = max(1, min(len(keys), int(room / longest)))
         head = LINE * math.ceil(len(keys) / columns) + title + 0.12
@@ -107,7 +107,7 @@ class Sheet:
         tall = BOTTOM + head + (self.height + self.gap) * rows - self.gap
         self.figure.set_size_inches(WIDTH, tall)
         self.figure.subplots_adjust(
-            self.left / WIDTH, BOTTOM / tall, 1 - self.right / WIDTH, 1 - head / tall, hspace=self.gap / self.height
+            left / WIDTH, BOTTOM / tall, 1 - right / WIDTH, 1 - head / tall, hspace=self.gap / self.height
         )
         if keys:
             self.figure.legend(
@@ -117,9 +117,14 @@ class Sheet:
 
 
 def sheet(
-    rows: int, columns: int = 1, height: float = 2.1, gap: float = 0.16, *, left: float = LEFT, right: float = RIGHT,
+    rows: int,
+    columns: int = 1,
+    height: float = 2.1,
+    gap: float = 0.16,
+    *,
+    margins: tuple[float, float] = (LEFT, RIGHT),
     shared: bool = True,
-) -> Sheet:  # fmt: skip
+) -> Sheet:
     """Empty panels, the rows on one horizontal axis if it is ``shared``. Margins are in inches: they are drawn once."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -130,7 +135,7 @@ def sheet(
     figure.subplots_adjust(wspace=0.2)
     for ax in axes.flat:
         dress(ax)
-    return Sheet(figure, axes, height, gap, left, right)
+    return Sheet(figure, axes, height, gap, margins)
 
 
 def dress(ax: Axes) -> None:

@@ -8,13 +8,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from nav.samples import Array
-from testbed.report.figures.errors import SMOOTH_S, moving_rms
+from testbed.report.figures.errors import LOG_LINE, SMOOTH_S, moving_rms
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
 from testbed.report.style import (
     CONSISTENT,
     FAR,
     GUIDE,
+    LEFT,
     REFUSED,
     focus_log,
     keys_of,
@@ -42,17 +43,17 @@ def consistency(run: Run) -> Figure | None:
     if not run.aligned:
         return None
     quantities = ("position", "velocity", "attitude") if run.positioned else ("attitude",)
-    drawn = sheet(len(quantities), height=2.0, right=1.0)
+    drawn = sheet(len(quantities), height=2.0, margins=(LEFT, 1.0))
     low, high = (float(chi2.ppf(p, 3)) / 3 for p in (0.025, 0.975))
     for ax, what in zip(drawn.axes[:, 0], quantities, strict=True):
         shown = run.aligned if what == "attitude" else run.positioned
         values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in shown.items()}
         ax.axhspan(low, high, color=CONSISTENT, lw=0, label="95 % of a consistent filter", zorder=0.2)
         ax.axhline(1.0, color=GUIDE, lw=0.8)
-        for name, nees in values.items():
+        for rank, (name, nees) in enumerate(values.items()):
             t = run.errors[name].t
             smooth = moving_rms(t, np.sqrt(nees), SMOOTH_S) ** 2
-            ax.plot(*thin(t, smooth), **run.lines[name], lw=0.9, label=name)
+            ax.plot(*thin(t, smooth), **run.lines[name], **layer(rank, len(values), LOG_LINE), label=name)
         _shares_inside(run, ax, values, (low, high), drawn.height)
         focus_log(ax, list(values.values()), 0.05, 10.0)
         ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-3))
@@ -124,12 +125,20 @@ def _ellipses_at(run: Run, ax: Axes, t: float) -> None:
             shown[name] = (ellipse(run.estimate(name, "covariance")[at, :2, :2], SIGMAS), e.position[row, :2])
     sizes = {name: float(np.abs([*corners, error]).max()) for name, (corners, error) in shown.items()}
     sizes = {name: size for name, size in sizes.items() if np.isfinite(size)}
-    limit = 1.1 * max([s for s in sizes.values() if s <= FAR * FAR * min(sizes.values())], default=1.0)
+    limit = 1.25 * max([s for s in sizes.values() if s <= FAR * FAR * min(sizes.values())], default=1.0)
     for rank, name in enumerate(sizes):
         corners, error = shown[name]
-        on_top = layer(rank, len(sizes))
+        on_top = layer(rank, len(sizes), 1.1)
         ax.plot(corners[:, 1], corners[:, 0], **run.lines[name], **on_top, label=name)
-        ax.plot(error[1], error[0], "x", color=run.colours[name], ms=5 + on_top["lw"], mew=on_top["lw"], zorder=4)
+        ax.plot(
+            error[1],
+            error[0],
+            "x",
+            color=run.colours[name],
+            ms=6 + on_top["lw"],
+            mew=on_top["lw"],
+            zorder=on_top["zorder"],
+        )
     beyond = [f"{name}: {size:,.0f} m" for name, size in sizes.items() if size > limit]
     if beyond:
         ax.text(0.02, 0.02, "beyond: " + "\n".join(beyond), transform=ax.transAxes, fontsize=7, color=GUIDE, zorder=5)

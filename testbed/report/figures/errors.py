@@ -17,6 +17,7 @@ from testbed.score.metrics import Errors
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+LOG_LINE = 0.9  # the thinnest line of a logarithmic figure [points]
 SMOOTH_S = 2.0  # the single zero crossings of an error say nothing on a logarithmic axis
 
 
@@ -48,9 +49,9 @@ def comparison(run: Run) -> Figure | None:
     panels += [(run.aligned, *panel) for panel in of_attitude]
     drawn = sheet(len(panels), height=1.9)
     for ax, (shown, label, size) in zip(drawn.axes[:, 0], panels, strict=True):
-        for name, e in shown.items():
+        for rank, (name, e) in enumerate(shown.items()):
             line = thin(e.t, np.maximum(moving_rms(e.t, size(e), SMOOTH_S), 1e-6))
-            ax.plot(*line, **run.lines[name], lw=1.1, label=name)
+            ax.plot(*line, **run.lines[name], **layer(rank, len(shown), LOG_LINE), label=name)
         ax.set_ylabel(label)
         focus_log(ax, [size(e)[e.valid] for e in shown.values()])
     run.against_time(drawn)
@@ -166,7 +167,8 @@ def motion_errors(run: Run, name: str) -> Figure:
 OF_ALL = (
     Plot(
         "comparison",
-        "Size of the errors, logarithmic: root mean square over the last 2 s. Each line is an estimator.",
+        "Size of the errors, logarithmic: root mean square over the last 2 s. Each line is an estimator, wider below"
+        " narrower.",
         comparison,
     ),
     Plot(

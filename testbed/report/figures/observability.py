@@ -10,7 +10,7 @@ import numpy as np
 from nav.observability import Visibility
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
-from testbed.report.style import sheet
+from testbed.report.style import RIGHT, sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,7 +33,7 @@ def visibility(run: Run) -> Figure | None:
 
     states = states_of(seen)
     columns = min(len(seen), ABREAST)
-    drawn = sheet(-(-len(seen) // columns), columns, height=0.16 * max(len(states), 8), gap=0.3, left=1.7)
+    drawn = sheet(-(-len(seen) // columns), columns, height=0.16 * max(len(states), 8), gap=0.3, margins=(1.7, RIGHT))
     drawn.figure.subplots_adjust(wspace=0.06)
     for ax, (name, own) in zip(drawn.axes.flat, seen.items(), strict=False):
         cells = np.zeros((len(states), len(own.rank), 4))
