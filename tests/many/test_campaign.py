@@ -32,6 +32,7 @@ from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
 from testbed.report import campaign_figures
+from testbed.results import MANIFEST
 from testbed.score import metrics
 
 AT_REST = """
@@ -534,7 +535,7 @@ def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
 def test_nothing_flown_draws_nothing(tmp_path: Path) -> None:
     result = made_up_campaign(tmp_path, [""], runs=0)
     campaign_report.save(result)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["campaign.csv", "campaign.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["campaign.csv", "campaign.json", MANIFEST]
     assert json.loads((tmp_path / "campaign.json").read_text())["failures"][0]["message"] == "lost"
 
 

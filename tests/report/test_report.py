@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from rich.console import Console
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
+from testbed.report import campaign_figures, style, tables
 from testbed.report import page as report
-from testbed.report import style, tables
 from testbed.report.figures import consistency, imu
 from testbed.report.run import Run
 from testbed.results import start_anew
@@ -185,3 +186,48 @@ def test_unwritable_folder_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="can't be written"):
         report.write_report(synthetic_run.dataset(5.0), {}, tmp_path / "file")
+
+
+def test_tables_turn_over_where_they_do_not_fit() -> None:
+    names = ("ins", "dead_reckoning", "federated_with_a_long_name", "ahrs")
+    found = {
+        f"{name}.{prefix}{key}": 1234.5 + k
+        for k, name in enumerate(names)
+        for prefix in ("", "outage_")
+        for key, _ in tables.ROWS
+    }
+    found |= {f"{name}.{key}.pitot_blocked_again": 1.0 for name in names for key in ("missed", "isolation_correct")}
+
+    def shown(what: object, width: int) -> list[str]:
+        out = io.StringIO()
+        Console(file=out, width=width).print(what)
+        assert "…" not in out.getvalue()
+        return out.getvalue().splitlines()
+
+    for what in (tables.summary(found), tables.fault_table(found)):
+        wide, narrow = shown(what, 250), shown(what, 80)
+        assert (sum("┏" in line for line in wide), sum("┏" in line for line in narrow)) == (1, len(names))
+        assert max(map(len, narrow)) <= 80
+        numbers = [re.findall(r"1\.23e\+03|1\.24e\+03|yes", "\n".join(lines)) for lines in (wide, narrow)]
+        assert sorted(numbers[0]) == sorted(numbers[1]) != []
+
+
+def test_page_fits_a_phone_has_contents_and_is_the_same_again(tmp_path: Path) -> None:
+    recorder = Recorder(None, scenario(5.0), 1)
+    recorder.truth(circle(5.0))
+    recorder.event(1.0, "info", "something")
+    pages = [report.write_report(recorder.dataset(), {}, tmp_path / name).read_text("utf-8") for name in "ab"]
+    assert pages[0] == pages[1]
+    assert '<meta name="viewport" content="width=device-width, initial-scale=1">' in pages[0]
+    targets = re.findall(r'href="#([^"]+)"', pages[0])
+    assert targets == ["all-estimators", "events", "record"]
+    assert all(f'id="{target}"' in pages[0] for target in targets)
+    assert pages[0].count('<div class="wide"><table') == pages[0].count("<table") > 0
+
+
+def test_whiskers_are_where_the_caption_says() -> None:
+    axes = Figure().subplots()
+    errors = np.random.default_rng(0).gamma(2.0, size=7).tolist()
+    campaign_figures._boxes(axes, [errors, []], "#123456")
+    ends = [line.get_ydata() for line in axes.get_lines() if len(line.get_ydata()) == 2]
+    assert {np.percentile(errors, 5), np.percentile(errors, 95)} <= {float(y) for own in ends for y in own}
