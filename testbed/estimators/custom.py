@@ -18,16 +18,7 @@ else `Adapter` stands in for them.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import importlib
-import importlib.util
-import sys
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
-from importlib.metadata import entry_points
-from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -36,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from nav import strapdown
 from nav.horizon import FusionHorizon
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from testbed import plugins
 from testbed.errors import UserError, choice, shown, unknown
 from testbed.estimators.lane import Lane, mountings
 from testbed.estimators.rig import Rig
@@ -80,14 +72,14 @@ def build(section: CustomSection, rig: Rig) -> Lane:
 
     Raises UserError when its class can't be had, does not have the three methods, or refuses its options.
     """
-    made = load(section.kind, rig.folder)
+    made = plugins.load(section.kind, rig.folder, GROUP)
     options = _options(section, made)
     try:
         inner = made(rig, **options)
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"estimator {section.name}: {section.kind} can't be made: {_told(error)}") from error
+        raise UserError(f"estimator {section.name}: {section.kind} can't be made: {plugins.raised(error)}") from error
     missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     if missing:
         raise UserError(f"estimator {section.name}: {section.kind} lacks {', '.join(missing)}: see docs/extending.md")
@@ -114,64 +106,6 @@ def _options(section: CustomSection, made: Any) -> dict[str, Any]:
             ) from None
         raise UserError(f"estimator {section.name}: {key}: {first['msg']}, not {shown(first['input'])}") from None
     return {name: getattr(checked, name) for name in options.model_fields} | dict(checked.model_extra or {})
-
-
-# --- finding the class
-
-
-@cache
-def installed() -> Mapping[str, str]:
-    """The kinds that installed packages offer by entry points: name and ``module:Class``."""
-    return {point.name: point.value for point in entry_points(group=GROUP)}
-
-
-def load(kind: str, folder: Path) -> Any:
-    """The class that ``kind`` names; a path is relative to ``folder``. Raises UserError when it can't be had."""
-    where, _, name = installed().get(kind, kind).rpartition(":")
-    try:
-        module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
-    except UserError:
-        raise
-    except ModuleNotFoundError as error:
-        if error.name is not None and where.split(".")[0] != error.name.split(".")[0]:
-            raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}") from error
-        todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
-        raise UserError(f"kind {shown(kind)}: there is no module {where}: {todo}") from None
-    except Exception as error:
-        raise UserError(f"kind {shown(kind)}: {where} can't be imported: {_told(error)}") from error
-    if not hasattr(module, name):
-        classes = [key for key, value in vars(module).items() if isinstance(value, type) and not key.startswith("_")]
-        raise UserError(f"kind {shown(kind)}: {unknown(f'class in {where}', name, classes)}")
-    return getattr(module, name)
-
-
-def _file(path: Path) -> ModuleType:
-    """The module in a file, the same one as long as the file is the same."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: can't be read: {error.strerror}: a path is relative to the scenario file") from None
-    name = f"{path.stem}_{hashlib.sha256(str(path.resolve()).encode() + content).hexdigest()[:12]}"
-    if name in sys.modules:
-        return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None  # its name ends with .py
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
-
-
-def _told(error: BaseException) -> str:
-    """What was raised and where, on one line."""
-    frames = traceback.extract_tb(error.__traceback__)
-    at = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {error}{at}"
 
 
 # --- running it
@@ -233,7 +167,7 @@ class Adapter:
         try:
             return ask()
         except Exception as error:
-            self.failure = _told(error)
+            self.failure = plugins.raised(error)
             return otherwise
 
 

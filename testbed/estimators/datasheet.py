@@ -15,7 +15,7 @@ from nav.error_model import ImuModel
 from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
-from testbed.sensors import SensorConfig
+from testbed.sensors import SensorConfig, registry
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocityConfig
@@ -105,7 +105,8 @@ def own_aid(name: str, section: SensorConfig, imu: ImuErrors, slip_mps: float | 
         case PositionFixConfig():
             p = section.errors()
             return PositionFixAid(name, tuple(p.position_n), p.height, arm_b)
-    return None
+    maker = registry.of(section).aid  # of a sensor of the user's
+    return None if maker is None else maker(name, section, imu)
 
 
 def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float, usual: Usual) -> dict[str, object]:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from testbed import plugins
 from testbed.errors import UserError, choice, shown
 from testbed.estimators import ahrs, custom, federated, ins
 from testbed.estimators.lane import Lane
@@ -36,9 +37,9 @@ def find(kind: str) -> Kind:
     """
     if kind in BUILT_IN:
         return BUILT_IN[kind]
-    if ":" in kind or kind in custom.installed():
+    if ":" in kind or kind in plugins.installed(custom.GROUP):
         return CUSTOM
-    known = [*BUILT_IN, *custom.installed()]
+    known = [*BUILT_IN, *plugins.installed(custom.GROUP)]
     text = f"there is no kind {shown(kind)}: {choice(kind, known)}"
     raise UserError(f'{text}, or name a class of your own, such as "./filters.py:Mine" or "mypackage.filters:Mine"')
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from testbed.errors import unknown
 from testbed.schema import Section
-from testbed.sensors import SensorConfig
+from testbed.sensors import SensorConfig, registry
 
 Mistake: TypeAlias = tuple[tuple[str | int, ...], str]  # where in the table, and what is wrong
 
@@ -84,7 +84,7 @@ def aid_mistakes(
     kind: str, aids: Sequence[str], sensors: Mapping[str, SensorConfig], usable: frozenset[str]
 ) -> Iterator[Mistake]:
     """What is wrong with a list of aids, of sensors that are of ``usable`` kinds."""
-    names = [name for name, sensor in sensors.items() if sensor.kind in usable]
+    names = [name for name, one in sensors.items() if one.kind in usable or registry.of(one).aid is not None]
     for index, aid in enumerate(aids):
         if aid in sensors and aid not in names:
             yield ("aids", index), f"{aid!r} is of kind {sensors[aid].kind!r}, which does not aid {kind!r}"

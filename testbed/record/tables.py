@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -140,12 +140,19 @@ def _text(values: Sequence[str], dtype: str) -> Data:
 def pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]]:
     """Samples of one sensor."""
     block: Block = {"time": _scalars(samples, "t")}
+    variables = dict(SAMPLE)
     for f in fields(samples[0]):
         if f.name in ("t", "sensor"):
             continue
-        variable = SAMPLE[f.name]
+        variable = variables.setdefault(f.name, _own(f, getattr(samples[0], f.name)))
         block[f.name] = _vectors(samples, f.name) if variable.dims else _scalars(samples, f.name, variable.dtype)
-    return block, SAMPLE
+    return block, variables
+
+
+def _own(f: Field[Any], value: Any) -> Variable:
+    """A number of a sample of the user's: unit and meaning from its metadata."""
+    unit, meaning = (str(f.metadata.get(key, "unknown")) for key in ("unit", "meaning"))
+    return Variable(unit, meaning, ("component",) if np.ndim(value) else ())
 
 
 def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Variable]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from pydantic import ValidationError
@@ -16,7 +17,7 @@ from testbed.estimators.section import DEFAULT_ESTIMATOR
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
 from testbed.schema import Section
-from testbed.sensors import CONFIGS
+from testbed.sensors import registry as sensor_registry
 
 ERRORS_SHOWN = 20
 MISSING = "is missing: add it"
@@ -24,21 +25,22 @@ TAG_KEYS = ("leg", "source", "kind")  # whose values tell sections of a union ap
 
 
 class Written(NamedTuple):
-    """A scenario as it was given: its data and text, the name of its file, and which override set which key."""
+    """A scenario as it was given: data, text, the file's name and folder, and which override set which key."""
 
     data: dict[str, Any]
     text: str
     place: str
     set_paths: Mapping[KeyPath, str]
+    folder: Path
 
 
 def report(error: ValidationError, root: type[Section], written: Written) -> str:
     """Every error on a line of its own: file, line, key path, what is wrong and what to do; ``root`` is the whole's."""
-    data, text, place, set_paths = written
+    _, text, place, set_paths, _ = written
     said: dict[KeyPath, list[str]] = {}
     misspelt: set[KeyPath] = set()
     for details in error.errors(include_url=False):
-        path, models = _locate(details, root, data)
+        path, models = _locate(details, root, written)
         said.setdefault(path, []).append(_say(details, path, models))
         if details["type"] == "extra_forbidden":
             misspelt.update((*path[:-1], key) for key in near(str(path[-1]), _keys(models)))
@@ -61,7 +63,7 @@ def report(error: ValidationError, root: type[Section], written: Written) -> str
     return "\n".join(told)
 
 
-def _locate(details: ErrorDetails, root: type[Section], data: dict[str, Any]) -> tuple[KeyPath, list[type[Section]]]:
+def _locate(details: ErrorDetails, root: type[Section], written: Written) -> tuple[KeyPath, list[type[Section]]]:
     """The key path of an error, and the sections whose keys may stand beside it.
 
     Pydantic's location also names the branch that it took in a union, which is no part of the file's path.
@@ -69,7 +71,7 @@ def _locate(details: ErrorDetails, root: type[Section], data: dict[str, Any]) ->
     loc = details["loc"]
     if "discriminator" in details.get("ctx", {}):
         loc = (*loc, details["ctx"]["discriminator"].strip("'"))
-    here: Any = data
+    here: Any = written.data
     path: KeyPath = ()
     models: list[type[Section]] = [root]
     for step in loc[:-1]:
@@ -79,7 +81,7 @@ def _locate(details: ErrorDetails, root: type[Section], data: dict[str, Any]) ->
             here = here[step]
             path = (*path, step)
             if len(path) == 2 and path[0] == "sensors":
-                models = [CONFIGS[here["kind"]]]
+                models = [sensor_registry.find(here["kind"], written.folder).section]
             elif len(path) == 2 and path[0] == "estimator":
                 models = [registry.find(here.get("kind", DEFAULT_ESTIMATOR)).section]
             elif isinstance(step, str):
@@ -116,7 +118,7 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
         case "missing":
             return "is missing: this item needs one more value" if isinstance(path[-1], int) else MISSING
         case "sensor_kind":
-            return unknown("sensor of kind", str(given.get("kind")), list(CONFIGS))
+            return str(context["text"])
         case "union_tag_not_found":
             known = [tag for model in models for tag in _tags(model, str(path[-1]))]
             return f"is missing: add it, one of {', '.join(known)}"

@@ -17,7 +17,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
-from pydantic import AfterValidator, Field, PlainValidator, PrivateAttr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PlainValidator,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from testbed.data import data_dir
@@ -30,7 +38,8 @@ from testbed.motion.gusts import expected_gust
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath, messages, mistakes
 from testbed.schema import LONGEST_RUN_S, Section
-from testbed.sensors import CONFIGS, SensorConfig, Site, faults
+from testbed.sensors import SensorConfig, Site, faults
+from testbed.sensors import registry as sensor_registry
 from testbed.sensors.magnetometer import covered
 
 LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
@@ -38,14 +47,16 @@ LARGEST_FILE = 1_000_000  # bytes; a scenario has a few thousand
 Date: TypeAlias = Annotated[dt.date, AfterValidator(covered)]
 
 
-def _sensor(table: object) -> Section:
+def _sensor(table: object, info: ValidationInfo) -> Section:
     """One ``[sensors.<name>]`` table, by the kind that it says or that its name says."""
     if not isinstance(table, dict):
         raise PydanticCustomError("dict_type", "Input should be a table")
-    kind = table.get("kind")
-    if not isinstance(kind, str) or kind not in CONFIGS:
-        raise PydanticCustomError("sensor_kind", "unknown sensor kind")
-    return CONFIGS[kind].model_validate(table, strict=True)
+    folder: Path = (info.context or {}).get("folder", Path())
+    try:
+        section = sensor_registry.find(str(table.get("kind")), folder).section
+    except UserError as error:
+        raise PydanticCustomError("sensor_kind", "{text}", {"text": str(error)}) from None
+    return section.model_validate(table, strict=True)
 
 
 def _estimator(table: object) -> EstimatorSection:
@@ -204,9 +215,15 @@ class Scenario(Section):
             if isinstance(table, dict):
                 table.setdefault("kind", name)
         try:
-            scenario = cls.model_validate(_frozen(data), strict=True)
+            scenario = cls.model_validate(
+                _frozen(data), strict=True, context={"folder": path.parent if path else Path()}
+            )
         except ValidationError as error:
-            raise UserError(messages.report(error, cls, messages.Written(data, text, place, set_paths))) from None
+            raise UserError(
+                messages.report(
+                    error, cls, messages.Written(data, text, place, set_paths, path.parent if path else Path())
+                )
+            ) from None
         except RecursionError:
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
         scenario._text, scenario._path, scenario._overrides = text, path, tuple(overrides)

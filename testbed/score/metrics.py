@@ -156,7 +156,10 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
     judged = slice(6 if attitude_only else 0, 9)
     every = np.column_stack([position, velocity, attitude])[:, judged]
-    finite = np.isfinite(every).all(axis=1) & np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
+    finite = np.isfinite(every).all(axis=1)
+    claimed = np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
+    if claimed.any():  # one that never claims a covariance is judged by its errors alone
+        finite &= claimed
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
     settled = since if aligned_s is None else t >= aligned_s + settling_s
     return Errors(

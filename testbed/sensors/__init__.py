@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from testbed.schema import Section
+from testbed.sensors import registry
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
 from testbed.sensors.barometer import Barometer, BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
@@ -19,7 +19,6 @@ from testbed.sensors.position_fix import PositionFix, PositionFixConfig
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
 
 __all__ = [
-    "CONFIGS",
     "AidingSensor",
     "Imu",
     "Sensor",
@@ -42,35 +41,10 @@ SensorConfig: TypeAlias = (
 AidingSensor: TypeAlias = Gnss | Magnetometer | Barometer | Airspeed | BodyVelocity | StarTracker | PositionFix
 Sensor: TypeAlias = Imu | AidingSensor
 
-# by kind
-CONFIGS: dict[str, type[Section]] = {
-    "imu": ImuConfig,
-    "gnss": GnssConfig,
-    "magnetometer": MagnetometerConfig,
-    "barometer": BarometerConfig,
-    "airspeed": AirspeedConfig,
-    "body_velocity": BodyVelocityConfig,
-    "star_tracker": StarTrackerConfig,
-    "position_fix": PositionFixConfig,
-}
-
 
 def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site: Site) -> Sensor:
     """The sensor for one run. Raises UserError when its samples do not fall on ticks or no field model has the date."""
-    match config:
-        case ImuConfig():
-            return Imu(name, config, tick_rate_hz, seed)
-        case GnssConfig():
-            return Gnss(name, config, tick_rate_hz, seed)
-        case MagnetometerConfig():
-            return Magnetometer(name, config, tick_rate_hz, seed, site)
-        case BarometerConfig():
-            return Barometer(name, config, tick_rate_hz, seed)
-        case AirspeedConfig():
-            return Airspeed(name, config, tick_rate_hz, seed)
-        case BodyVelocityConfig():
-            return BodyVelocity(name, config, tick_rate_hz, seed)
-        case StarTrackerConfig():
-            return StarTracker(name, config, tick_rate_hz, seed)
-        case PositionFixConfig():
-            return PositionFix(name, config, tick_rate_hz, seed)
+    made = registry.of(config).sensor
+    given = (name, config, tick_rate_hz, seed)
+    sensor: Sensor = made(*given, site) if isinstance(config, MagnetometerConfig) else made(*given)
+    return sensor

@@ -22,6 +22,7 @@ from worlds.ahrs import (
     run,
     tilted,
 )
+from worlds.sections import SECTIONS
 
 from nav import ahrs as module
 from nav.ahrs import BIAS, PHI, STATES, Ahrs, AhrsConfig
@@ -584,7 +585,7 @@ def test_half_an_hour_without_gnss(plan):
     for seed in (1, 2, 3):
         sense = {}
         for kind, keys in SENSORS.items():
-            section = sensors.CONFIGS[kind].model_validate(keys, strict=True)
+            section = SECTIONS[kind].model_validate(keys, strict=True)
             sense[kind] = section, sensors.build(kind, section, 200.0, seed, None).sense(truth)
         model = imu_model(sense["imu"][0].errors())
         told = AhrsConfig(model, LAT, 300.0, ("airspeed", "barometer"), heading=30 * DEG, force_sigma=0.3)

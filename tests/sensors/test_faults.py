@@ -13,17 +13,18 @@ import pymap3d
 import pytest
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
+from worlds.sections import SECTIONS
 from worlds.sensor_truth import RATE_HZ, cut, lively, still
 
 from nav.earth import isa_pressure
 from nav.samples import FixType, ImuSamples
 from testbed import sensors
-from testbed.sensors import CONFIGS, faults
+from testbed.sensors import faults
 from testbed.sensors.faults import CHANNELS, Faults
 
 DURATION_S = 30.0
 SITE = sensors.Site(dt.date(2026, 6, 1), 0.0, 0.0, 0.0)
-KINDS = tuple(CONFIGS)
+KINDS = tuple(SECTIONS)
 FAULT: TypeAdapter[Any] = TypeAdapter(faults.Fault)
 G_TO_SI = 9.80665
 
@@ -33,7 +34,7 @@ def fault(**keys: Any) -> Any:
 
 
 def section(kind: str, **keys: Any) -> Any:
-    return CONFIGS[kind].model_validate({"kind": kind, **keys}, strict=True)
+    return SECTIONS[kind].model_validate({"kind": kind, **keys}, strict=True)
 
 
 def sensed(

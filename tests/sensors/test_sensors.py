@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from pydantic import ValidationError
+from worlds.sections import SECTIONS
 from worlds.sensor_truth import RATE_HZ, cut, lively
 
 from nav.samples import (
@@ -94,15 +95,15 @@ def outputs(name, kind, config, blocks, seed=1):
     )
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_every_field_of_a_sample_is_recorded(kind):
     recorded = record.IMU if kind == "imu" else record.SAMPLE
     assert {f.name for f in fields(SAMPLES[kind])} - {"t", "sensor"} <= recorded.keys()
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_configuration_defaults_to_its_kind_and_builds(kind):
-    config = sensors.CONFIGS[kind]()
+    config = SECTIONS[kind]()
     assert config.kind == kind
     sensor = sensors.build("x", config, RATE_HZ, 1, SITE)
     assert sensor.name == "x"
@@ -115,7 +116,7 @@ GRADES = [(kind, grade) for kind, module in MODULES.items() for grade in module.
 
 @pytest.mark.parametrize(("kind", "grade"), GRADES)
 def test_grade_sets_its_keys_and_what_is_written_wins(kind, grade):
-    config = sensors.CONFIGS[kind]
+    config = SECTIONS[kind]
     preset = MODULES[kind].GRADES[grade]
     for key, value in preset.items():
         assert getattr(config(grade=grade), key) == value
@@ -126,9 +127,9 @@ def test_grade_sets_its_keys_and_what_is_written_wins(kind, grade):
         assert overridden.model_dump(exclude={key}) == config(grade=grade).model_dump(exclude={key})
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_section_takes_toml_lists_and_refuses_strings_for_numbers(kind):
-    config = sensors.CONFIGS[kind]
+    config = SECTIONS[kind]
     config.model_validate_json('{"rate_hz": 5}', strict=True)
     if kind in ("imu", "gnss"):
         config.model_validate_json('{"lever_arm_m": [1, 0, 0.5]}', strict=True)
@@ -188,50 +189,50 @@ def test_section_takes_toml_lists_and_refuses_strings_for_numbers(kind):
 ])  # fmt: skip
 def test_out_of_range_is_refused(kind, key, value):
     with pytest.raises(ValidationError) as raised:
-        sensors.CONFIGS[kind](**{key: value})
+        SECTIONS[kind](**{key: value})
     assert raised.value.errors()[0]["loc"][0] == key
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_a_rate_that_does_not_divide_the_tick_is_refused(kind):
     with pytest.raises(UserError, match=r"sensors\.x\.rate_hz"):
-        sensors.build("x", sensors.CONFIGS[kind](rate_hz=30.0), RATE_HZ, 1, SITE)
+        sensors.build("x", SECTIONS[kind](rate_hz=30.0), RATE_HZ, 1, SITE)
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 @settings(max_examples=40, deadline=None)
 @given(cuts=st.lists(st.integers(0, 400), max_size=8))
 def test_result_does_not_depend_on_blocks(kind, cuts):
-    config = sensors.CONFIGS[kind](**EVERYTHING[kind])
+    config = SECTIONS[kind](**EVERYTHING[kind])
     whole = outputs(kind, kind, config, [TRUTH])
     assert len(whole) > 3
     np.testing.assert_array_equal(outputs(kind, kind, config, cut(TRUTH, cuts)), whole)
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_result_does_not_depend_on_blocks_tick_by_tick(kind):
-    config = sensors.CONFIGS[kind](**EVERYTHING[kind])
+    config = SECTIONS[kind](**EVERYTHING[kind])
     whole = outputs(kind, kind, config, [TRUTH])
     np.testing.assert_array_equal(outputs(kind, kind, config, cut(TRUTH, list(range(1, 400)))), whole)
 
 
 def test_adding_a_sensor_changes_no_other():
     """Run alone and run in the company of others, also of its own kind: the same bits."""
-    alone = {k: outputs(k, k, sensors.CONFIGS[k](**EVERYTHING[k]), [TRUTH]) for k in sensors.CONFIGS}
+    alone = {k: outputs(k, k, SECTIONS[k](**EVERYTHING[k]), [TRUTH]) for k in SECTIONS}
     company = {}
-    for kind in [*reversed(sensors.CONFIGS), *sensors.CONFIGS]:
-        company[f"{kind}_2"] = sensors.build(f"{kind}_2", sensors.CONFIGS[kind](), RATE_HZ, 1, SITE)
-        company[kind] = sensors.build(kind, sensors.CONFIGS[kind](**EVERYTHING[kind]), RATE_HZ, 1, SITE)
+    for kind in [*reversed(SECTIONS), *SECTIONS]:
+        company[f"{kind}_2"] = sensors.build(f"{kind}_2", SECTIONS[kind](), RATE_HZ, 1, SITE)
+        company[kind] = sensors.build(kind, SECTIONS[kind](**EVERYTHING[kind]), RATE_HZ, 1, SITE)
     for sensor in company.values():
         sensor.sense(TRUTH.rows(0, 100))
-    for kind in sensors.CONFIGS:
-        together = outputs(kind, kind, sensors.CONFIGS[kind](**EVERYTHING[kind]), [TRUTH])
+    for kind in SECTIONS:
+        together = outputs(kind, kind, SECTIONS[kind](**EVERYTHING[kind]), [TRUTH])
         np.testing.assert_array_equal(together, alone[kind])
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_name_and_seed_make_the_noise(kind):
-    config = sensors.CONFIGS[kind](**EVERYTHING[kind])
+    config = SECTIONS[kind](**EVERYTHING[kind])
     reference = outputs("a", kind, config, [TRUTH])
     np.testing.assert_array_equal(outputs("a", kind, config, [TRUTH]), reference)
     assert not np.array_equal(outputs("b", kind, config, [TRUTH]), reference, equal_nan=True)
@@ -258,10 +259,10 @@ def error_keys(kind, grade):
     return [key for key, value in numbers.items() if not any(w in key for w in words) and value != 0]
 
 
-@pytest.mark.parametrize("kind", sensors.CONFIGS)
+@pytest.mark.parametrize("kind", SECTIONS)
 def test_switching_one_error_off_removes_that_error_and_no_other(kind):
     """The errors are additive to first order: the parts, each alone, sum to the whole."""
-    module, config = MODULES[kind], sensors.CONFIGS[kind]
+    module, config = MODULES[kind], SECTIONS[kind]
     grade = list(module.GRADES)[-1]
     plain = {"grade": "perfect", "rate_hz": 10.0}
     keys = error_keys(kind, grade)

@@ -1,0 +1,68 @@
+"""An estimator that is a program of its own, in any language: fed and answering over a pipe, a line each way.
+
+To the program, fields separated by blanks, SI units and radians, ``nan`` where there is nothing:
+
+    imu N                      N lines follow:  t dt dtheta_x dtheta_y dtheta_z dv_x dv_y dv_z
+    gnss t lat lon h v_north v_east v_down sigma_north sigma_east sigma_down fix
+    magnetometer t x y z       [T], body axes
+    barometer t pressure       [Pa]
+    airspeed t eas             [m/s]
+    estimate                   asks for one line in answer:
+
+    t aligned lat lon h v_north v_east v_down q_w q_x q_y q_z
+
+``aligned`` is 0 or 1. Nothing else is answered; the end of its input is the end of the run.
+"""
+
+import subprocess
+
+import numpy as np
+
+from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, MagnetometerSample, Status
+
+
+class External:
+    """Kind ``./external.py:External`` with the key ``command``, a list: the program and its arguments."""
+
+    def __init__(self, rig, command):
+        self.program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def propagate(self, imu):
+        rows = np.column_stack([imu.t, imu.dt, imu.dtheta, imu.dv]).tolist()
+        self.program.stdin.write(f"imu {len(rows)}\n" + "".join(line(*row) for row in rows))
+
+    def update(self, sample):
+        match sample:
+            case GnssSample():
+                place = (sample.t, sample.lat, sample.lon, sample.h)
+                self.tell("gnss", *place, *sample.v_n, *sample.sigma_position_n, int(sample.has_fix))
+            case MagnetometerSample():
+                self.tell("magnetometer", sample.t, *sample.field_b)
+            case BarometerSample():
+                self.tell("barometer", sample.t, sample.pressure)
+            case AirspeedSample():
+                self.tell("airspeed", sample.t, sample.eas)
+
+    def tell(self, what, *fields):
+        self.program.stdin.write(f"{what} " + line(*fields))
+
+    def estimate(self):
+        self.program.stdin.write("estimate\n")
+        self.program.stdin.flush()
+        answer = self.program.stdout.readline()
+        if not answer:
+            raise RuntimeError(f"the program has ended with exit code {self.program.wait()}")
+        t, aligned, *state = map(float, answer.split())
+        if not aligned:
+            return Estimate.of(t)
+        lla, v_n, q_nb = (np.array(part) for part in (state[:3], state[3:6], state[6:]))
+        return Estimate.of(t, q_nb=q_nb, lla=lla, v_n=v_n, status=Status.ALIGNED)
+
+    def __del__(self):
+        self.program.stdin.close()
+        self.program.stdout.close()
+        self.program.wait()
+
+
+def line(*fields):
+    return " ".join(map(repr, map(float, fields))) + "\n"

@@ -1,0 +1,217 @@
+"""Anybody's estimator: found, checked, run beside ours, and contained when it fails."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from worlds.loop import same
+
+from testbed import Scenario, run
+from testbed.errors import UserError
+from testbed.estimators import custom
+
+EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+SHORT = {"duration_s": 12, "expect": {}}
+
+MINE = """
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from nav.samples import Estimate, GnssSample
+
+
+class Mine:
+    class Options(BaseModel):
+        model_config = ConfigDict(extra="forbid")
+        after_s: float = 1e9
+        how: str = "raise"
+
+    def __init__(self, rig, after_s, how):
+        self.t, self.fix, self.after_s, self.how, self.times = 0.0, None, after_s, how, []
+        assert rig.sensors["gnss"].errors().latency >= 0
+        assert rig.tick_rate_hz == 200.0
+
+    def propagate(self, imu):
+        self.t = imu.t[-1]
+        if self.t > self.after_s and self.how == "raise":
+            raise RuntimeError("lost its way")
+        if self.how == "spoil":
+            imu.dtheta[:] = 0.0
+
+    def update(self, sample):
+        self.times.append(sample.t)
+        assert self.times == sorted(self.times) and abs(sample.t - self.t) < 1e-6
+        if isinstance(sample, GnssSample) and sample.has_fix:
+            self.fix = sample
+
+    def estimate(self):
+        if self.fix is None:
+            return Estimate.of(self.t)
+        if self.t > self.after_s and self.how == "nan":
+            return Estimate.of(self.t, q_nb=np.full(4, np.nan), lla=np.full(3, np.nan))
+        if self.t > self.after_s and self.how == "shape":
+            return Estimate.of(self.t, q_nb=np.zeros(3))
+        if self.t > self.after_s and self.how == "type":
+            return 3.0
+        lla = np.array([self.fix.lat, self.fix.lon, self.fix.h])
+        return Estimate.of(self.t, q_nb=np.array([1.0, 0, 0, 0]), lla=lla, v_n=self.fix.v_n)
+
+
+class Bare:
+    def __init__(self, rig):
+        pass
+"""
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder: a scenario with ours and theirs, and their file beside it."""
+    folder = tmp_path_factory.mktemp("mine")
+    (folder / "filters.py").write_text(MINE)
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[expect]")[0]
+    mine = '[[estimator]]\nname = "mine"\nkind = "./filters.py:Mine"\n'
+    (folder / "own.toml").write_text(f"{text}\n{mine}", "utf-8")
+    return folder
+
+
+def flown(folder: Path, **options: object):
+    keys = {f"estimator[1].{key}": value for key, value in options.items()}
+    return run(Scenario.load(folder / "own.toml", SHORT | keys))
+
+
+@pytest.fixture(scope="session")
+def healthy(folder: Path):
+    return flown(folder)
+
+
+def ours(result) -> dict[str, np.ndarray]:
+    return {name: one.values for name, one in result.dataset["estimators/ins"].data_vars.items()}
+
+
+def test_it_runs_beside_ours_and_is_recorded(healthy) -> None:
+    own, truth = healthy.dataset["estimators/mine"], healthy.dataset["truth"]
+    assert own["time"].values[-1] == truth["time"].values[-1]
+    north = np.abs(own["lat"].values - truth["lat"].values)[50:].max() * 6.37e6
+    assert north < 15.0  # the last fix, carried on by the increments
+    assert healthy.remarks[-1].startswith("mine: its errors are not scored")
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("raise", "RuntimeError: lost its way (filters.py, line"),
+        ("shape", "ValueError: estimate: q_nb has shape (3,), not (4,)"),
+        ("type", "TypeError: estimate gave float where nav.samples.Estimate was expected"),
+        ("spoil", "ValueError: assignment destination is read-only"),
+    ],
+)
+def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str) -> None:
+    """Told with its name; ours has the same bits as beside a sound one."""
+    result = flown(folder, how=how, after_s=5.0)
+    (remark,) = [one for one in result.remarks if "has ended" in one]
+    assert remark.startswith(f"mine has ended: {says}")
+    events = result.dataset["events"]
+    (told,) = [text for text in events["text"].values.tolist() if "has ended" in text]
+    assert told == remark
+    assert np.isnan(result.dataset["estimators/mine/lat"].values[-1])
+    before, after = ours(healthy), ours(result)
+    assert before.keys() == after.keys()
+    assert all(np.array_equal(before[name], after[name], equal_nan=before[name].dtype.kind == "f") for name in before)
+
+
+def test_same_bits_live_and_batch(folder: Path, healthy) -> None:
+    live = run(Scenario.load(folder / "own.toml", SHORT), realtime=1000.0)
+    assert same(healthy.dataset, live.dataset)
+
+
+def test_nan_is_never_flown_on(folder: Path) -> None:
+    keys = {"estimator[1].how": "nan", "estimator[1].after_s": 6.0, "autopilot.feedback": "mine"}
+    result = run(Scenario.load(folder / "own.toml", SHORT | keys))
+    assert result.failure.startswith("the autopilot lost its estimate: mine gives no")
+    assert np.isfinite(result.dataset["truth/lat"].values).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("filters", 'there is no kind "filters": choose from ins, federated, ahrs'),
+        ("inss", "did you mean ins?"),
+        ("./none.py:Mine", "can't be read: No such file or directory: a path is relative to the scenario file"),
+        ("./filters.py:Mind", 'there is no class in ./filters.py "Mind": did you mean Mine?'),
+        ("nowhere.filters:Mine", "there is no module nowhere.filters: install it, or give its file, such as"),
+        ("./filters.py:Bare", "./filters.py:Bare lacks propagate, update, estimate"),
+        ("math:pi", "math:pi can't be made: TypeError"),
+    ],
+)
+def test_what_is_wrong_with_a_kind_is_said(folder: Path, kind: str, says: str) -> None:
+    with pytest.raises(UserError) as told:
+        flown(folder, kind=kind)
+    assert says in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"after": 3}, "estimator mine: after: unknown key: did you mean after_s?"),
+        ({"after_s": "soon"}, "estimator mine: after_s: "),
+        ({"aids": ["gnss2"]}, 'there is no sensor "gnss2"'),
+        ({"imu": "gnss"}, 'there is no IMU "gnss"'),
+    ],
+)
+def test_what_is_wrong_with_its_keys_is_said(folder: Path, options: dict[str, object], says: str) -> None:
+    with pytest.raises(UserError) as told:
+        flown(folder, **options)
+    assert says in str(told.value)
+
+
+def test_a_file_that_does_not_run_says_where(tmp_path: Path) -> None:
+    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    with pytest.raises(
+        UserError, match=r"can't be imported: ZeroDivisionError: division by zero \(broken.py, line 2\)"
+    ):
+        custom.load("./broken.py:Mine", tmp_path)
+
+
+def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
+    monkeypatch.setattr(custom, "installed", lambda: {"theirs": "filters_installed:Mine"})
+    monkeypatch.syspath_prepend(str(folder))
+    (folder / "filters_installed.py").write_text(MINE)
+    assert flown(folder, kind="theirs").dataset["estimators/mine"]["time"].size
+
+
+# --- the examples of the manual
+
+
+def example(file: str, kind: str, **keys: object):
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[[estimator]]")[0]
+    own = f'[[estimator]]\nname = "own"\nkind = "./{file}:{kind}"\n'
+    scenario = Scenario.parse(f"{text}\n{own}", [], EXAMPLES / "own.toml")
+    return run(Scenario.parse(text + own, overrides(keys), EXAMPLES / "own.toml")), scenario
+
+
+def overrides(keys: dict[str, object]) -> list[str]:
+    from testbed.scenario import keypath
+
+    return [keypath.override(f"estimator[0].{key}", value) for key, value in keys.items()]
+
+
+def test_complementary() -> None:
+    result, _ = example("complementary.py", "Complementary", estimates="attitude", time_constant_s=20.0)
+    print(result.metrics)
+    assert result.metrics["own.roll_pitch_rms_deg"] < 8.0  # gravity is not down in a turn
+    assert "own.attitude_nees_mean" not in result.metrics
+
+
+def test_published() -> None:
+    pytest.importorskip("vqf")
+    result, _ = example("published.py", "Published", estimates="attitude")
+    print(result.metrics)
+    assert result.metrics["own.roll_pitch_rms_deg"] < 8.0
+
+
+def test_external() -> None:
+    command = [sys.executable, str(EXAMPLES / "external_filter.py")]
+    result, _ = example("external.py", "External", command=command)
+    print(result.metrics)
+    assert result.metrics["own.position_horizontal_rms_m"] < 10.0
+    assert not [one for one in result.remarks if "has ended" in one]

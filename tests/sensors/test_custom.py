@@ -1,0 +1,80 @@
+"""Anybody's sensor: found, sensed, recorded, and aiding the filters."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from testbed import Scenario, run
+from testbed.errors import UserError
+
+RADAR = """
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic import Field
+
+from testbed.sensors.noise import Process, stream
+from testbed.sensors.timing import AidingTiming, Schedule
+
+
+@dataclass(frozen=True, slots=True)
+class HeightSample:
+    t: float
+    t_arrival: float
+    height: float = field(metadata={"unit": "m", "meaning": "height above the ellipsoid"})
+    sensor: str = "radar"
+
+
+class Radar:
+    class Section(AidingTiming):
+        noise_m: float = Field(0.5, ge=0, description="1 sigma")
+
+    def __init__(self, name, section, tick_rate_hz, seed):
+        self.name, self.schedule = name, Schedule.of(name, section, tick_rate_hz)
+        self.white = Process.white(stream(seed, name, "white"), [section.noise_m])
+
+    def sense(self, truth):
+        rows = self.schedule.rows(truth)
+        noise = self.white.take(len(rows))[:, 0] if len(rows) else ()
+        return [
+            HeightSample(float(truth.t[k]), float(truth.t[k]) + self.schedule.latency, float(truth.h[k] + e), self.name)
+            for k, e in zip(rows, noise)
+        ]
+"""
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("radar")
+    (folder / "radar.py").write_text(RADAR)
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[expect]")[0]
+    (folder / "own.toml").write_text(f'{text}\n[sensors.radar]\nkind = "./radar.py:Radar"\nrate_hz = 5\n', "utf-8")
+    return folder / "own.toml"
+
+
+def test_it_is_recorded_with_unit_and_noise(scenario: Path) -> None:
+    dropout = {"sensor": "radar", "kind": "dropout", "window": [10.0, 15.0]}
+    result = run(Scenario.load(scenario, {"duration_s": 20, "fault": [dropout], "sensors.radar.noise_m": 2.0}))
+    own, truth = result.dataset["sensors/radar"], result.dataset["truth"]
+    assert own["height"].attrs["units"] == "m"
+    t = own["time"].values
+    assert not ((t >= 10.0) & (t < 15.0)).any()
+    error = own["height"].values - np.interp(t, truth["time"].values, truth["h"].values)
+    assert 1.5 < error.std() < 2.6
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        ({"sensors.radar.noise": 1.0}, "sensors.radar.noise: unknown key: did you mean noise_m?"),
+        ({"sensors.radar.noise_m": -1.0}, "sensors.radar.noise_m: must be greater than or equal to 0"),
+        ({"sensors.radar.kind": "./radar.py:Rader"}, 'there is no class in ./radar.py "Rader": did you mean Radar?'),
+        ({"sensors.radar.kind": "./radar.py:HeightSample"}, "lacks a Section"),
+        ({"estimator[0].aids": ["gnss", "radar"]}, "'radar' is of kind './radar.py:Radar', which does not aid 'ins'"),
+    ],
+)
+def test_what_is_wrong_is_said(scenario: Path, overrides: dict[str, object], says: str) -> None:
+    with pytest.raises(UserError) as told:
+        Scenario.load(scenario, overrides)
+    assert says in str(told.value)
