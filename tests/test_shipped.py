@@ -54,7 +54,14 @@ def passes_its_check(name: str, out: Path) -> None:
     assert not outcome.failed, "\n".join([str(outcome), *(str(row) for row in outcome.rows if not row.sound)])
 
 
-@pytest.mark.parametrize("name", [n for n in SCENARIOS if Scenario.load(n).duration_s <= SHORT_S])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(n, marks=[] if n == "u_turn" else [pytest.mark.ci])
+        for n in SCENARIOS
+        if Scenario.load(n).duration_s <= SHORT_S
+    ],
+)
 def test_short_scenario_passes_its_check(name: str, tmp_path: Path) -> None:
     passes_its_check(name, tmp_path)
 

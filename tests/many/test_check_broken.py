@@ -113,10 +113,10 @@ def test_unbroken_it_passes(verdict: Callable[[], check.Outcome]) -> None:
 
 BREAKS = [
     pytest.param(sign("magnetometer", PHI), "ins.heading_rms_deg", id="sign-magnetometer"),
-    pytest.param(noise("gnss"), "ins.nis_mean.gnss_position", id="R-x-100-gnss"),
-    pytest.param(no_detector, "federated.missed.ramp", id="no-detector"),
-    pytest.param(samples_as_they_arrive, "ins.position_horizontal_rms_m", id="latency-ignored"),
-    pytest.param(gravity, "federated.outage_position_horizontal_max_m", id="gravity-1-mg"),
+    pytest.param(noise("gnss"), "ins.nis_mean.gnss_position", marks=pytest.mark.ci, id="R-x-100-gnss"),
+    pytest.param(no_detector, "federated.missed.ramp", marks=pytest.mark.ci, id="no-detector"),
+    pytest.param(samples_as_they_arrive, "ins.position_horizontal_rms_m", marks=pytest.mark.ci, id="latency-ignored"),
+    pytest.param(gravity, "federated.outage_position_horizontal_max_m", marks=pytest.mark.ci, id="gravity-1-mg"),
 ]
 MORE = [
     pytest.param(sign("gnss_velocity", VEL), "ins.velocity_rms_mps", id="sign-gnss-velocity"),
