@@ -38,7 +38,9 @@ wheel-test: $(VENV)/.ready $(LOWEST)/.ready
 	$(LOWEST)/bin/python -m pip check
 	folder=$$(mktemp -d) && cd $$folder && trap "rm -rf $$folder" EXIT \
 		&& $(CURDIR)/$(LOWEST)/bin/testbed run static_bench --set duration_s=90 \
-		&& $(CURDIR)/$(LOWEST)/bin/testbed check regression
+		&& $(CURDIR)/$(LOWEST)/bin/testbed check regression \
+		&& $(CURDIR)/$(LOWEST)/bin/testbed init mine \
+		&& $(CURDIR)/$(LOWEST)/bin/testbed check mine/first.toml
 
 setup: $(VENV)/.ready
 

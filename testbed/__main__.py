@@ -1,4 +1,4 @@
-"""The command line: ``testbed scenarios | aircraft | run | check | report | export | campaign | papers | watch``.
+"""Commands: ``testbed scenarios | aircraft | run | check | report | export | campaign | papers | watch | init``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -350,6 +350,18 @@ def watch(
     if not (math.isfinite(speed) and speed > 0):
         raise UserError(f"--speed {speed:g}: the factor must be above 0, such as 10")
     show(source, _console(), speed)
+
+
+@app.command()
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder, or an empty one.")],
+) -> None:
+    """Begin a project of your own: a flight, an estimator for it, and a test of both."""
+    from testbed.data import make_project
+
+    for path in make_project(folder):
+        print(path)
+    print(f"Now: cd {folder} && testbed run first.toml")
 
 
 def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:

@@ -1,4 +1,4 @@
-"""Where the shipped aircraft and scenarios lie, and writing a file whole."""
+"""Where shipped files lie, a project made of them, and writing a file whole."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from testbed.errors import UserError
 
 
 def data_dir(name: str) -> Path:
-    """Folder of shipped data, ``"aircraft"`` or ``"scenarios"``: in `testbed` once installed, beside it in a checkout.
+    """Folder of shipped files, ``"aircraft"``, ``"scenarios"`` or ``"template"``.
 
+    They are in `testbed` once installed; aircraft and scenarios are beside it in a checkout.
     Raises UserError when the installation lacks it.
     """
     package = Path(__file__).resolve().parent
@@ -18,6 +19,24 @@ def data_dir(name: str) -> Path:
         if folder.is_dir():
             return folder
     raise UserError(f"{package / name}: the folder of shipped {name} is missing: install the package again")
+
+
+def make_project(folder: Path) -> list[Path]:
+    """Copy the template of a user's own project into a new or empty folder; the files made.
+
+    Raises UserError when there is something in it, or it can't be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UserError(f"{folder}: is not empty: name a new folder")
+    except OSError as error:
+        raise UserError(f"{folder}: can't be made: {error.strerror}: name another folder") from None
+    made = []
+    for source in sorted(path for path in data_dir("template").iterdir() if path.is_file()):
+        made.append(folder / source.name)
+        write_file(made[-1], source.read_bytes())
+    return made
 
 
 def write_file(path: Path, content: bytes) -> None:

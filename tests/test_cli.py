@@ -6,6 +6,7 @@ import io
 import math
 import os
 import re
+import runpy
 import signal
 import socket
 import subprocess
@@ -25,9 +26,10 @@ from testbed.loop import links, loop
 from testbed.many import progress
 from testbed.motion import flight
 from testbed.record import reader as record
+from testbed.scenario import Scenario
 
 QUICK = ["--set", "duration_s=3", "--no-report"]
-PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "watch"}
+PROMISED = {"scenarios", "run", "check", "report", "export", "campaign", "watch", "init"}
 
 
 class Ended:
@@ -79,6 +81,29 @@ def test_h_is_help(testbed: Testbed, command: tuple[str, ...]) -> None:
     short, long = testbed(*command, "-h"), testbed(*command, "--help")
     assert short.code == 0
     assert short.out == long.out
+
+
+def test_init_begins_a_project(testbed: Testbed, tmp_path: Path) -> None:
+    begun = testbed("init", "new/mine")
+    assert begun.code == 0
+    files = sorted(path.name for path in (tmp_path / "new/mine").iterdir())
+    assert files == ["README.md", "filters.py", "first.toml", "test_filters.py"]
+    assert begun.out.splitlines() == [
+        *(f"new/mine/{name}" for name in files),
+        "Now: cd new/mine && testbed run first.toml",
+    ]
+    assert {one.name for one in Scenario.load(tmp_path / "new/mine/first.toml").estimator} == {"mine", "ins"}
+    again = testbed("init", "new/mine")
+    assert (again.code, again.err) == (2, "testbed: new/mine: is not empty: name a new folder\n")
+    taken = testbed("init", "new/mine/README.md")
+    assert (taken.code, taken.err.count("\n")) == (2, 1)
+
+
+@pytest.mark.ci
+def test_a_project_that_was_begun_passes_its_own_test(testbed: Testbed, tmp_path: Path) -> None:
+    testbed("init", "mine")
+    tests = runpy.run_path(str(tmp_path / "mine/test_filters.py"))
+    tests["test_mine_stays_near_an_ins"]()
 
 
 def test_scenarios_lists_name_title_and_duration(testbed: Testbed) -> None:
