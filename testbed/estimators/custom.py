@@ -115,7 +115,7 @@ class Adapter:
     """A class of three methods as an estimator of the house (`nav.horizon.Estimator`).
 
     What it raises, or gives that is no estimate, is its end: ``failure`` says why, and from there on it has no
-    estimate. It is handed read-only arrays, so that it can't change what others see.
+    estimate. It is handed copies, so that it can't change what others see.
     """
 
     def __init__(self, inner: Any) -> None:
@@ -133,21 +133,21 @@ class Adapter:
         accepts: Callable[[Sample], bool] | None = getattr(self.inner, "accepts", None)
         if self.failure or accepts is None:
             return not self.failure
-        return self._asked(lambda: bool(accepts(_read_only(sample))), False)
+        return self._asked(lambda: bool(accepts(_copied(sample))), False)
 
     def propagate(self, imu: ImuSamples) -> Sequence[UpdateReport]:
         """Advance by a block of increments."""
         self._t = float(imu.t[-1])
-        return self._asked(lambda: _reports(self.inner.propagate(_read_only(imu))), [])
+        return self._asked(lambda: _reports(self.inner.propagate(_copied(imu))), [])
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample that is valid at the estimator's own time."""
-        return self._asked(lambda: _reports(self.inner.update(_read_only(sample))), [])
+        return self._asked(lambda: _reports(self.inner.update(_copied(sample))), [])
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """The reports on a sample that came too late: none, unless it has something to say."""
         refuse = getattr(self.inner, "refuse", None)
-        return [] if refuse is None else self._asked(lambda: _reports(refuse(_read_only(sample), reason)), [])
+        return [] if refuse is None else self._asked(lambda: _reports(refuse(_copied(sample), reason)), [])
 
     def estimate(self) -> Estimate:
         """The state at its own time."""
@@ -158,7 +158,7 @@ class Adapter:
         end = float(imu.t[-1])
         predict = getattr(self.inner, "predict", None)
         if predict is not None:
-            return self._asked(lambda: _checked(predict(_read_only(imu))), Estimate.of(end))
+            return self._asked(lambda: _checked(predict(_copied(imu))), Estimate.of(end))
         return self._asked(lambda: carried(_checked(self.inner.estimate()), imu), Estimate.of(end))
 
     def _asked(self, ask: Callable[[], T], otherwise: T) -> T:
@@ -212,12 +212,11 @@ def _checked(estimate: Any) -> Estimate:
     return estimate
 
 
-def _read_only(record: T) -> T:
-    """The same record with arrays that can't be written to."""
+def _copied(record: T) -> T:
+    """The same record with arrays of its own."""
     changes = {}
     for name in (field.name for field in dataclasses.fields(record)):  # type: ignore[arg-type]
         value = getattr(record, name)
         if isinstance(value, np.ndarray):
-            changes[name] = value.view()
-            changes[name].flags.writeable = False
+            changes[name] = value.copy()
     return dataclasses.replace(record, **changes) if changes else record  # type: ignore[type-var]
