@@ -7,7 +7,7 @@ LOWEST := .venv-lowest
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: run test test-ci test-all lint bench wheel-test setup lock clean
+.PHONY: run test test-ci test-all lint bench docs wheel-test setup lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/testbed run loiter_gnss_outage --out runs/loiter_gnss_outage --mavlink tlog:runs/loiter_gnss_outage/run.tlog
@@ -26,6 +26,10 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The manual, into site/.
+docs: $(VENV)/.ready
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(VENV)/.ready
 	$(BIN)/python tests/bench $(BENCH)
@@ -73,4 +77,4 @@ lock:
 	$(COMPILE) --group clients --no-deps --constraint requirements.lock --output-file requirements-clients.lock
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -79,15 +79,19 @@ def scenario_tables() -> list[Table]:
     """Every section that a scenario may have, in the order of the file."""
     from pydantic.json_schema import models_json_schema
 
+    from testbed.estimators import registry
     from testbed.scenario import Scenario
     from testbed.sensors import CONFIGS
 
-    models = [(model, "validation") for model in (Scenario, *CONFIGS.values())]
+    estimators = {name: kind.section for name, kind in registry.BUILT_IN.items()}
+    estimators["module:Class"] = registry.CUSTOM.section
+    models = [(model, "validation") for model in (Scenario, *CONFIGS.values(), *estimators.values())]
     references, schema = models_json_schema(models)  # type: ignore[arg-type]
     definitions = schema["$defs"]
-    # What a table of any name may be, told apart by a key that the schema doesn't know of.
+    # Tables that are told apart by a key which the schema doesn't know of.
     registries: dict[Any, Any] = {
-        ("Scenario", "sensors"): ("kind", {k: references[c, "validation"] for k, c in CONFIGS.items()}),
+        ("Scenario", "sensors"): ("[{}.<name>]", {k: references[c, "validation"] for k, c in CONFIGS.items()}),
+        ("Scenario", "estimator"): ("[[{}]]", {k: references[c, "validation"] for k, c in estimators.items()}),
         PRESET: {config.__name__: frozenset(_preset(config)) for config in CONFIGS.values()},
     }
     return list(_tables(references[Scenario, "validation"], "", "The run", 2, definitions, registries))
@@ -103,22 +107,22 @@ def _tables(
     rows = tuple(
         _row(key, about, "**required**" if key in required else "by grade" if key in preset else "", definitions)
         for key, about in definition["properties"].items()
-        if "const" not in about or "default" in about
+        if "const" not in about  # the heading says it
     )
     yield Table(definition["title"], heading, level, _plain(definition.get("description", "")), rows)
     for key, about in definition["properties"].items():
-        tag, inside = registries.get((definition["title"], key), (None, None))
-        brackets, dotted = "{}", f"{path}.{key}".lstrip(".")
-        if inside is None:
-            tag, inside, many, named = _models(about)
-            brackets = "[[{}]]" if many else "[{}]"
-            dotted += ".<name>" if named else ""
+        dotted = f"{path}.{key}".lstrip(".")
+        if (definition["title"], key) in registries:
+            tag = "kind"
+            brackets, inside = registries[definition["title"], key]
         else:
-            brackets, dotted = "[{}]", f"{dotted}.<name>"
+            tag, inside, many, named = _models(about)
+            brackets = "[[{}]]" if many else "[{}.<name>]" if named else "[{}]"
         for name, child in inside.items():
             written = brackets.format(dotted)
             title = f"`{written}`" + (f', `{tag} = "{name}"`' if tag else "")
-            yield from _tables(child, dotted, title, min(level + (level < 3 or bool(path)), 4), definitions, registries)
+            below = dotted + ".<name>" * ("<name>" in brackets)
+            yield from _tables(child, below, title, min(level + (level < 3 or bool(path)), 4), definitions, registries)
 
 
 def _models(about: Mapping[str, Any]) -> tuple[str | None, dict[str, Any], bool, bool]:
@@ -159,7 +163,7 @@ def _type(about: Mapping[str, Any], definitions: Any) -> str:
         return f'`"{about["const"]}"`'
     if "enum" in about:
         return ", ".join(f'`"{choice}"`' for choice in about["enum"])
-    if _models(about)[1]:
+    if _models(about)[1] or about.get("items") == {}:
         return "tables" if about.get("type") == "array" or "additionalProperties" in about else "table"
     match about.get("type"):
         case "array" if "prefixItems" in about:
@@ -179,7 +183,7 @@ def _type(about: Mapping[str, Any], definitions: Any) -> str:
 
 def _range(about: Mapping[str, Any]) -> str:
     if "items" in about or "prefixItems" in about:
-        inner = about.get("items") or about["prefixItems"][0]
+        inner = about["items"] if "items" in about else about["prefixItems"][0]
         size = [
             f"{about[key]} {word}" for key, word in (("minItems", "or more"), ("maxItems", "at most")) if key in about
         ]
@@ -215,14 +219,20 @@ def _plain(text: str) -> str:
 
 def scenario_reference() -> str:
     """All keys of a scenario, section by section."""
-    parts = []
-    for table in scenario_tables():
+    parts, tables = [], scenario_tables()
+    of_the_run = {row.key: row.description for row in tables[0].rows}
+    chapter = ""
+    for table in tables:
+        now = re.match(r"`\[+(\w+)", table.heading)
+        if now and now[1] != chapter:
+            chapter = now[1]
+            parts.append(f"## `{chapter}`\n\n{of_the_run[chapter][:1].upper()}{of_the_run[chapter][1:]}.")
         rows = [(f"`{row.key}`", row.type, row.unit, row.range, row.default, row.description) for row in table.rows]
         head = ("key", "type", "unit", "range", "default", "what it is")
         parts.append(f"{'#' * table.level} {table.heading}\n\n{table.about}\n\n{_table(head, rows) if rows else ''}")
         if table.heading.startswith("`[sensors.<name>]`"):
             kind = re.findall(r'"(.+)"', table.heading)[0]
-            parts.append(f"What the grades preset is under [Sensors](../sensors.md#{kind.replace('_', '-')}).\n")
+            parts.append(f"What the grades preset: [Sensors](sensors.md#{kind.replace('_', '-')}).")
     return "\n\n".join(parts)
 
 
@@ -378,6 +388,30 @@ def commands() -> str:
     return "\n\n".join(parts)
 
 
+def aircraft_modes() -> str:
+    """Modes of the main aircraft without its autopilot."""
+    from testbed.motion.modes import modes_table
+
+    return modes_table()
+
+
+def envelopes() -> str:
+    """What is known of each shipped aircraft."""
+    found = {
+        path.parent.name: tomllib.loads(path.read_text("utf-8"))
+        for path in sorted(ROOT.glob("aircraft/*/envelope.toml"))
+    }
+    keys = dict.fromkeys(
+        (section, key) for one in found.values() for section, of in one.items() if section != "title" for key in of
+    )
+    rows = [
+        (f"`{section}.{key}`", *(_figure(one.get(section, {}).get(key)) for one in found.values()))
+        for section, key in keys
+    ]
+    titles = [f"* `{name}`: {one['title']}" for name, one in found.items()]
+    return "\n".join(titles) + "\n\n" + _table(("key", *(f"`{name}`" for name in found)), rows)
+
+
 RECORDED = """
 title = "All that is recorded"
 duration_s = 4
@@ -413,21 +447,32 @@ def record_format() -> str:
     from testbed import Scenario, run
 
     tree = run(Scenario.parse(RECORDED)).dataset
-    parts = ["**Attributes of the file**\n\n" + ", ".join(f"`{name}`" for name in tree.attrs)]
-    for path in sorted(tree.groups):
-        dataset = tree[path].dataset
+    labels = {name: v for path in tree.groups for name, v in tree[path].coords.items() if v.dims == (name,)}
+    parts = ["Attributes of the file: " + ", ".join(f"`{name}`" for name in tree.attrs) + "."]
+    told: set[str] = set()
+    for path in sorted(tree.groups, key=_order_of_groups):
+        shown = re.sub(r"^/estimators/\w+", "/estimators/<name>", path)
+        shown = re.sub(r"innovations/\w+", "innovations/<measurement>", shown)
+        variables = tree[path].to_dataset(inherit=False).data_vars
         rows = [
-            (
-                f"`{name}`",
-                ", ".join(map(str, v.dims)) or "–",
-                v.attrs.get("units", ""),
-                v.attrs.get("description") or v.attrs.get("long_name") or v.attrs.get("frame", ""),
-            )
-            for name, v in dataset.variables.items()
+            (f"`{name}`", ", ".join(map(str, v.dims)) or "–", v.attrs.get("units", ""), v.attrs.get("long_name", ""))
+            for name, v in variables.items()
         ]
-        if rows:
-            parts.append(f"### `{path}`\n\n" + _table(("variable", "dimensions", "units", "what it is"), rows))
+        if rows and shown not in told:
+            told.add(shown)
+            head = ("variable", "dimensions", "units", "what it is")
+            parts.append(f"### `{shown.lstrip('/')}`\n\n" + _table(head, rows))
+    named = [
+        (f"`{name}`", ", ".join(map(str, v.values))) for name, v in sorted(labels.items()) if v.dtype.kind in "OUT"
+    ]
+    parts.append("### Names along dimensions\n\n" + _table(("dimension", "in order"), named))
     return "\n\n".join(parts)
+
+
+def _order_of_groups(path: str) -> tuple[int, str]:
+    order = ("truth", "sensors", "estimators", "events", "faults")
+    top = path.strip("/").partition("/")[0]
+    return (order.index(top) if top in order else len(order), path)
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -449,6 +494,8 @@ PARTS: dict[str, Callable[[], str]] = {
     "shipped_scenarios": shipped_scenarios,
     "metric_names": metric_names,
     "commands": commands,
+    "aircraft_modes": aircraft_modes,
+    "envelopes": envelopes,
     "record_format": record_format,
     **{f"grades_{kind}": _grade_part(kind) for kind in KINDS},
 }

@@ -110,7 +110,7 @@ def failure_shows_within_two_seconds_and_passes(session: Session) -> None:
 
 
 def test_a_client_sees_the_estimate_leave_the_truth_and_return(listen: Callable[..., Session]) -> None:
-    """Draws what the client heard: the README's picture is a copy."""
+    """Draws what the client heard: the picture of README and manual is a copy."""
     changes = ["sensors.imu.grade='mems-consumer'", "estimator[0].aids=['gnss', 'barometer', 'magnetometer']"]
     session = listen([6, 10, 8], *(word for change in changes for word in ("--set", change)), realtime=5)
     seen = Seen(session["heard"])
@@ -124,10 +124,11 @@ def test_a_client_sees_the_estimate_leave_the_truth_and_return(listen: Callable[
     assert 10_000 < PICTURE.stat().st_size < 150_000
 
 
-def test_program_of_the_readme(
+def test_program_of_the_manual(
     clients: Path, fly: Callable[..., int], start: Callable[..., Program], tmp_path: Path
 ) -> None:
-    [program] = re.findall(r"^```py\n(.*?)^```$", (ROOT / "README.md").read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    page = (ROOT / "docs/ground-station.md").read_text("utf-8")
+    [program] = re.findall(r"^```python [^\n]*\n(.*?)^```$", page, re.DOTALL | re.MULTILINE)
     assert program.count("14540") == 1
     (tmp_path / "program.py").write_text(program.replace("14540", str(fly("u_turn"))))
     start(clients / "python", tmp_path / "program.py").expect("gnss (silent|denied)", 30)
