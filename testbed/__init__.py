@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from testbed.loop.loop import RunResult, run
+    from testbed.many.campaign import CampaignResult, campaign
+    from testbed.many.check import Checked, check
     from testbed.scenario import Scenario
     from testbed.score.series import error_series
 
-__all__ = ["RunResult", "Scenario", "error_series", "run"]
+__all__ = ["CampaignResult", "Checked", "RunResult", "Scenario", "campaign", "check", "error_series", "run"]
 
 
 def __getattr__(name: str) -> Any:
@@ -27,4 +29,12 @@ def __getattr__(name: str) -> Any:
         import testbed.loop.loop
 
         return getattr(testbed.loop.loop, name)
+    if name in ("campaign", "CampaignResult"):
+        import testbed.many.campaign
+
+        return getattr(testbed.many.campaign, name)
+    if name in ("check", "Checked"):
+        import testbed.many.check
+
+        return getattr(testbed.many.check, name)
     raise AttributeError(f"module 'testbed' has no attribute {name!r}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import sys
 import tempfile
 import tomllib
@@ -16,6 +17,11 @@ from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
+
+from testbed import interrupts
+
+if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is the program, and not a module of another
+    interrupts.end_at_once()  # while all else is imported
 
 import typer
 
@@ -32,9 +38,10 @@ if TYPE_CHECKING:
     from testbed.loop.requests import Recorded
     from testbed.scenario import Scenario
 
-EXIT_FAILED, EXIT_USER_ERROR, EXIT_INTERRUPTED = 1, 2, 130
+EXIT_FAILED, EXIT_USER_ERROR = 1, 2  # and of an interrupt, 128 and the number of its signal
 RUNS = Path("runs")
 PIPE_COLUMNS = 120  # width of tables where the output is not a terminal
+
 
 app = typer.Typer(
     help="Fly, sense, navigate: a navigation testbed coupled to a flight simulation.",
@@ -64,7 +71,8 @@ class ExportFormat(StrEnum):
 def main() -> None:
     """Entry point: a user's mistake ends with its message and exit code 2, never with a traceback."""
     try:
-        app(_explicit_realtime(sys.argv[1:]))
+        with interrupts.heeded():
+            app(_explicit_realtime(sys.argv[1:]))
     except UserError as error:
         for line in str(error).splitlines():
             print(f"testbed: {line}", file=sys.stderr)
@@ -72,8 +80,6 @@ def main() -> None:
     except OSError as error:  # a full disk, a folder that went away
         print(f"testbed: {error}", file=sys.stderr)
         sys.exit(EXIT_USER_ERROR)
-    except KeyboardInterrupt:
-        sys.exit(EXIT_INTERRUPTED)
 
 
 @app.callback(invoke_without_command=True)
@@ -221,7 +227,7 @@ def check(
     todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
     with (
         _output_folder(RUNS / "check"),
-        _keeping("nothing was concluded"),
+        interrupts.leaving(lambda: "nothing was concluded"),
         progress.shown(_console(stderr=True), "check") as tell,
     ):
         outcomes = checks.fly_all(todo, tell)
@@ -290,18 +296,11 @@ def campaign(
     with (
         _output_folder(folder),
         held(folder),
-        _keeping(f"what is finished is in {folder}; the same command carries on"),
+        interrupts.leaving(lambda: f"what is finished is in {folder}; the same command carries on"),
         progress.shown(_console(stderr=True), scenario) as tell,
     ):
-        result = campaigns.campaign(
-            scenario,
-            runs,
-            vary=varied,
-            overrides=overrides or (),
-            scheduler=scheduler,
-            out=folder,
-            progress=lambda now: tell((now.done + now.failed) / now.total, str(now)),
-        )
+        plan = campaigns.Plan(scenario, runs, folder, varied, overrides or ())
+        result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)))
     for table in campaign_report.tables(result):
         _console().print(table)
     print(f"campaign: {folder}")
@@ -326,7 +325,7 @@ def papers(
     with (
         _output_folder(out),
         held(out),
-        _keeping("nothing was written"),
+        interrupts.leaving(lambda: "nothing was written"),
         progress.shown(_console(stderr=True), "papers") as tell,
     ):
         claims = library.reproduce(found, out, tell)
@@ -465,16 +464,6 @@ def _output_folder(folder: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-@contextmanager
-def _keeping(what_is_left: str) -> Iterator[None]:
-    """Let an interrupted command say what it leaves behind."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print(f"testbed: interrupted: {what_is_left}", file=sys.stderr)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-
-
 def _connect(
     urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, **options: Any
 ) -> list[Publisher]:
@@ -511,8 +500,9 @@ def _fly(
     from testbed.loop import keyboard, loop
     from testbed.many import progress
 
+    record, before = folder / RECORD, _stamp(folder / RECORD)
     with (
-        _keeping(f"the record so far is {folder / RECORD}"),
+        interrupts.leaving(lambda: _kept(record) if _stamp(record) != before else "nothing was recorded"),
         keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(_console(stderr=True), scenario.title) as tell,
     ):
@@ -532,6 +522,18 @@ def _fly(
     for remark in result.remarks:
         print(f"testbed: {remark}", file=sys.stderr)
     return result
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is written or made anew; None when there is none."""
+    with suppress(OSError):
+        status = path.stat()
+        return status.st_ino, status.st_mtime_ns
+    return None
+
+
+def _kept(record: Path) -> str:
+    return f"the record so far is {record}: `testbed report {shlex.quote(str(record))}` shows it"
 
 
 def _conclude(

@@ -364,7 +364,7 @@ def test_an_interrupted_run_says_what_it_leaves(testbed: Testbed, monkeypatch: p
 
     monkeypatch.setattr(loop, "run", interrupted)
     ended = testbed("run", "u_turn")
-    assert (ended.code, ended.err) == (130, "testbed: interrupted: the record so far is runs/u_turn/run.nc\n")
+    assert (ended.code, ended.err) == (130, "testbed: interrupted: nothing was recorded\n")
 
 
 @pytest.mark.ci
@@ -378,7 +378,10 @@ def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
         running.send_signal(signal.SIGINT)
         rest = running.stderr.read()
     assert running.returncode == 130
-    assert rest.splitlines()[-1] == "testbed: interrupted: the record so far is runs/static_bench/run.nc"
+    assert rest.splitlines()[-1] == (
+        "testbed: interrupted: the record so far is runs/static_bench/run.nc: "
+        "`testbed report runs/static_bench/run.nc` shows it"
+    )
     assert "Traceback" not in rest
     rows = record.load(tmp_path / "runs/static_bench/run.nc")["truth"].sizes["time"]
     assert rows >= 30 * percent > 0  # at 10 Hz over 300 s

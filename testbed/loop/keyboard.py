@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import select
-import signal
-import sys
 import termios
 import tty
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import NoReturn
 
 from testbed.loop.requests import End, Faster, Request, Restart, Step, Toggle
 
@@ -51,20 +48,18 @@ class Keyboard:
 def keys(fd: int = 0) -> Iterator[Keyboard | None]:
     """The keyboard of terminal ``fd`` while the context lasts; None when it is no terminal, or another's.
 
-    Keys then come one by one and unseen; however the context ends, by SIGTERM too, the terminal is as it was.
+    Keys then come one by one and unseen; however the context ends, the terminal is as it was.
     """
     if not (os.isatty(fd) and _in_front(fd)):
         yield None
         return
     before = termios.tcgetattr(fd)
-    on_terminate = signal.signal(signal.SIGTERM, _leave)
     try:
         tty.setcbreak(fd, termios.TCSANOW)
         yield Keyboard(fd)
     finally:
         if _in_front(fd):
             termios.tcsetattr(fd, termios.TCSANOW, before)
-        signal.signal(signal.SIGTERM, on_terminate)
 
 
 def _in_front(fd: int) -> bool:
@@ -73,7 +68,3 @@ def _in_front(fd: int) -> bool:
         return os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:
         return False
-
-
-def _leave(number: int, frame: object) -> NoReturn:
-    sys.exit(128 + number)

@@ -1,4 +1,4 @@
-"""Many seeds: one scenario flown many times, for every combination of varied values, on Dask.
+"""Many seeds: one scenario flown many times, for every combination of varied values, on many processors.
 
 Run k of a combination has the scenario's own seed + k, so `testbed run --seed` flies any one of them again, bit for
 bit. Every run is a task by itself: its numbers can't depend on how many workers there are, or on which of them it ran.
@@ -6,26 +6,21 @@ Results come back to this process, which writes them into the campaign's folder 
 interrupted carries on with the runs that are missing.
 """
 
-# mypy: untyped-calls-exclude="distributed"
-
 from __future__ import annotations
 
-import asyncio
 import functools
 import hashlib
 import io
 import itertools
 import json
-import logging
 import math
-import shutil
+import re
 import time
+import tomllib
 import traceback
-import uuid
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,25 +32,22 @@ import testbed
 from nav.samples import Array
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
+from testbed.many import pool, progress
+from testbed.many.shared_flight import require_control, share_truth
 from testbed.motion import aircraft
 from testbed.motion.sections import FlightTruth
-from testbed.motion.table import MotionSource, Replay, save_motion
+from testbed.motion.table import Replay
 from testbed.scenario import Scenario
 from testbed.score import metrics
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
-    from distributed import Client
 
     from testbed.report.campaign import Statistics
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
-CONNECT_S = 3.0  # how long a scheduler may take to answer
-WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
-POLL_S = 2.0  # how often progress is told when no run finishes
 SETUP = "setup.json"
-# An interrupt from the terminal reaches the workers too, where it would end in a traceback: this process stops them.
-IGNORE_INTERRUPT = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
 
 
@@ -100,29 +92,32 @@ class Failure:
 class Progress:
     """Where a campaign stands: runs finished and failed, of how many, how many of them were there before it began.
 
-    ``elapsed_s`` is wall time; ``activity`` says what is going on when it is not simply flying.
+    ``flying`` is the sum of the shares that are done of the runs on their way; ``elapsed_s`` is wall time; ``activity``
+    says what is going on when it is not simply flying.
     """
 
     done: int
     failed: int
     total: int
     before: int
+    flying: float
     elapsed_s: float
     activity: str
 
     @property
+    def fraction(self) -> float:
+        """The share of the campaign that is done."""
+        return (self.done + self.failed + self.flying) / self.total
+
+    @property
     def remaining_s(self) -> float:
-        """Wall time still to go at the pace so far, NaN before the first run."""
-        flown = self.done + self.failed - self.before
-        return self.elapsed_s / flown * (self.total - self.done - self.failed) if flown else math.nan
+        """Wall time still to go at the pace so far, NaN as long as there is none."""
+        flown = self.fraction - self.before / self.total
+        return self.elapsed_s / flown * (1.0 - self.fraction) if flown > 0 else math.nan
 
     def __str__(self) -> str:
-        parts = [f"{self.done}/{self.total}", f"{self.elapsed_s:.0f} s"]
-        if math.isfinite(self.remaining_s):
-            parts.append(f"about {self.remaining_s:.0f} s to go")
-        if self.failed:
-            parts.append(f"{self.failed} failed")
-        return "  ".join(filter(None, [*parts, self.activity]))
+        parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed" if self.failed else "", self.activity]
+        return "  ".join(filter(None, parts))
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +129,62 @@ class CampaignResult:
     outcomes: Sequence[Outcome]
     failures: Sequence[Failure]
     statistics: Statistics
+
+    def frame(self) -> pandas.DataFrame:
+        """One row for each run: the varied values, the seed and all metrics, NaN where a run has none of that name."""
+        import pandas
+
+        return pandas.DataFrame(
+            [
+                {key: _plain(value) for key, value in self.combinations[o.combination].values.items()}
+                | {"seed": o.seed}
+                | dict(sorted(o.metrics.items()))
+                for o in self.outcomes
+            ]
+        )
+
+    def dataset(self) -> xarray.Dataset:
+        """What `Outcome` keeps over time, of all runs: dimensions run and time, NaN after the end of a shorter run.
+
+        Coordinates of a run are its seed and, under their keys, the varied values as given.
+        """
+        import xarray
+
+        longest = max((o.history["time"] for o in self.outcomes), key=len, default=np.zeros(0))
+        names = [name for name in (self.outcomes[0].history if self.outcomes else ()) if name != "time"]
+
+        def stacked(name: str) -> Array:
+            rows = [np.pad(o.history[name], (0, len(longest) - len(o.history[name])), constant_values=np.nan)
+                    for o in self.outcomes]  # fmt: skip
+            return np.array(rows)
+
+        coordinates: dict[str, Any] = {"time": longest, "seed": ("run", [o.seed for o in self.outcomes])}
+        for key in self.combinations[0].values:
+            coordinates[key] = ("run", [self.combinations[o.combination].values[key] for o in self.outcomes])
+        return xarray.Dataset({name: (("run", "time"), stacked(name)) for name in names}, coordinates)
+
+
+def _plain(text: str) -> Any:
+    """A varied value as a number, a text or a truth value; a list or a table stays as it was given."""
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+    return text if isinstance(value, (list, dict)) else value
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a campaign is to fly: ``runs`` seeds for every combination of the values in ``vary``, into folder ``out``.
+
+    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs.
+    """
+
+    scenario: str | Path
+    runs: int
+    out: Path
+    vary: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    overrides: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,48 +204,52 @@ def campaign(
     *,
     vary: Mapping[str, Sequence[str]] | None = None,
     overrides: Sequence[str] = (),
-    scheduler: str | None = None,
-    out: Path,
-    workers: int | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    workers: int | str | None = None,
+    out: str | Path | None = None,
 ) -> CampaignResult:
     """Fly ``runs`` seeds of a scenario for every combination of the values in ``vary``, and say what they show.
 
     ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs.
-    ``scheduler`` is the address of a Dask scheduler; without, a cluster of one process per core (or ``workers``) lives
-    as long as the campaign. A script that calls this needs the guard ``if __name__ == "__main__":``, because those
-    processes import it. In ``out`` there are, at the end, runs/, campaign.csv, campaign.json and figures; what is there
-    already of the same campaign is not flown again.
+    ``workers`` is the number of processes, one for each core without, or the address of a Dask scheduler. In ``out``,
+    ``runs/<scenario>_campaign`` without, there are at the end runs/, campaign.csv, campaign.json and figures; what is
+    there already of the same campaign is not flown again. How far it is, and how long it will take, is told on stderr.
 
     A run that fails is in ``failures`` and stops no other. Raises UserError when the scenario or a varied value is
     wrong, when ``out`` can't be written or holds another campaign, or when the scheduler can't be reached.
     """
-    from dask.system import CPU_COUNT
+    folder = Path("runs", f"{Path(scenario).stem}_campaign") if out is None else Path(out)
+    from rich.console import Console
 
+    with progress.shown(Console(stderr=True), str(scenario)) as tell:
+        plan = Plan(scenario, runs, folder, vary or {}, overrides)
+        return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
+
+
+def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress], None] | None = None) -> CampaignResult:
+    """The same, for whoever shows by itself how far it is."""
     from testbed.report import campaign as campaign_report
 
-    combinations = _combinations(scenario, vary or {}, overrides)
-    if runs < 1:
-        raise UserError(f"--runs {runs}: give at least 1")
-    folder = out.absolute()
-    _claim(folder, _setup([one.scenario for one in combinations], vary or {}, overrides))
-    wanted = [(i, c.scenario.seed + k) for i, c in enumerate(combinations) for k in range(runs)]
-    stored = {run: _load(folder, *run) for run in wanted}
-    missing = [run for run, outcome in stored.items() if outcome is None]
+    combinations = _combinations(plan)
+    if plan.runs < 1:
+        raise UserError(f"--runs {plan.runs}: give at least 1")
+    total = len(combinations) * plan.runs
+    folder = plan.out.absolute()
+    _claim(folder, _setup([one.scenario for one in combinations], plan))
+    stored = _load_all(folder, combinations, plan.runs)
     failures: list[Failure] = []
-    if missing:
-        truth = _share_truth(folder, combinations)
-        code = _code()
-        tasks = [_Task(i, seed, combinations[i].scenario, truth, code) for i, seed in missing]
-        tell = _Teller(progress, len(wanted), len(wanted) - len(missing))
-        with _connect(scheduler, min(workers or CPU_COUNT, len(tasks))) as client:
-            for flown in _fly_all(client, tasks, tell):
+    if len(stored) < total:
+        teller = _Teller(tell, total, len(stored))
+        with pool.opened(total - len(stored), workers) as crew:
+            tasks = _tasks(plan, combinations, share_truth(folder, [c.scenario for c in combinations]), set(stored))
+            for done in crew.work(_fly, tasks, teller.standing):
+                flown = _flown(done)
                 if isinstance(flown, Failure):
                     failures.append(flown)
                 else:
                     _store(folder, flown)
                     stored[flown.combination, flown.seed] = flown
-    outcomes = [outcome for outcome in stored.values() if outcome is not None]
+                teller.finished(flown)
+    outcomes = [stored[run] for run in sorted(stored)]
     failures.sort(key=lambda f: (f.combination, f.seed))
     statistics = campaign_report.statistics(combinations, outcomes)
     result = CampaignResult(folder, combinations, outcomes, failures, statistics)
@@ -202,38 +257,47 @@ def campaign(
     return result
 
 
-def _combinations(
-    scenario: str | Path, vary: Mapping[str, Sequence[str]], overrides: Sequence[str]
-) -> list[Combination]:
+def _combinations(plan: Plan) -> list[Combination]:
     """Every combination of varied values, each loaded and so checked. They differ in nothing else."""
-    for key, listed in vary.items():
+    for key, listed in plan.vary.items():
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
         if not listed or len(set(listed)) < len(listed):
             raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
     made = []
-    for values in itertools.product(*vary.values()):
-        chosen = dict(zip(vary, values, strict=True))
-        loaded = Scenario.load(scenario, [*overrides, *(f"{key}={value}" for key, value in chosen.items())])
+    for values in itertools.product(*plan.vary.values()):
+        chosen = dict(zip(plan.vary, values, strict=True))
+        loaded = Scenario.load(plan.scenario, [*plan.overrides, *(f"{key}={value}" for key, value in chosen.items())])
         made.append(Combination(chosen, loaded))
     if not made[0].scenario.estimator:
-        raise UserError(f"{scenario}: has no estimator, so a campaign would have nothing to compare: add [[estimator]]")
+        raise UserError(
+            f"{plan.scenario}: has no estimator, so a campaign would have nothing to compare: add [[estimator]]"
+        )
     return made
+
+
+def _tasks(
+    plan: Plan, combinations: Sequence[Combination], truth: Path | None, stored: Set[tuple[int, int]]
+) -> Iterator[_Task]:
+    """The runs that are not there yet. There may be millions: they are made as they are flown."""
+    code = _code()
+    for i, combination in enumerate(combinations):
+        for seed in range(combination.scenario.seed, combination.scenario.seed + plan.runs):
+            if (i, seed) not in stored:
+                yield _Task(i, seed, combination.scenario, truth, code)
 
 
 # --- the folder
 
 
-def _setup(
-    scenarios: Sequence[Scenario], vary: Mapping[str, Sequence[str]], overrides: Sequence[str]
-) -> dict[str, Any]:
+def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
     packages = ("numpy", "scipy", "numba", "jsbsim", "pygeomag")
     flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
         "scenario text": scenarios[0].text,
-        "overrides": list(overrides),
-        "varied values": {key: list(values) for key, values in vary.items()},
+        "overrides": list(plan.overrides),
+        "varied values": {key: list(values) for key, values in plan.vary.items()},
         "code": _code(),
         "aircraft": [aircraft.digest(name) for name in sorted(flown)],
         "versions": {package: version(package) for package in packages},
@@ -246,13 +310,12 @@ def _code() -> str:
     digest = hashlib.sha256()
     package = Path(testbed.__file__).parent
     shown = {file for room in PRESENTATION for file in (package / room).rglob("*.py")}
-    for folder, pattern in (
-        (Path(nav.__file__).parent, "*.py"),
-        (package, "*.py"),
-        (data_dir("aircraft"), "*.xml"),
-        (data_dir("aircraft"), "*.toml"),
+    for folder, kinds in (
+        (Path(nav.__file__).parent, (".py",)),
+        (package, (".py",)),
+        (data_dir("aircraft"), (".xml", ".toml")),
     ):
-        for file in sorted(set(folder.rglob(pattern)) - shown):
+        for file in sorted({file for file in folder.rglob("*") if file.suffix in kinds} - shown):
             digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
@@ -292,6 +355,21 @@ def _store(folder: Path, outcome: Outcome) -> None:
     write_file(stem.with_suffix(".json"), json.dumps(record, indent=1).encode())
 
 
+def _load_all(folder: Path, combinations: Sequence[Combination], runs: int) -> dict[tuple[int, int], Outcome]:
+    """The outcomes that are there, of those that are wanted, by combination and seed."""
+    found = {}
+    for path in (folder / "runs").glob("*.json"):
+        named = re.fullmatch(r"c(\d+)_s(\d+)", path.stem)
+        if named is None:
+            continue
+        combination, seed = int(named[1]), int(named[2])
+        if combination < len(combinations) and 0 <= seed - combinations[combination].scenario.seed < runs:
+            outcome = _load(folder, combination, seed)
+            if outcome is not None:
+                found[combination, seed] = outcome
+    return found
+
+
 def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
     """A stored outcome; None when there is none, or none that can be read."""
     stem = _stem(folder, combination, seed)
@@ -304,170 +382,18 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
     return Outcome(combination, seed, values, history)
 
 
-# --- the shared flight
-
-
-def _share_truth(folder: Path, combinations: Sequence[Combination]) -> Path | None:
-    """Fly once the motion that all runs have in common, if they have, and give the folder where it lies."""
-    from testbed.feeds.simulated import motion
-
-    first = combinations[0].scenario
-    if not all(_same_motion(first, c.scenario) for c in combinations) or not _seed_leaves_motion(first):
-        return None
-    truth = folder / "truth"
-    if not truth.is_dir():
-        source = motion(first, first.seed)
-        save_motion(source, round(first.duration_s * source.rate_hz) + 1, truth)
-        try:
-            _require_control(source)
-        except UserError:
-            shutil.rmtree(truth)
-            raise
-    return truth
-
-
-def _require_control(source: MotionSource) -> None:
-    """A flight that got out of control says nothing about navigation: don't let its numbers in among the others."""
-    if source.failure:
-        raise UserError(f"the flight ended early: {source.failure}")
-
-
-def _same_motion(one: Scenario, other: Scenario) -> bool:
-    return _moving(one) == _moving(other)
-
-
-def _moving(scenario: Scenario) -> tuple[object, ...]:
-    """All that the motion depends on but the seed, and what is estimated when that is fed back."""
-    return scenario.truth, scenario.plan, scenario.duration_s, scenario.autopilot
-
-
-def _seed_leaves_motion(scenario: Scenario) -> bool:
-    """Whether the motion is the same for every seed: nothing estimated is fed back, and no gust follows the seed."""
-    if scenario.autopilot.feedback.estimators:
-        return False
-    if not isinstance(scenario.truth, FlightTruth):
-        return True
-    wind = scenario.truth.wind
-    return wind.turbulence == "none" or wind.turbulence_seed is not None
-
-
 # --- the workers
 
 
-@contextmanager
-def _connect(scheduler: str | None, workers: int) -> Iterator[Client]:
-    """A client of the scheduler at an address, or of a cluster of our own on the loopback interface."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    # A scheduler that goes away is told of in a line; the client would add its traceback.
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-    if scheduler is not None:
-        _require_scheduler(scheduler)
-        with Client(scheduler, set_as_default=False) as client, client.as_current():
-            try:
-                client.wait_for_workers(1, timeout=WORKER_WAIT_S)
-            except TimeoutError:
-                raise UserError(
-                    f"{scheduler}: the scheduler has no workers: start some with `dask worker {scheduler}`"
-                ) from None
-            yield client
-        return
-    # Dask starts workers with one BLAS thread each, which is what matrices of this size want. Its statistical profiler
-    # would look at the Python stack a hundred times a second.
-    with (
-        dask.config.set({"distributed.worker.profile.enabled": False}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            host="127.0.0.1",
-            dashboard_address=None,
-            scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},  # or it would take port 8787 all the same
-            memory_limit=None,
-            preload=[IGNORE_INTERRUPT],
-            silence_logs=logging.CRITICAL,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-        client.as_current(),
-    ):
-        yield client
+def _flown(done: pool.Done[_Task, Outcome | Failure]) -> Outcome | Failure:
+    """What became of a run, also when its worker could not say so itself."""
+    if done.result is not None:
+        return done.result
+    said = str(done.error) if isinstance(done.error, pool.Died) else f"{type(done.error).__name__}: {done.error}"
+    return Failure(done.task.combination, done.task.seed, said, done.trace)
 
 
-def _require_scheduler(address: str) -> None:
-    """Ask whoever answers at the address what it is: a client that can't connect leaves threads and noise behind."""
-    from concurrent.futures import ThreadPoolExecutor
-
-    from distributed.core import rpc
-    from distributed.security import Security
-
-    async def ask() -> Mapping[str, Any]:
-        arguments = Security().get_connection_args("client")
-        async with rpc(address, connection_args=arguments, timeout=CONNECT_S) as peer:
-            return await asyncio.wait_for(peer.identity(), CONNECT_S)
-
-    try:
-        # In a thread of its own, since a notebook has an event loop running in this one.
-        with ThreadPoolExecutor(1) as pool:
-            identity = pool.submit(asyncio.run, ask()).result()
-    except ValueError as error:
-        raise UserError(f"--scheduler {address}: {error}: give an address like tcp://host:8786") from None
-    except OSError:
-        raise UserError(
-            f"--scheduler {address}: nothing answers there: start one with `dask scheduler`, or leave the option out"
-        ) from None
-    except MemoryError:  # the first bytes of another protocol, read as the size of a message
-        identity = {}
-    if identity.get("type") != "Scheduler":
-        raise UserError(f"--scheduler {address}: what answers there is no Dask scheduler")
-
-
-def _fly_all(client: Client, tasks: Sequence[_Task], tell: _Teller) -> Iterator[Outcome | Failure]:
-    """Outcomes and failures as they come. A task whose worker dies is given to another one."""
-    from concurrent.futures import CancelledError
-
-    from distributed import wait
-
-    campaign_id = uuid.uuid4().hex  # an old scheduler may remember another campaign
-    waiting = {
-        client.submit(_fly, task, key=f"run-{campaign_id}-{task.combination}-{task.seed}", pure=False): task
-        for task in tasks
-    }
-    tell.now("starting")
-    try:
-        while waiting:
-            try:
-                done = wait(list(waiting), timeout=POLL_S, return_when="FIRST_COMPLETED").done
-            except TimeoutError:
-                tell.now("" if client.scheduler_info()["workers"] else "waiting for a worker")
-                continue
-            for future in done:
-                result = _result(future, waiting.pop(future))
-                tell.finished(isinstance(result, Failure))
-                yield result
-    except CancelledError:
-        raise UserError("the scheduler has gone: give the same command again to fly the runs that are left") from None
-
-
-def _result(future: Any, task: _Task) -> Outcome | Failure:
-    from concurrent.futures import CancelledError
-
-    from distributed.scheduler import KilledWorker
-
-    try:
-        result: Outcome | Failure = future.result()
-    except CancelledError:
-        raise
-    except KilledWorker as error:
-        deaths = error.allowed_failures + 1
-        message = f"its worker process died, {deaths} times over: out of memory, or a crash outside Python?"
-        return Failure(task.combination, task.seed, message)
-    except Exception as error:
-        return Failure(task.combination, task.seed, f"{type(error).__name__}: {error}", traceback.format_exc())
-    return result
-
-
-def _fly(task: _Task) -> Outcome | Failure:
+def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
     """Fly one run. Called on a worker."""
     from testbed.feeds.simulated import motion
     from testbed.loop.loop import run
@@ -479,8 +405,8 @@ def _fly(task: _Task) -> Outcome | Failure:
             )
         shared = task.truth if task.truth is not None and task.truth.is_dir() else None
         source = Replay(shared) if shared else motion(task.scenario, task.seed)
-        result = run(task.scenario, seed=task.seed, source=source)
-        _require_control(source)
+        result = run(task.scenario, seed=task.seed, source=source, progress=lambda now: tell(now.t / now.duration))
+        require_control(source)
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
         finite = {key: value for key, value in kept.items() if math.isfinite(value)}
@@ -516,21 +442,34 @@ def _history(dataset: xarray.DataTree) -> dict[str, Array]:
 
 
 class _Teller:
-    """Counts what has finished and passes it on."""
+    """Counts what has finished and passes it on, with how far the others are."""
 
-    def __init__(self, progress: Callable[[Progress], None] | None, total: int, done: int) -> None:
-        self._progress = progress
+    def __init__(self, tell: Callable[[Progress], None] | None, total: int, done: int) -> None:
+        self._tell = tell
         self._total, self._before, self._done, self._failed = total, done, done, 0
+        self._flying, self._begun, self._activity = 0.0, False, ""
         self._started = time.monotonic()
 
-    def finished(self, failed: bool) -> None:
+    def finished(self, flown: Outcome | Failure) -> None:
         """One more run is through."""
+        failed = isinstance(flown, Failure)
         self._failed += failed
         self._done += not failed
-        self.now("")
+        self._flying = max(self._flying - 1.0, 0.0)
+        self._now()
 
-    def now(self, activity: str) -> None:
-        """Tell how things stand."""
-        if self._progress is not None:
+    def standing(self, now: pool.Standing[_Task]) -> None:
+        """Workers have told how far they are."""
+        self._begun |= now.workers > 0
+        self._flying = sum(share for _, share in now.running)
+        self._activity = "" if now.workers else "waiting for a worker" if self._begun else "starting"
+        self._now()
+
+    def _now(self) -> None:
+        if self._tell is not None:
             elapsed = time.monotonic() - self._started
-            self._progress(Progress(self._done, self._failed, self._total, self._before, elapsed, activity))
+            self._tell(
+                Progress(
+                    self._done, self._failed, self._total, self._before, self._flying, elapsed, self._activity
+                )
+            )  # fmt: skip

@@ -3,45 +3,45 @@
 Golden metrics are what came out when somebody last looked: one JSON file for each scenario, one metric a line. They
 say nothing of right or wrong; `[expect]` does. What is compared, and how closely, is in `testbed.measures`.
 
-Every run is flown by a worker process. One that dies takes the scenario that it flew with it and no other.
+Scenarios are flown by worker processes. One that dies takes the scenario that it flew with it and no other.
 """
+
+# mypy: untyped-calls-exclude="junitparser"
 
 from __future__ import annotations
 
 import itertools
 import json
 import math
-import multiprocessing
-import os
 import re
-import signal
+import tempfile
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree import ElementTree
 
 from testbed import measures
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.feeds.closed import NEVER_CLOSED
 from testbed.loop import loop
+from testbed.many import pool, progress
 from testbed.report import page as report
-from testbed.results import start_anew
+from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score.metrics import column
 
 if TYPE_CHECKING:
+    from junitparser import Error, Failure
+    from junitparser.xunit2 import TestCase
     from rich.table import Table
 
     from testbed.many.progress import Tell
 
+OUT = Path("runs/check")
 GOLDEN = Path("tests/golden")  # of a checkout; they are not shipped
 _ANEW = "delete it, and make it again with `testbed check --update`"
 DIGITS = 4  # of a golden metric; tolerances are a hundred times that
@@ -114,6 +114,39 @@ class Outcome:
         verdict = "FAILED" if self.failed else "passed"
         kept = f"; kept in {self.task.folder}" if self.failed and self.task.folder.exists() else ""
         return f"{self.name}: {verdict} in {self.wall_s:.0f} s: {'; '.join(parts)}{kept}"
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What `check` found out, scenario by scenario. As text, every verdict and whatever is not as it should be."""
+
+    outcomes: Sequence[Outcome]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return not any(outcome.failed for outcome in self.outcomes)
+
+    def __str__(self) -> str:
+        lines = [[str(one), *(f"  {row}" for row in one.rows if not row.sound)] for one in self.outcomes]
+        return "\n".join(itertools.chain(*lines))
+
+
+def check(
+    *scenarios: str | Path, golden: str | Path | None = None, workers: int | None = None, out: str | Path = OUT
+) -> Checked:
+    """Fly scenarios, files or shipped ones by name, and hold their metrics against [expect] and against golden ones.
+
+    ``golden`` is the folder of golden metrics, none without; ``workers`` is the number of processes, one for each core
+    without, and one scenario is flown in this one. Of a scenario that fails there are record and report in a folder of
+    its name in ``out``. In a test: ``result = testbed.check("mine.toml")``, ``assert result.passed, result``. Raises
+    UserError when a scenario or a golden file is wrong, or there is nothing to check.
+    """
+    from rich.console import Console
+
+    given = tasks([str(one) for one in scenarios], Path(out), None if golden is None else Path(golden))
+    with progress.shown(Console(stderr=True), "check") as tell:
+        return Checked(fly_all(given, tell, workers))
 
 
 def shipped() -> list[str]:
@@ -250,104 +283,56 @@ def clear(folder: Path) -> None:
         folder.rmdir()
 
 
-# --- the workers
+# --- all of them
 
 
-@dataclass(slots=True)
-class _Worker:
-    """A process that flies one task after the other, at its end of a pipe."""
+def fly_all(given: Sequence[Task], tell: Tell | None = None, workers: int | None = None) -> list[Outcome]:
+    """Fly all tasks, as many at a time as there are cores, or ``workers``; their outcomes in the order given.
 
-    process: BaseProcess
-    task: Task
-    share: float = 0.0  # of the task that is done
-
-    @classmethod
-    def hire(cls, task: Task) -> tuple[Connection, _Worker]:
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs,), daemon=True)
-        # Whoever waits for the workers decides what an interrupt means: what is ignored here is ignored there too.
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-        try:
-            process.start()
-        finally:
-            signal.signal(signal.SIGINT, before)
-        theirs.close()
-        worker = cls(process, task)
-        worker.give(ours, task)
-        return ours, worker
-
-    def give(self, connection: Connection, task: Task | None) -> None:
-        """The next task, or no more. One that has died meanwhile is found out when it does not answer."""
-        if task is not None:
-            self.task, self.share = task, 0.0
-        with suppress(OSError):
-            connection.send(task)
-
-    def died(self) -> Outcome:
-        self.process.join()
-        code = self.process.exitcode or 0
-        how = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-        return Outcome(self.task, failure=f"its process ended {how}: out of memory, or a crash outside Python?")
-
-
-def _serve(connection: Connection) -> None:
-    """Fly tasks as they come, in a process of one core, until there is none, or nobody listens any more."""
-    with suppress(EOFError, OSError):
-        while (task := connection.recv()) is not None:
-            connection.send(fly(task, connection.send))
-
-
-def fly_all(given: Sequence[Task], tell: Tell | None = None, processes: int | None = None) -> list[Outcome]:
-    """Fly all tasks, as many at a time as there are cores, or ``processes``; their outcomes in the order given."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the workers: what they multiply is small
-    most = processes or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    They are flown in a folder beside theirs that goes at the end, whatever ends it: only what failed comes to its own.
+    """
+    parent = given[0].folder.parent
+    parent.mkdir(parents=True, exist_ok=True)
     # The longest first, so that no core has much to do when the others have finished.
-    waiting = deque(sorted(given, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator))))
+    longest = sorted(given, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator)))
     total_s = sum(task.scenario.duration_s for task in given)
     done: dict[str, Outcome] = {}
-    crew: dict[Connection, _Worker] = {}
 
-    def say() -> None:
+    def say(now: pool.Standing[Task]) -> None:
         if tell is not None:
             flown_s = sum(one.task.scenario.duration_s for one in done.values())
-            flown_s += sum(worker.share * worker.task.scenario.duration_s for worker in crew.values())
-            names = ", ".join(worker.task.name for worker in crew.values())
+            flown_s += sum(share * task.scenario.duration_s for task, share in now.running)
+            names = ", ".join(task.name for task, _ in now.running)
             tell(flown_s / total_s, f"{len(done)} of {len(given)} scenarios  {names}")
 
-    try:
-        while waiting or crew:
-            while waiting and len(crew) < most:
-                connection, worker = _Worker.hire(waiting.popleft())
-                crew[connection] = worker
-            for connection in [one for one in wait(list(crew)) if isinstance(one, Connection)]:
-                worker = crew[connection]
-                try:
-                    said = connection.recv()
-                except (EOFError, OSError):
-                    said = worker.died()
-                if isinstance(said, float):
-                    worker.share = said
-                    continue
-                done[said.name] = said
-                if waiting and worker.process.is_alive():
-                    worker.give(connection, waiting.popleft())
-                else:
-                    _dismiss(connection, crew.pop(connection))
-            say()
-    finally:
-        for connection, worker in crew.items():
-            worker.process.kill()
-            _dismiss(connection, worker)
-            clear(worker.task.folder)
+    with (
+        tempfile.TemporaryDirectory(prefix=".flying_", dir=parent, ignore_cleanup_errors=True) as flying,
+        pool.opened(len(given), workers) as crew,
+    ):
+        own = {task.name: task.folder for task in given}
+        for flown in crew.work(fly, (replace(task, folder=Path(flying, task.name)) for task in longest), say):
+            outcome = flown.result or Outcome(flown.task, failure=str(flown.error))
+            task = replace(flown.task, folder=own[flown.task.name])
+            clear(task.folder)
+            if outcome.failed:
+                outcome = _keep(outcome, flown.task.folder, task.folder)
+            done[task.name] = replace(outcome, task=task)
     return [done[task.name] for task in given]
 
 
-def _dismiss(connection: Connection, worker: _Worker) -> None:
-    worker.give(connection, None)
-    worker.process.join()
-    worker.process.close()
-    connection.close()
+def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
+    """Bring what is in the folder where it was flown into its own, unless files of somebody else are in the way."""
+    if not flown.exists():
+        return outcome
+    found = list(flown.iterdir())
+    try:
+        require_own(folder, [path.name for path in found])
+    except UserError as error:
+        return replace(outcome, failure="\n".join(filter(None, (outcome.failure, str(error)))))
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in found:
+        path.replace(folder / path.name)
+    return outcome
 
 
 # --- telling
@@ -379,34 +364,46 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 def junit(outcomes: Sequence[Outcome]) -> bytes:
     """All outcomes as JUnit XML: a suite for each scenario; a case for the flight, [expect], and each estimator."""
-    root = ElementTree.Element("testsuites", name="testbed check")
+    from junitparser import Error
+    from junitparser.xunit2 import JUnitXml, TestSuite
+
+    report = JUnitXml("testbed check")
     for outcome in outcomes:
-        suite = ElementTree.SubElement(root, "testsuite", name=outcome.name, time=f"{outcome.wall_s:.3f}")
-        flight = ElementTree.SubElement(suite, "testcase", classname=outcome.name, name="flight")
-        flight.set("time", f"{outcome.wall_s:.3f}")
+        suite = TestSuite(outcome.name)
+        flight = _case(outcome.name, "flight", outcome.wall_s)
         if outcome.failure:
-            _complaint(flight, "error", outcome.failure.splitlines()[0], outcome.failure)
+            flight.result = [_complaint(Error, outcome.failure.splitlines()[0], outcome.failure)]
+        suite.add_testcase(flight)
         for group, found in itertools.groupby(outcome.rows, _group):
-            rows = list(found)
-            case = ElementTree.SubElement(suite, "testcase", classname=outcome.name, name=group, time="0")
-            bad = [str(row) for row in rows if not row.sound]
-            if bad:
-                _complaint(case, "failure", f"{len(bad)} of {len(rows)} metrics", "\n".join(bad))
-        _count(suite, suite)
-    _count(root, root)
-    ElementTree.indent(root)
-    return b'<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(root, encoding="unicode").encode() + b"\n"
+            suite.add_testcase(_judged(outcome.name, group, list(found)))
+        report.add_testsuite(suite)
+    report.update_statistics()
+    text: bytes = report.tostring()
+    return text
+
+
+def _judged(name: str, group: str, rows: Sequence[Row]) -> TestCase:
+    from junitparser import Failure
+
+    case = _case(name, group, 0.0)
+    bad = [str(row) for row in rows if not row.sound]
+    if bad:
+        case.result = [_complaint(Failure, f"{len(bad)} of {len(rows)} metrics", "\n".join(bad))]
+    return case
+
+
+def _case(suite: str, name: str, wall_s: float) -> TestCase:
+    from junitparser.xunit2 import TestCase
+
+    return TestCase(name, suite, round(wall_s, 3))
 
 
 def _group(row: Row) -> str:
     return f"golden {row.metric.partition('.')[0]}" if row.golden else "expect"
 
 
-def _complaint(case: ElementTree.Element, kind: str, message: str, text: str) -> None:
-    complaint = ElementTree.SubElement(case, kind, message=_NOT_XML.sub("?", message), type=kind)
+def _complaint(kind: type[Error | Failure], message: str, text: str) -> Error | Failure:
+    """An error or a failure; characters that XML can't have become question marks."""
+    complaint = kind(_NOT_XML.sub("?", message), kind.__name__.lower())
     complaint.text = _NOT_XML.sub("?", text)
-
-
-def _count(element: ElementTree.Element, below: ElementTree.Element) -> None:
-    for name, path in (("tests", "testcase"), ("failures", "failure"), ("errors", "error")):
-        element.set(name, str(len(list(below.iter(path)))))
+    return complaint

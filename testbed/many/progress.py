@@ -1,4 +1,4 @@
-"""How far something long has come: a bar on a terminal, a line now and then elsewhere."""
+"""How far something long has come, and how long it will take: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 PLAIN_LINES = 10  # for the whole
 PLAIN_EVERY_S = 5.0  # wall time
+PACE_S = 2.0  # wall time before it is said how long the rest will take
 
 Tell: TypeAlias = Callable[[float, str], None]
 
@@ -23,8 +24,9 @@ Tell: TypeAlias = Callable[[float, str], None]
 @contextmanager
 def shown(console: Console, title: str) -> Iterator[Tell]:
     """A function to be told the fraction done and what is going on, shown on ``console`` while the context lasts."""
+    pace = _Pace()
     if not console.is_terminal:
-        yield _plain(console)
+        yield _plain(console, pace)
         return
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -33,15 +35,41 @@ def shown(console: Console, title: str) -> Iterator[Tell]:
     )
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=1.0, text="starting; the first time, kernels are compiled")
-        yield lambda fraction, text: bar.update(task, completed=fraction, text=text)
+        yield lambda fraction, text: bar.update(task, completed=fraction, text=pace.with_remaining(fraction, text))
 
 
-def _plain(console: Console) -> Tell:
+class _Pace:
+    """How long the rest will take, if it goes on as it has from the first that was told."""
+
+    def __init__(self) -> None:
+        self._began: tuple[float, float] | None = None  # wall time, and the fraction that was done then
+
+    def with_remaining(self, fraction: float, text: str) -> str:
+        """The text, and how long it will take, once that can be said."""
+        now = time.monotonic()
+        if self._began is None:
+            self._began = now, fraction
+        elapsed, done = now - self._began[0], fraction - self._began[1]
+        if elapsed < PACE_S or done <= 0.0 or fraction >= 1.0:
+            return text
+        return f"{text}  {_about(elapsed / done * (1.0 - fraction))} to go"
+
+
+def _about(seconds: float) -> str:
+    """A time to come, in the unit that it is told in."""
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"about {seconds / size:,.0f} {unit}"
+    return f"about {seconds:.0f} s"
+
+
+def _plain(console: Console, pace: _Pace) -> Tell:
     shown = 0
     last_line = time.monotonic()
 
     def tell(fraction: float, text: str) -> None:
         nonlocal shown, last_line
+        text = pace.with_remaining(fraction, text)
         reached = int(fraction * PLAIN_LINES + 1e-9)  # a tenth of the whole is none in binary
         if reached <= shown and time.monotonic() - last_line < PLAIN_EVERY_S:
             return

@@ -26,6 +26,7 @@ from rich.table import Table
 from rich.text import Text
 
 from testbed.errors import UserError
+from testbed.interrupts import Interrupted
 from testbed.mavlink.link import CONNECT_TIMEOUT_S, log_path, resolve
 
 Turn: TypeAlias = tuple[float, list[Any]]  # a clock [s] and the messages that have come up to then
@@ -72,7 +73,7 @@ def watch(source: str, console: Console, speed: float) -> None:
         speed, turns = 1.0, _live(source)
     else:
         turns = _replay(path, speed if console.is_terminal else math.inf)
-    with contextlib.closing(turns), contextlib.suppress(KeyboardInterrupt):
+    with contextlib.closing(turns), contextlib.suppress(KeyboardInterrupt, Interrupted):
         (_draw if console.is_terminal else _write)(picture, turns, console, speed)
     if not console.is_terminal:
         console.print(picture.render())

@@ -7,11 +7,8 @@ concludes its claims and draws its figures. The scenarios lie in ``scenarios/pap
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -21,6 +18,7 @@ import numpy as np
 
 from testbed.data import data_dir
 from testbed.errors import UserError
+from testbed.many import pool
 from testbed.results import write_result
 from testbed.scenario import Scenario
 
@@ -124,18 +122,21 @@ def reproduce(papers: Mapping[str, Paper], out: Path, tell: Tell | None = None) 
     """Work off the jobs of all ``papers`` on every core, conclude, draw; `RESULTS` and figures go to ``out``."""
     jobs = [(name, k, job) for name, paper in papers.items() for k, job in enumerate(paper.jobs())]
     results: dict[str, dict[int, Any]] = {name: {} for name in papers}
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
-        try:
-            waiting = {pool.submit(job.work, *job.arguments): (name, k) for name, k, job in jobs}
-            for done, future in enumerate(as_completed(waiting), 1):
-                name, k = waiting[future]
-                results[name][k] = future.result()
-                if tell is not None:
-                    tell(done / len(jobs), f"{done} of {len(jobs)}  {name}")
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    done = 0
+
+    def say(now: pool.Standing[tuple[str, int, Job]]) -> None:
+        if tell is not None:
+            flying = ", ".join(dict.fromkeys(name for (name, _, _), _ in now.running))
+            tell(done / len(jobs), f"{done} of {len(jobs)} jobs  {flying}")
+
+    with pool.opened(len(jobs)) as crew:
+        for one in crew.work(_work, jobs, say):
+            if one.error is not None:
+                raise one.error
+            name, k, _ = one.task
+            results[name][k] = one.result
+            done += 1
+            say(pool.Standing([(one.task, 1.0)], 1))
     claims = {}
     for name, paper in papers.items():
         in_order = [results[name][k] for k in sorted(results[name])]
@@ -144,6 +145,12 @@ def reproduce(papers: Mapping[str, Paper], out: Path, tell: Tell | None = None) 
     found = {name: [claim.record() for claim in own] for name, own in claims.items()}
     write_result(out / RESULTS, json.dumps(found, indent=1).encode())
     return claims
+
+
+def _work(task: tuple[str, int, Job], tell: Callable[[float], None]) -> Any:
+    """Called on a worker."""
+    job = task[2]
+    return job.work(*job.arguments)
 
 
 def table(title: str, claims: Sequence[Claim]) -> Table:

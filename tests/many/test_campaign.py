@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -21,13 +22,16 @@ from distributed import LocalCluster
 from typer.testing import CliRunner
 from worlds import synthetic_run
 
+import testbed
 from testbed import Scenario, run
 from testbed.__main__ import app
 from testbed.errors import UserError
+from testbed.feeds import simulated
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.many import campaign as campaigns
-from testbed.many.campaign import Combination, Failure, Outcome, Progress, campaign
+from testbed.many import pool, shared_flight
+from testbed.many.campaign import Combination, Failure, Outcome, Plan, Progress, campaign
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
@@ -182,15 +186,15 @@ def test_replayed_flight_equals_the_flight(tmp_path: Path) -> None:
     ],
 )
 def test_truth_is_shared_when_the_seed_does_not_move_it(overrides: list[str], shared: bool) -> None:
-    assert campaigns._seed_leaves_motion(Scenario.load("u_turn", overrides)) is shared
+    assert shared_flight.seed_leaves_motion(Scenario.load("u_turn", overrides)) is shared
 
 
 def test_truth_is_not_shared_when_it_is_varied(at_rest: Path) -> None:
     here, there = (Scenario.load(at_rest, [f"truth.start.alt_m={alt}"]) for alt in (500, 600))
-    assert campaigns._same_motion(here, Scenario.load(at_rest, ["sensors.gnss.rate_hz=1"]))
-    assert not campaigns._same_motion(here, there)
+    assert shared_flight.same_motion(here, Scenario.load(at_rest, ["sensors.gnss.rate_hz=1"]))
+    assert not shared_flight.same_motion(here, there)
     on_truth, on_estimate = (Scenario.load("u_turn", [f"autopilot.feedback={name}"]) for name in ("truth", "ins"))
-    assert not campaigns._same_motion(on_truth, on_estimate)
+    assert not shared_flight.same_motion(on_truth, on_estimate)
 
 
 # --- the same numbers, however flown
@@ -199,7 +203,7 @@ def test_truth_is_not_shared_when_it_is_varied(at_rest: Path) -> None:
 @pytest.mark.ci
 def test_two_workers_give_what_one_process_gives(at_rest: Path, tmp_path: Path) -> None:
     told: list[Progress] = []
-    result = campaign(at_rest, 3, out=tmp_path / "out", workers=2, progress=told.append)
+    result = campaigns.fly(Plan(at_rest, 3, tmp_path / "out"), 2, told.append)
     assert not result.failures
     assert [outcome.seed for outcome in result.outcomes] == [11, 12, 13]
     assert (tmp_path / "out" / "truth" / "t.npy").exists()  # so this compares replay with direct, too
@@ -256,7 +260,7 @@ def test_interrupted_campaign_carries_on(
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        campaign(at_rest, 4, scheduler=threads, out=out, progress=interrupt)
+        campaigns.fly(Plan(at_rest, 4, out), threads, interrupt)
     assert not (out / "campaign.json").exists()
     kept = {int(path.stem.split("_s")[1]) for path in (out / "runs").glob("*.json")}
     assert 1 <= len(kept) <= 2
@@ -265,13 +269,13 @@ def test_interrupted_campaign_carries_on(
     time.sleep(1.0)  # until the worker is done with the run it was flying
 
     flown.seeds.clear()
-    result = campaign(at_rest, 4, scheduler=threads, out=out)
+    result = campaign(at_rest, 4, workers=threads, out=out)
     assert sorted(flown.seeds) == sorted({11, 12, 13, 14} - kept | {min(kept)})
     again = next(outcome for outcome in result.outcomes if outcome.seed == min(kept))
     assert same(again, flown_here(at_rest, again.seed))
 
     flown.seeds.clear()
-    more = campaign(at_rest, 5, scheduler=threads, out=out)
+    more = campaign(at_rest, 5, workers=threads, out=out)
     assert flown.seeds == [15]
     assert len(more.outcomes) == 5
 
@@ -291,7 +295,7 @@ def test_failing_run_is_reported_and_stops_no_other(
 
     flown.seeds.clear()
     flown.failing = set()
-    result = campaign(at_rest, 3, scheduler=threads, out=out)
+    result = campaign(at_rest, 3, workers=threads, out=out)
     assert flown.seeds == [12]
     assert not result.failures
 
@@ -313,12 +317,12 @@ def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkey
         def advance(self, ticks: int) -> TruthBlock:
             return super().advance(ticks if self._tick < 200 else 0)
 
-    monkeypatch.setattr(loop, "motion", lambda scenario, seed: Falls())
-    result = campaign("u_turn", 2, scheduler=threads, out=tmp_path / "gusty")
+    monkeypatch.setattr(simulated, "motion", lambda scenario, seed: Falls())
+    result = campaign("u_turn", 2, workers=threads, out=tmp_path / "gusty")
     assert not result.outcomes
     assert [f.message for f in result.failures] == ["the flight ended early: control lost: bank -90 deg"] * 2
     with pytest.raises(UserError, match="control lost"):
-        campaign("u_turn", 2, overrides=["truth.wind.turbulence=none"], scheduler=threads, out=tmp_path / "calm")
+        campaign("u_turn", 2, overrides=["truth.wind.turbulence=none"], workers=threads, out=tmp_path / "calm")
     assert not (tmp_path / "calm" / "truth").exists()
 
 
@@ -352,9 +356,8 @@ def test_killed_worker_loses_nothing(at_rest: Path, tmp_path: Path) -> None:
 
     try:
         wait_for(address)
-        result = campaign(
-            at_rest, 8, overrides=overrides, scheduler=address, out=tmp_path / "out", progress=kill_half_way
-        )
+        plan = Plan(at_rest, 8, tmp_path / "out", overrides=overrides)
+        result = campaigns.fly(plan, address, kill_half_way)
     finally:
         for process in (*workers, scheduler):
             process.terminate()
@@ -374,7 +377,7 @@ def wait_for(address: str) -> None:
     deadline = time.monotonic() + 30.0
     while True:
         try:
-            campaigns._require_scheduler(address)
+            pool._require_scheduler(address)
             break
         except UserError:
             assert time.monotonic() < deadline
@@ -382,23 +385,71 @@ def wait_for(address: str) -> None:
         client.wait_for_workers(2, timeout=30)
 
 
+def test_the_code_that_decides_numbers_is_all_of_it_but_presentation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(Path(testbed.__file__).parent, tmp_path / "testbed", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(testbed, "__file__", str(tmp_path / "testbed" / "__init__.py"))
+    before = campaigns._code.__wrapped__()
+    for path in (tmp_path / "testbed").rglob("*.py"):
+        text = path.read_bytes()
+        path.write_bytes(text + b"#")
+        room = path.relative_to(tmp_path / "testbed").parts[0]
+        assert (campaigns._code.__wrapped__() == before) == (room in ("report", "mavlink")), path
+        path.write_bytes(text)
+    assert campaigns._code.__wrapped__() == before
+
+
+def test_a_million_runs_are_made_as_they_are_flown(
+    at_rest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = []
+
+    def first(now: Progress) -> None:
+        began.append(now)
+        raise KeyboardInterrupt
+
+    flown = Counter(monkeypatch)
+    with pytest.raises(KeyboardInterrupt):
+        campaigns.fly(Plan(at_rest, 1_000_000_000, tmp_path / "out"), 1, first)
+    assert began[0].total == 1_000_000_000
+    assert flown.seeds == []
+
+
+def test_a_wrong_scheduler_is_told_before_anything_is_made(at_rest: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="nothing answers there"):
+        campaign(at_rest, 1_000_000_000, workers=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
+
+
+def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
+    vary = {"sensors.gnss.rate_hz": ["1", "5"]}
+    result = campaign(at_rest, 2, vary=vary, workers=threads, overrides=["duration_s=76"], out=str(tmp_path / "out"))
+    frame, dataset = result.frame(), result.dataset()
+    assert list(frame["seed"]) == [11, 12, 11, 12]
+    assert list(frame["sensors.gnss.rate_hz"]) == [1, 1, 5, 5]
+    assert frame["ins.aligned_s"][3] == result.outcomes[3].metrics["ins.aligned_s"]
+    assert dict(dataset.sizes) == {"run": 4, "time": 77}
+    np.testing.assert_array_equal(dataset["ins.error"][2], result.outcomes[2].history["ins.error"])
+    assert list(dataset["sensors.gnss.rate_hz"].values) == ["1", "1", "5", "5"]
+
+
 # --- what a user may get wrong
 
 
 def test_folder_of_another_campaign(at_rest: Path, tmp_path: Path, threads: str) -> None:
     out = tmp_path / "out"
-    campaign(at_rest, 1, scheduler=threads, out=out)
+    campaign(at_rest, 1, workers=threads, out=out)
     with pytest.raises(UserError, match="different overrides: choose another folder with --out"):
-        campaign(at_rest, 1, overrides=["duration_s=79"], scheduler=threads, out=out)
+        campaign(at_rest, 1, overrides=["duration_s=79"], workers=threads, out=out)
     at_rest.write_text(AT_REST + "# changed\n")
     with pytest.raises(UserError, match="different scenario text"):
-        campaign(at_rest, 1, scheduler=threads, out=out)
+        campaign(at_rest, 1, workers=threads, out=out)
     (out / "setup.json").write_text("{")
     with pytest.raises(UserError, match=r"setup\.json: is damaged"):
-        campaign(at_rest, 1, scheduler=threads, out=out)
+        campaign(at_rest, 1, workers=threads, out=out)
     (out / "setup.json").unlink()
     with pytest.raises(UserError, match="has runs but no"):
-        campaign(at_rest, 1, scheduler=threads, out=out)
+        campaign(at_rest, 1, workers=threads, out=out)
 
 
 def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
@@ -426,20 +477,20 @@ def test_wrong_varied_values(at_rest: Path, tmp_path: Path, vary: dict[str, list
 @pytest.mark.parametrize("address", ["localhost", "nonsense://here:1", "tcp://127.0.0.1:port"])
 def test_scheduler_address_that_is_none(at_rest: Path, tmp_path: Path, address: str) -> None:
     with pytest.raises(UserError, match="give an address like tcp://host:8786"):
-        campaign(at_rest, 1, scheduler=address, out=tmp_path / "out")
+        campaign(at_rest, 1, workers=address, out=tmp_path / "out")
 
 
 def test_scheduler_that_does_not_answer(at_rest: Path, tmp_path: Path) -> None:
     started = time.monotonic()
     with pytest.raises(UserError, match="nothing answers there"):
-        campaign(at_rest, 1, scheduler=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
+        campaign(at_rest, 1, workers=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
     assert time.monotonic() - started < 6.0
 
 
 def test_scheduler_without_workers(at_rest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(campaigns, "WORKER_WAIT_S", 0.5)
+    monkeypatch.setattr(pool, "WORKER_WAIT_S", 0.5)
     with in_this_process(0) as cluster, pytest.raises(UserError, match="has no workers"):
-        campaign(at_rest, 1, scheduler=cluster.scheduler_address, out=tmp_path / "out")
+        campaign(at_rest, 1, workers=cluster.scheduler_address, out=tmp_path / "out")
 
 
 # --- statistics

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+import testbed
 import testbed.__main__ as cli
 from testbed import measures
 from testbed.data import data_dir
@@ -278,29 +279,36 @@ def test_check_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
 LAST = "Only [expect] was checked: there is no tests/golden here. Give golden metrics with --golden DIR.\n"
 
 
+def fly_or_crash(task: Task, tell: Any) -> Outcome:
+    """Called on a worker."""
+    if task.name == "crash":
+        task.folder.mkdir()
+        (task.folder / "run.nc").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Outcome(task, wall_s=os.getpid())
+
+
 def test_a_crash_costs_one_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one that flies longest is killed as soon as it flies; the same worker's place is taken by another."""
-    names = ["crash", "good", "also"]
+    """The one that flies longest crashes; the same worker's place is taken by another."""
+    names = ["crash", "good", "also", "more"]
     given = check.tasks(
         [str(scenario(tmp_path, name, HOUR if name == "crash" else BENCH)) for name in names], tmp_path / "runs", None
     )
-    hired: list[Any] = []
-    killed: list[None] = []
-    right = check._Worker.hire
-
-    def hire(task: Task) -> Any:
-        hired.append(right(task))
-        return hired[-1]
-
-    def tell(share: float, text: str) -> None:
-        if share > 0 and not killed:
-            killed.append(hired[0][1].process.kill())
-
-    monkeypatch.setattr(check._Worker, "hire", hire)
-    outcomes = check.fly_all(given, tell, processes=1)
-    assert [outcome.failed for outcome in outcomes] == [True, False, False]
+    monkeypatch.setattr(check, "fly", fly_or_crash)
+    outcomes = check.fly_all(given, workers=2)
+    assert [outcome.failed for outcome in outcomes] == [True, False, False, False]
     assert outcomes[0].failure.startswith("its process ended by signal 9")
-    assert [worker.process._closed for _, worker in hired] == [True, True]
+    assert [outcome.task for outcome in outcomes] == given
+    assert [path.name for path in (tmp_path / "runs").iterdir()] == ["crash"]
+
+
+def test_check_in_a_test(tmp_path: Path) -> None:
+    result = testbed.check(scenario(tmp_path, "mine"), out=tmp_path / "runs")
+    assert result.passed, result
+    bad = scenario(tmp_path, "bad", f'{HEAD}[expect]\n"ins.aligned_s" = 0.0\n')
+    result = testbed.check(bad, out=tmp_path / "runs")
+    assert not result.passed
+    assert re.search(r"(?m)^bad: FAILED in .*\n  ins.aligned_s is \S+, not ≤ 0: exceeded$", str(result))
 
 
 def test_an_interrupt_leaves_no_process_and_no_file(tmp_path: Path) -> None:

@@ -1,0 +1,154 @@
+"""One interrupt ends a command: SIGINT, which is what Ctrl-C sends, and SIGTERM alike.
+
+It is raised once, in the main thread. Python hears of a signal between two of its own instructions, and what is raised
+in a callback is lost: whoever has not ended `GRACE_S` later is ended as it is, from a thread beside it.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+GRACE_S = 2.0  # to close files and to end other processes
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
+
+_left: list[Callable[[], str]] = []  # what the contexts that are open leave behind, the innermost last
+_last: list[Callable[[], object]] = []  # what is to be done though no context is left in order
+_told = False
+_held = False
+_waiting: list[int] = []  # signals that came in the meantime
+
+
+class Interrupted(BaseException):
+    """Raised by a signal; ``exit_code`` is 128 and its number, as shells have it.
+
+    No KeyboardInterrupt: libraries have ideas of their own of what that means.
+    """
+
+    def __init__(self, number: int = signal.SIGINT) -> None:
+        super().__init__(number)
+        self.exit_code = 128 + number
+
+
+def end_at_once() -> None:
+    """From now on each of `SIGNALS` ends this process there and then, with a line: before anything is begun."""
+    for one in SIGNALS:
+        if signal.getsignal(one) is not signal.SIG_IGN:
+            signal.signal(one, _end)
+
+
+def _end(number: int, frame: object) -> None:
+    _tell()
+    os._exit(128 + number)
+
+
+@contextmanager
+def heeded() -> Iterator[None]:
+    """While the context lasts, the first of `SIGNALS` raises `Interrupted`, and the watch over the end begins.
+
+    What this process was started to ignore, as in the background of a shell, it goes on ignoring.
+    """
+    mine = [one for one in SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+    heard, tell = os.pipe()
+    os.set_blocking(tell, False)
+    interrupted = False
+
+    def interrupt(number: int, frame: object) -> None:
+        nonlocal interrupted
+        interrupted = True
+        if _held:
+            _waiting.append(number)
+            return
+        for one in mine:
+            signal.signal(one, signal.SIG_IGN)
+        raise Interrupted(number)
+
+    before = {one: signal.getsignal(one) for one in mine}
+    awakened, unraisable = signal.set_wakeup_fd(tell, warn_on_full_buffer=False), sys.unraisablehook
+    sys.unraisablehook = lambda what: None if isinstance(what.exc_value, Interrupted) else unraisable(what)
+    threading.Thread(target=_watch, args=(heard,), daemon=True, name="interrupts").start()
+    try:
+        with leaving():
+            for one in mine:
+                signal.signal(one, interrupt)
+            yield
+    except SystemExit as end:
+        if interrupted:  # nothing is left to be closed, and to take everything down in order can take seconds
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(end.code if isinstance(end.code, int) else 0)
+        raise
+    finally:
+        if not interrupted:  # otherwise the watch goes on until the process has ended
+            for one, handler in before.items():
+                signal.signal(one, handler)
+            signal.set_wakeup_fd(awakened)
+            sys.unraisablehook = unraisable
+            os.close(tell)
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """A signal in this context is raised at its end: to start a process, and to note that it was, is one thing."""
+    global _held
+    _held = True
+    try:
+        yield
+    finally:
+        _held = False
+    if _waiting:
+        raise Interrupted(_waiting.pop())
+
+
+@contextmanager
+def leaving(what: Callable[[], str] = str) -> Iterator[None]:
+    """An interrupt in this context ends the command with its exit code and one line: ``what`` it leaves behind."""
+    _left.append(what)
+    try:
+        yield
+    except (Interrupted, KeyboardInterrupt) as interrupt:
+        _tell()
+        raise SystemExit(interrupt.exit_code if isinstance(interrupt, Interrupted) else 130) from None
+    finally:
+        _left.remove(what)
+
+
+@contextmanager
+def lastly(do: Callable[[], object]) -> Iterator[None]:
+    """While the context lasts, ``do`` is called, in a thread, before the process is ended as it is."""
+    _last.append(do)
+    try:
+        yield
+    finally:
+        _last.remove(do)
+
+
+def _tell() -> None:
+    global _told
+    _told = True
+    what = _left[-1]() if _left else ""
+    print(f"testbed: interrupted{': ' if what else ''}{what}", file=sys.stderr, flush=True)
+
+
+def _watch(heard: int) -> None:
+    """Wait for a signal, or the end of the pipe that it would be heard on; then for the process to end."""
+    number = os.read(heard, 1)
+    if not number:
+        os.close(heard)
+        return
+    select.select([], [], [], GRACE_S)
+    for do in _last:
+        with suppress(Exception):
+            do()
+    if sys.stderr.isatty():
+        print(end=_SHOW_CURSOR, file=sys.stderr)
+    if not _told:
+        with suppress(Exception):
+            _tell()
+    os._exit(128 + number[0])

@@ -1,0 +1,57 @@
+"""A flight that all runs of a campaign have in common is flown once."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from testbed.errors import UserError
+from testbed.motion.sections import FlightTruth
+from testbed.motion.table import MotionSource, save_motion
+from testbed.scenario import Scenario
+
+
+def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
+    """Fly once the motion that all runs have in common, if they have, and give the folder where it lies."""
+    from testbed.feeds.simulated import motion
+
+    first = scenarios[0]
+    if not all(same_motion(first, scenario) for scenario in scenarios) or not seed_leaves_motion(first):
+        return None
+    truth = folder / "truth"
+    if not truth.is_dir():
+        source = motion(first, first.seed)
+        save_motion(source, round(first.duration_s * source.rate_hz) + 1, truth)
+        try:
+            require_control(source)
+        except UserError:
+            shutil.rmtree(truth)
+            raise
+    return truth
+
+
+def require_control(source: MotionSource) -> None:
+    """A flight that got out of control says nothing about navigation: don't let its numbers in among the others."""
+    if source.failure:
+        raise UserError(f"the flight ended early: {source.failure}")
+
+
+def same_motion(one: Scenario, other: Scenario) -> bool:
+    """Whether both move alike, as far as the seed leaves it."""
+    return _moving(one) == _moving(other)
+
+
+def _moving(scenario: Scenario) -> tuple[object, ...]:
+    """All that the motion depends on but the seed, and what is estimated when that is fed back."""
+    return scenario.truth, scenario.plan, scenario.duration_s, scenario.autopilot
+
+
+def seed_leaves_motion(scenario: Scenario) -> bool:
+    """Whether the motion is the same for every seed: nothing estimated is fed back, and no gust follows the seed."""
+    if scenario.autopilot.feedback.estimators:
+        return False
+    if not isinstance(scenario.truth, FlightTruth):
+        return True
+    wind = scenario.truth.wind
+    return wind.turbulence == "none" or wind.turbulence_seed is not None

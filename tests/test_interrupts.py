@@ -1,0 +1,75 @@
+"""One interrupt ends every command: soon, with one line, and nothing outlives it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+COMMANDS = {
+    "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
+    "campaign": (["campaign", "static_bench", "--runs", "1000000"], r"what is finished is in .*; the same .*"),
+    "check": (["check", "one.toml", "two.toml"], "nothing was concluded"),
+    "papers": (["papers"], "nothing was written"),
+    "watch": (["watch", "udpin:127.0.0.1:0"], ""),
+}
+
+
+def caught(pid: int, number: int) -> bool:
+    """Whether a process has a handler for a signal: before it has, not even Python hears of it."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return bool(int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16) >> (number - 1) & 1)
+
+
+def group(mark: str) -> list[str]:
+    """The processes that a command has started, and itself, wherever they have gone: they inherit its environment."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            zombie = process.joinpath("stat").read_text().rpartition(")")[2].split()[0] == "Z"
+            if not zombie and mark.encode() in process.joinpath("environ").read_bytes():
+                found.append(process.joinpath("cmdline").read_text().replace("\0", " "))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "after_s", [0.0, pytest.param(2.0, marks=pytest.mark.slow), pytest.param(8.0, marks=pytest.mark.slow)]
+)
+def test_an_interrupt_ends_a_command(tmp_path: Path, name: str, number: int, after_s: float) -> None:
+    arguments, left = COMMANDS[name]
+    bench = Path(__file__).parents[1] / "scenarios" / "static_bench.toml"
+    for scenario in ("one", "two"):
+        (tmp_path / f"{scenario}.toml").write_text(bench.read_text().replace("duration_s = 300", "duration_s = 36000"))
+    mark = f"TESTBED_TEST={tmp_path}"
+    path = os.pathsep.join(filter(None, sys.path))
+    with subprocess.Popen(
+        [sys.executable, "-m", "testbed", *arguments], cwd=tmp_path,
+        env=os.environ | dict([mark.split("=")]) | {"PYTHONPATH": path},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, process_group=0,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as running:  # fmt: skip
+        while not caught(running.pid, signal.SIGTERM):
+            time.sleep(0.001)
+        time.sleep(after_s)
+        os.killpg(running.pid, number) if number == signal.SIGINT else running.send_signal(number)
+        _, said = running.communicate()
+    assert "Traceback" not in said
+    if name != "watch" or said:  # which shows what it has seen, once it is there
+        assert running.returncode == 128 + number, said
+        assert re.fullmatch(f"testbed: interrupted(: ({left}))?", said.splitlines()[-1]), said
+    deadline = time.monotonic() + 5.0
+    while outlived := group(mark):
+        assert time.monotonic() < deadline, outlived
+        time.sleep(0.05)
+    if name in ("check", "papers"):
+        assert sorted(one.name for one in tmp_path.iterdir()) == ["one.toml", "two.toml"]
