@@ -106,6 +106,16 @@ class EventWatch:
         self.t = t
 
 
+def legs_unflown(scenario: Scenario, leg: float) -> str:
+    """Which legs of the plan a run that ends in leg ``leg``, counted from 0, never came to; empty when none."""
+    names = [one.leg.replace("_", " ") for one in scenario.plan]
+    missed = [f"{number}/{len(names)} {name}" for number, name in enumerate(names, 1) if number > leg + 1]
+    if not missed:
+        return ""
+    what = f"leg {missed[0]} was" if len(missed) == 1 else f"legs {', '.join(missed)} were"
+    return f"{what} never flown: the run ended in leg {leg + 1:.0f} {names[int(leg)]}"
+
+
 def plan_flown(scenario: Scenario, end: float) -> tuple[str, str]:
     """Severity and text of a plan that ended before the run; a denial that it never reached is worth a warning."""
     text = f"plan flown: the run ends at {end:.0f} s of {scenario.duration_s:g} s"

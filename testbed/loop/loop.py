@@ -22,7 +22,7 @@ from testbed.estimators.lane import Lane, Tracked
 from testbed.feeds.build import open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
-from testbed.loop.events import EventWatch, plan_flown
+from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
 from testbed.loop.requests import Desk, Director, Plant, Recorded, Request, Restarted
 from testbed.motion.sections import FlightTruth
@@ -295,6 +295,9 @@ class _Passage:
             severity, remark = plan_flown(self.scenario, end)
             self.told.emit(end, severity, remark)
             remarks.append(remark)
+        elif unflown := legs_unflown(self.scenario, self.watch.leg):
+            self.told.emit(end, "warning", unflown)
+            remarks.append(unflown)
         remarks += [f"{name} has ended: {self.lanes[name].failure}" for name in self.lanes if name in self.ended]
         self.director.conclude(end)
         if self.director.pacer is not None and self.director.pacer.missed:
