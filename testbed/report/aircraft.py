@@ -28,7 +28,7 @@ def tables(name: str) -> Iterator[Table]:
     envelope = aircraft.load(name)
     yield _limits(envelope)
     slowest, fastest = envelope.min_airspeed(ALTITUDE), envelope.max_airspeed(ALTITUDE)
-    airspeeds = np.linspace(math.ceil(2 * slowest) / 2, math.floor(2 * fastest) / 2, SPEEDS)
+    airspeeds = np.round(2 * np.linspace(math.ceil(2 * slowest) / 2, math.floor(2 * fastest) / 2, SPEEDS)) / 2
     found = [trim_and_modes(name, float(airspeed), ALTITUDE) for airspeed in airspeeds]
     yield _trims([trim for trim, _ in found], envelope)
     yield _modes(found)
@@ -52,7 +52,7 @@ def _limits(envelope: aircraft.Envelope) -> Table:
 
 
 def _trims(trims: list[Trim], envelope: aircraft.Envelope) -> Table:
-    heads = ("TAS\nm/s", "alpha\ndeg", "elevator\n%", "throttle\n%", "rev/min", "thrust\nN")
+    heads = ("TAS\nm/s", "alpha\ndeg", "elev.\n%", "throt.\n%", "rev/min", "thrust\nN")
     table = Table(
         *heads, "climb\nm/s", "descent\nm/s", "bank\ndeg", title=f"trimmed at {ALTITUDE:g} m, and limits there"
     )
