@@ -424,7 +424,7 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
 
 def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
     """Scenario, folder, seed and requests for running a record again."""
-    from testbed.loop import requests as control
+    from testbed.loop import director
     from testbed.record.reader import load
     from testbed.record.recorder import versions as installed
     from testbed.scenario import Scenario
@@ -443,7 +443,7 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
     if not said["complete"]:
         print(f"testbed: {run_file}: ends early; the rerun goes on to the scenario's end", file=sys.stderr)
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
-    return scenario, RUNS / f"{name}_again", seed, control.recorded(dataset, scenario)
+    return scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario)
 
 
 @contextmanager

@@ -55,7 +55,7 @@ class Publisher(Protocol):
         ...
 
     def settings(self, values: Mapping[str, float]) -> None:
-        """The values in force of what may change (`testbed.loop.requests.settings`): first and at each change."""
+        """The values in force of what may change (`testbed.loop.settings.settings`): first and at each change."""
         ...
 
     def event(self, t: float, severity: str, text: str) -> None:

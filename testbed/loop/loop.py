@@ -22,9 +22,11 @@ from testbed.estimators.lane import Lane, Tracked
 from testbed.feeds.build import open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
+from testbed.loop.director import Director, Executor, Restarted
 from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
-from testbed.loop.requests import Desk, Director, Plant, Recorded, Request, Restarted
+from testbed.loop.requests import Recorded, Request
+from testbed.loop.settings import Parts
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource
 from testbed.record.recorder import Recorder
@@ -181,8 +183,8 @@ class _Passage:
         legs = scenario.plan if isinstance(scenario.truth, FlightTruth) else scenario.truth.segments
         self.plan = [leg.leg for leg in legs]
         self.watch = EventWatch.of(self.told.emit, self.feed.faults.truth, scenario)
-        plant = Plant(self.feed.faults, self.feed.aiding, self.lanes, self.feed.source)
-        director.begin(Desk(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
+        plant = Parts(self.feed.faults, self.feed.aiding, self.lanes, self.feed.source)
+        director.begin(Executor(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
         self.latest = _Latest()
         self.arrived: list[Sample] = []  # not looked at for events
         self.backlog = {name: _Backlog(self._behind(one)) for name, one in self.lanes.items()}

@@ -16,6 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
+from testbed.loop import injection
 from testbed.loop import requests as control
 from testbed.mavlink import messages, mission
 from testbed.mavlink.encode import Encoder, Fields, Voice
@@ -332,7 +333,7 @@ class Answers:
         if instance is None or instance < 0:
             return int(mav.MAV_RESULT_DENIED)
         try:
-            self.asked += control.injection(self._scenario, _UNITS[unit], _FAILURES[kind], instance)
+            self.asked += injection.injection(self._scenario, _UNITS[unit], _FAILURES[kind], instance)
         except control.Refused as refused:
             self._text(talk, str(refused))
             return int(mav.MAV_RESULT_DENIED)

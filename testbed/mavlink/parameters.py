@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from testbed.loop.requests import Setting
+from testbed.loop.settings import Setting
 from testbed.mavlink.encode import Fields
 from testbed.mavlink.receive import Message, whole_number
 
@@ -43,7 +43,7 @@ class Parameters:
     """A table of parameters in a fixed order, and how their values travel."""
 
     def __init__(self, facts: Mapping[str, tuple[int, str]], settings: Mapping[str, Setting], byte_wise: bool) -> None:
-        """``facts`` are for reading only; ``settings`` as `testbed.loop.requests.settings` gives them."""
+        """``facts`` are for reading only; ``settings`` as `testbed.loop.settings.settings` gives them."""
         self._byte_wise = byte_wise
         self._settings = dict(settings)
         self._values: dict[str, float] = {name: float(value) for name, (value, _) in facts.items()}

@@ -13,7 +13,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, Status, UpdateReport
-from testbed.loop.requests import Request, settings
+from testbed.loop.requests import Request
+from testbed.loop.settings import settings
 from testbed.mavlink import messages, mission
 from testbed.mavlink.answers import Answers, Talk
 from testbed.mavlink.encode import Encoder, microseconds

@@ -18,12 +18,11 @@ from worlds.loop import same
 from nav.samples import FixType
 from testbed import Scenario, run
 from testbed.errors import UserError
+from testbed.loop.director import Director, Restarted, recorded
+from testbed.loop.injection import KINDS, UNITS, injection
 from testbed.loop.requests import (
-    KINDS,
-    UNITS,
     Change,
     Clear,
-    Director,
     End,
     Faster,
     Inject,
@@ -31,15 +30,12 @@ from testbed.loop.requests import (
     Refused,
     Request,
     Restart,
-    Restarted,
     Resume,
     Speed,
     Step,
     Toggle,
-    injection,
-    recorded,
-    settings,
 )
+from testbed.loop.settings import settings
 from testbed.record import reader as record
 
 HEALTHY = ["sensors.gnss.denied=[]", "expect={}", "truth.wind.turbulence='none'"]

@@ -17,6 +17,7 @@ from worlds.mavlink import SCENARIO, publish, read_log
 
 from testbed import Scenario
 from testbed.errors import UserError
+from testbed.loop import injection, settings
 from testbed.loop import requests as control
 from testbed.mavlink import MavlinkPublisher, link, mission, signing
 from testbed.mavlink.stream import STREAMS
@@ -132,7 +133,7 @@ def test_all_parameters_are_fetched(meet, identity):
     assert {message.param_count for message in heard} == {len(heard)}
     values = {message.param_id: decoded(message, identity == "px4") for message in heard}
     assert list(values) == sorted(values)
-    settings = control.settings(SCENARIO)
+    settings = settings.settings(SCENARIO)
     for name, setting in settings.items():
         assert values[name] == pytest.approx(setting.value)
     types = {message.param_id: message.param_type for message in heard}
@@ -424,10 +425,10 @@ def test_arming(meet):
 def test_failures_are_injected(meet):
     peer = meet()
     assert peer.command(420, mav.FAILURE_UNIT_SENSOR_GPS, mav.FAILURE_TYPE_OFF, 0)[0] == [ACCEPTED]
-    assert peer.asked == control.injection(SCENARIO, "gnss", "off", 0)
+    assert peer.asked == injection.injection(SCENARIO, "gnss", "off", 0)
     peer.asked.clear()
     assert peer.command(420, mav.FAILURE_UNIT_SENSOR_MAG, mav.FAILURE_TYPE_STUCK, 1)[0] == [ACCEPTED]
-    assert peer.asked == control.injection(SCENARIO, "magnetometer", "stuck", 1)
+    assert peer.asked == injection.injection(SCENARIO, "magnetometer", "stuck", 1)
     peer.asked.clear()
     results, heard = peer.command(420, mav.FAILURE_UNIT_SENSOR_GPS, mav.FAILURE_TYPE_OFF, 3)
     assert results == [DENIED]
