@@ -133,13 +133,13 @@ def test_all_parameters_are_fetched(meet, identity):
     assert {message.param_count for message in heard} == {len(heard)}
     values = {message.param_id: decoded(message, identity == "px4") for message in heard}
     assert list(values) == sorted(values)
-    settings = settings.settings(SCENARIO)
-    for name, setting in settings.items():
+    known = settings.settings(SCENARIO)
+    for name, setting in known.items():
         assert values[name] == pytest.approx(setting.value)
     types = {message.param_id: message.param_type for message in heard}
     assert types["SIM_GPS1_ENABLE"] == mav.MAV_PARAM_TYPE_INT32
     assert types["SIM_WIND_SPD"] == mav.MAV_PARAM_TYPE_REAL32
-    facts = set(values) - set(settings)
+    facts = set(values) - set(known)
     if identity == "px4":
         assert facts == {"MAV_SYS_ID", "MAV_TYPE", "SYS_AUTOSTART", "SYS_FAILURE_EN"}
         assert values["SYS_FAILURE_EN"] == 1  # or MAVSDK injects no failures
