@@ -1,6 +1,7 @@
 """What the manual takes from the code while it is built, and mathematics without scripts.
 
-A line ``<!-- generated: NAME -->`` in a page becomes the Markdown that the function of that name in `PARTS` returns.
+A line ``<!-- generated: NAME -->`` in a page becomes the Markdown that the function of that name in `PARTS` returns,
+``<!-- example: FILE -->`` that file of ``docs/examples``.
 Equations between dollars become MathML, which browsers show by themselves, so no page asks another host for anything.
 """
 
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parent.parent
+EXAMPLE = re.compile(r"^<!-- example: (\w+\.py) -->$", re.MULTILINE)
 PLACEHOLDER = re.compile(r"^<!-- generated: ([a-z_]+) -->$", re.MULTILINE)
 
 # --- the scenario reference, from pydantic's JSON schema
@@ -81,18 +83,19 @@ def scenario_tables() -> list[Table]:
 
     from testbed.estimators import registry
     from testbed.scenario import Scenario
-    from testbed.sensors import CONFIGS
+    from testbed.sensors.timing import AidingTiming
 
+    sensors = {**sensor_sections(), "module:Class": AidingTiming}
     estimators = {name: kind.section for name, kind in registry.BUILT_IN.items()}
     estimators["module:Class"] = registry.CUSTOM.section
-    models = [(model, "validation") for model in (Scenario, *CONFIGS.values(), *estimators.values())]
+    models = [(model, "validation") for model in (Scenario, *sensors.values(), *estimators.values())]
     references, schema = models_json_schema(models)  # type: ignore[arg-type]
     definitions = schema["$defs"]
     # Tables that are told apart by a key which the schema doesn't know of.
     registries: dict[Any, Any] = {
-        ("Scenario", "sensors"): ("[{}.<name>]", {k: references[c, "validation"] for k, c in CONFIGS.items()}),
+        ("Scenario", "sensors"): ("[{}.<name>]", {k: references[c, "validation"] for k, c in sensors.items()}),
         ("Scenario", "estimator"): ("[[{}]]", {k: references[c, "validation"] for k, c in estimators.items()}),
-        PRESET: {config.__name__: frozenset(_preset(config)) for config in CONFIGS.values()},
+        PRESET: {config.__name__: frozenset(_preset(config)) for config in sensor_sections().values()},
     }
     return list(_tables(references[Scenario, "validation"], "", "The run", 2, definitions, registries))
 
@@ -230,7 +233,7 @@ def scenario_reference() -> str:
         rows = [(f"`{row.key}`", row.type, row.unit, row.range, row.default, row.description) for row in table.rows]
         head = ("key", "type", "unit", "range", "default", "what it is")
         parts.append(f"{'#' * table.level} {table.heading}\n\n{table.about}\n\n{_table(head, rows) if rows else ''}")
-        if table.heading.startswith("`[sensors.<name>]`"):
+        if any(row.key == "grade" for row in table.rows):
             kind = re.findall(r'"(.+)"', table.heading)[0]
             parts.append(f"What the grades preset: [Sensors](sensors.md#{kind.replace('_', '-')}).")
     return "\n\n".join(parts)
@@ -239,14 +242,19 @@ def scenario_reference() -> str:
 # --- sensors
 
 
+def sensor_sections() -> dict[str, Any]:
+    """The section of each kind of sensor."""
+    from testbed.sensors import registry
+
+    return {name: kind.section for name, kind in registry.BUILT_IN.items()}
+
+
 def grade_tables() -> dict[str, str]:
     """By kind of sensor: what each grade presets, and where the figures come from."""
-    from testbed.sensors import CONFIGS
-
-    return {kind: _grades(kind, config) for kind, config in CONFIGS.items()}
+    return {kind: _grades(config) for kind, config in sensor_sections().items()}
 
 
-def _grades(kind: str, config: Any) -> str:
+def _grades(config: Any) -> str:
     rows = []
     for key, values in _preset(config).items():
         unit = next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
@@ -513,8 +521,18 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def with_examples(markdown: str) -> str:
+    """A page with the files of `docs/examples` that it names."""
+
+    def block(found: re.Match[str]) -> str:
+        return f'```python title="{found[1]}"\n{(ROOT / "docs/examples" / found[1]).read_text("utf-8")}```'
+
+    return EXAMPLE.sub(block, markdown)
+
+
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put in what is generated."""
+    """Put in examples, and what is generated."""
+    markdown = with_examples(markdown)
     return PLACEHOLDER.sub(lambda found: PARTS[found[1]](), markdown)
 
 

@@ -24,7 +24,6 @@ import yaml
 import testbed.__main__ as cli
 from testbed import Scenario, run
 from testbed.schema import Section
-from testbed.sensors import CONFIGS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -41,10 +40,27 @@ NOT_RUN = {
     "testbed papers": "takes minutes: tests/papers",
     "python scenarios/sweep_outage.py": "flies half an hour",
 }
-NOT_RUN_FILES = {"mavsdk_client.py": "needs MAVSDK, in an environment of its own: tests/clients/test_mavsdk.py"}
+NOT_RUN_FILES = {
+    "mavsdk_client.py": "needs MAVSDK, in an environment of its own: tests/clients/test_mavsdk.py",
+    "external_filter.py": "reads what external.py tells it, and is run by that",
+}
 
 
 DONE: set[str] = set()  # Python that has been run on another page
+
+
+def module(path: Path) -> ModuleType:
+    """A file as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = made  # where dataclasses look
+    spec.loader.exec_module(made)
+    return made
+
+
+GENERATE = module(DOCS / "_generate.py")
 
 
 class Block(NamedTuple):
@@ -56,8 +72,9 @@ class Block(NamedTuple):
 
 
 def blocks(page: Path) -> list[Block]:
-    """The fenced blocks of a page."""
-    found = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    """The fenced blocks of a page, examples among them."""
+    text = GENERATE.with_examples(page.read_text("utf-8"))
+    found = re.findall(r'^```(\w*)(?: title="([^"]+)")?\n(.*?)^```$', text, re.DOTALL | re.MULTILINE)
     return [Block(*block) for block in found]
 
 
@@ -96,8 +113,8 @@ def shortened(command: Sequence[str]) -> list[str]:
 
 def test_there_is_nothing_that_is_not_looked_at() -> None:
     assert {block.language for _, block in ALL} <= {"sh", "python", "toml", "text"}
-    fences = sum(len(re.findall(r"^```", page.read_text("utf-8"), re.MULTILINE)) for page in PAGES)
-    assert fences == 2 * len(ALL)
+    texts = [GENERATE.with_examples(page.read_text("utf-8")) for page in PAGES]
+    assert sum(len(re.findall(r"^```", text, re.MULTILINE)) for text in texts) == 2 * len(ALL)
     assert {command[0] for command in COMMANDS} >= {
         "scenarios",
         "run",
@@ -196,22 +213,6 @@ def test_the_manual_lists_its_pages() -> None:
 # --- what is generated
 
 
-def module(path: Path) -> ModuleType:
-    """A file as a module."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = made  # where dataclasses look
-    spec.loader.exec_module(made)
-    return made
-
-
-@pytest.fixture(scope="module")
-def generate() -> ModuleType:
-    return module(DOCS / "_generate.py")
-
-
 def sections(section: type[Section] = Section) -> Iterator[type[Section]]:
     """All sections that a scenario may have."""
     for below in section.__subclasses__():
@@ -220,12 +221,12 @@ def sections(section: type[Section] = Section) -> Iterator[type[Section]]:
             yield from sections(below)
 
 
-ABSTRACT = {"AidingTiming", "InterruptedTiming", "EstimatorSection"}  # whose keys are those of the sections below them
+ABSTRACT = {"InterruptedTiming", "EstimatorSection"}  # whose keys are those of the sections below them
 ELSEWHERE = "testbed.motion.aircraft"  # envelope.toml
 
 
-def test_every_key_is_in_the_reference_and_says_what_it_is(generate: ModuleType) -> None:
-    tables = generate.scenario_tables()
+def test_every_key_is_in_the_reference_and_says_what_it_is() -> None:
+    tables = GENERATE.scenario_tables()
     told = {(table.model, row.key) for table in tables for row in table.rows}
     there = {
         (section.__name__, key)
@@ -238,33 +239,33 @@ def test_every_key_is_in_the_reference_and_says_what_it_is(generate: ModuleType)
     assert len(there) > 200
     assert [(table.model, row.key) for table in tables for row in table.rows if not row.description] == []
     assert [(table.heading, row.key) for table in tables for row in table.rows if not row.type or not row.default] == []
-    page = generate.scenario_reference()
+    page = GENERATE.scenario_reference()
     assert all(f"| `{key}` |" in page for _, key in told)
 
 
-def test_every_grade_has_a_source(generate: ModuleType) -> None:
-    for kind, config in CONFIGS.items():
-        text = generate.grade_tables()[kind]
-        for name in generate._grade_names(config):
+def test_every_grade_has_a_source() -> None:
+    for kind, config in GENERATE.sensor_sections().items():
+        text = GENERATE.grade_tables()[kind]
+        for name in GENERATE._grade_names(config):
             assert name == "perfect" or f"* `{name}`: " in text, (kind, name)
 
 
-def test_every_recorded_variable_is_explained(generate: ModuleType) -> None:
-    rows = re.findall(r"^\| `.*$", generate.record_format(), re.MULTILINE)
+def test_every_recorded_variable_is_explained() -> None:
+    rows = re.findall(r"^\| `.*$", GENERATE.record_format(), re.MULTILINE)
     assert len(rows) > 80
     assert [row for row in rows if row.endswith("|  |")] == []
 
 
-def test_what_pages_ask_for_is_generated(generate: ModuleType) -> None:
-    asked = {name for page in PAGES for name in generate.PLACEHOLDER.findall(page.read_text("utf-8"))}
-    assert asked == set(generate.PARTS)
+def test_what_pages_ask_for_is_generated() -> None:
+    asked = {name for page in PAGES for name in GENERATE.PLACEHOLDER.findall(page.read_text("utf-8"))}
+    assert asked == set(GENERATE.PARTS)
     for name in asked - {"record_format", "aircraft_modes"}:  # the first has a test of its own, the second flies
-        assert len(generate.PARTS[name]()) > 100, name
+        assert len(GENERATE.PARTS[name]()) > 100, name
 
 
 def test_the_recipe_for_a_sensor_names_every_file() -> None:
     page = (DOCS / "extending.md").read_text("utf-8")
-    recipe = page[page.index("## A sensor, inside") : page.index("## A leg")]
+    recipe = page[page.index("## A built-in sensor") : page.index("## A leg")]
     named = set(re.findall(r"`((?:nav|testbed)/[\w/]+\.py)`", recipe)) - {"testbed/sensors/lidar.py"}
     sources = [path for room in ("nav", "testbed") for path in (ROOT / room).rglob("*.py")]
     knows = re.compile(r"StarTracker|StarSample|StarAid|star_tracker|star_attitude")
