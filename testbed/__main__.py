@@ -26,7 +26,7 @@ if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is th
 import typer
 
 from testbed.data import data_dir
-from testbed.errors import UserError
+from testbed.errors import UserError, printable
 from testbed.results import METRICS, RECORD, REPORT, held, require_own
 
 if TYPE_CHECKING:
@@ -75,11 +75,16 @@ def main() -> None:
             app(_explicit_realtime(sys.argv[1:]))
     except UserError as error:
         for line in str(error).splitlines():
-            print(f"testbed: {line}", file=sys.stderr)
+            _remark(line)
         sys.exit(EXIT_USER_ERROR)
     except OSError as error:  # a full disk, a folder that went away
-        print(f"testbed: {error}", file=sys.stderr)
+        _remark(str(error))
         sys.exit(EXIT_USER_ERROR)
+
+
+def _remark(text: str) -> None:
+    """One line for whoever reads along; what a file name may hold that a terminal would obey is escaped."""
+    print(f"testbed: {printable(text)}", file=sys.stderr)
 
 
 @app.callback(invoke_without_command=True)
@@ -254,7 +259,12 @@ def report(run_file: RunFile, force: Force = False) -> None:
     from testbed.score import metrics
 
     dataset = load(run_file)
-    computed = metrics.compute(dataset)
+    try:
+        computed = metrics.compute(dataset)
+    except UserError as error:
+        raise UserError(f"{run_file}: {error}") from None
+    for remark in metrics.unscored(dataset):
+        _remark(remark)
     kept = run_file.parent / METRICS
     if not kept.exists():  # the run was killed
         metrics.save(computed, kept)
@@ -271,7 +281,7 @@ def export(
     """Turn a run file into CSV or MATLAB."""
     from testbed.record.export import export as write
 
-    print(write(run_file, format.value, out, force))
+    print(printable(str(write(run_file, format.value, out, force))))
 
 
 @app.command()
@@ -303,10 +313,10 @@ def campaign(
         result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)))
     for table in campaign_report.tables(result):
         _console().print(table)
-    print(f"campaign: {folder}")
+    print(printable(f"campaign: {folder}"))
     for failure in result.failures:
         case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()
-        print(f"testbed: {case}: {failure.message}", file=sys.stderr)
+        _remark(f"{case}: {failure.message}")
     if result.failures:
         raise typer.Exit(EXIT_FAILED)
 
@@ -331,7 +341,7 @@ def papers(
         claims = library.reproduce(found, out, tell)
     for name, own in claims.items():
         _console().print(library.table(found[name].title, own))
-    print(f"{out / library.RESULTS} and figures beside it")
+    print(printable(f"{out / library.RESULTS} and figures beside it"))
     if any(claim.verdict == "missed" for own in claims.values() for claim in own):
         raise typer.Exit(EXIT_FAILED)
 
@@ -425,23 +435,21 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
 def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
     """Scenario, folder, seed and requests for running a record again."""
     from testbed.loop import director
-    from testbed.record.reader import load
+    from testbed.record.reader import load, scenario_of
     from testbed.record.recorder import versions as installed
-    from testbed.scenario import Scenario
 
     dataset = load(run_file)
     said = dataset.attrs
     try:
-        before, versions = [*json.loads(said["overrides"])], [*json.loads(said["versions"]).items()]
-        text, seed, path = said["scenario"], int(said["seed"]), said["scenario_path"]
+        versions, seed = [*json.loads(said["versions"]).items()], int(said["seed"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
-    scenario = Scenario.parse(text, [*before, *overrides], Path(path) if path else run_file)
+    scenario = scenario_of(dataset, overrides)
     other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
     if other:
-        print(f"testbed: {run_file}: was made with {', '.join(other)}: bits may differ", file=sys.stderr)
+        _remark(f"{run_file}: was made with {', '.join(other)}: bits may differ")
     if not said["complete"]:
-        print(f"testbed: {run_file}: ends early; the rerun goes on to the scenario's end", file=sys.stderr)
+        _remark(f"{run_file}: ends early; the rerun goes on to the scenario's end")
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
     return scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario)
 
@@ -520,7 +528,7 @@ def _fly(
             replay=replay,
         )
     for remark in result.remarks:
-        print(f"testbed: {remark}", file=sys.stderr)
+        _remark(remark)
     return result
 
 
@@ -547,8 +555,9 @@ def _conclude(
     if faults is not None:
         console.print(faults)
     if report:
-        print(f"report: {page.write_report(dataset, metrics, run_file.parent, force)}")
-    print(f"record: {run_file}")
+        written = page.write_report(dataset, metrics, run_file.parent, force)
+        print(printable(f"report: {written}"))
+    print(printable(f"record: {run_file}"))
 
 
 def _lost(result: RunResult) -> bool:
@@ -557,7 +566,7 @@ def _lost(result: RunResult) -> bool:
         from testbed.score.metrics import column
 
         t = column(result.dataset, "truth/time")[-1]
-        print(f"testbed: the flight ended after {t:.0f} s: {result.failure}", file=sys.stderr)
+        _remark(f"the flight ended after {t:.0f} s: {result.failure}")
     return bool(result.failure)
 
 

@@ -451,3 +451,8 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     told(Console(file=out, force_terminal=True, width=120))
     assert "a title [with] brackets" in out.getvalue()
     assert "1:00:00 of 1:00:00  87.7 × real time  leg [2]" in out.getvalue()
+
+
+def test_what_a_file_name_may_hold_is_not_obeyed_by_the_terminal(testbed: Testbed) -> None:
+    ended = testbed("report", "\x1b[31mred.nc")
+    assert (ended.code, ended.err.startswith(r"testbed: \x1b[31mred.nc: no such file")) == (2, True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,8 @@ from testbed.record.tables import Data
 if TYPE_CHECKING:
     import h5py
     import xarray
+
+    from testbed.scenario import Scenario
 
 
 def load(path: Path) -> xarray.DataTree:
@@ -52,6 +55,36 @@ def _upgrade(columns: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
         if path.split("/")[2:3] == ["innovations"]:
             reason, nis, weight = (group[name][1] for name in ("reason", "nis", "weight"))
             group["outcome"] = REPORT["outcome"], format1.outcomes(reason, nis, weight)
+
+
+def scenario_of(dataset: xarray.DataTree, overrides: Sequence[str] = ()) -> Scenario:
+    """The scenario that a record was made of, with further ``overrides``.
+
+    Raises UserError, naming the record's format and who wrote it, when that scenario is no longer read; and as
+    `Scenario.parse` does when an override is wrong.
+    """
+    from testbed.scenario import Scenario
+
+    said = dataset.attrs
+    try:
+        if not overrides:
+            return Scenario.of_record(said)
+        return Scenario.of_record({**said, "overrides": json.dumps([*json.loads(said["overrides"]), *overrides])})
+    except (KeyError, TypeError, ValueError, UserError) as error:
+        if overrides:
+            scenario_of(dataset)  # raises where it is the record that is not read
+            raise
+        what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+        raise UserError(f"a record of {_writer(dataset)}, whose scenario is no longer read: {what}") from None
+
+
+def _writer(dataset: xarray.DataTree) -> str:
+    """Format of a record, and the version that wrote it."""
+    try:
+        version = json.loads(dataset.attrs["versions"])["navigation-testbed"]
+    except (KeyError, TypeError, ValueError):
+        version = "of unknown version"
+    return f"format {dataset.attrs.get('format', 'unknown')!r}, written by navigation-testbed {version}"
 
 
 def _plain(value: Any) -> Any:

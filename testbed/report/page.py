@@ -17,7 +17,7 @@ from testbed.report import tables
 from testbed.report.figures import CHAPTERS
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
-from testbed.score.metrics import column
+from testbed.score.metrics import column, left_out
 
 if TYPE_CHECKING:
     import xarray
@@ -74,6 +74,7 @@ def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "seed": attributes.get("seed", ""),
         "complete": bool(attributes.get("complete", 1)),
         "never_aligned": [name for name, e in run.errors.items() if e.aligned_s is None],
+        "left_out": left_out(run.dataset),
         "summary": tables.summary(metrics),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),

@@ -48,8 +48,8 @@ from nav.samples import Array, Outcome, Status, has_fix
 from testbed.errors import UserError
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
+from testbed.record.reader import scenario_of
 from testbed.results import write_result
-from testbed.scenario import Scenario
 from testbed.schema import LONGEST_RUN_S
 from testbed.sensors.faults import FaultTruth
 from testbed.sensors.timing import patience
@@ -286,7 +286,14 @@ def inside(t: Array, windows: list[Window]) -> Mask:
 
 
 def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[str, float]:
-    """All metrics of a recorded run; see the head of this module for what each counts."""
+    """All metrics of a recorded run; see the head of this module for what each counts.
+
+    Raises UserError when no row of truth was recorded.
+    """
+    if "truth" not in dataset or not dataset["truth"].sizes["time"]:
+        raise UserError(
+            "the record holds no row of truth, so there is nothing to score: the run ended before its first"
+        )
     result: dict[str, float] = {}
     windows = outages(dataset)
     for name in names(dataset):
@@ -296,8 +303,8 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
 
 
 def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[str]:
-    """Which estimators have no errors among the metrics, and why: a sentence each."""
-    told = []
+    """What is missing among the metrics, and why: a sentence each."""
+    told = left_out(dataset)
     for name in names(dataset):
         e = errors(dataset, name, settling_s)
         if e.aligned_s is None:
@@ -310,11 +317,20 @@ def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[s
     return told
 
 
+def left_out(dataset: xarray.DataTree) -> list[str]:
+    """What needs the scenario of a record, when that is no longer read: a sentence, or none."""
+    try:
+        scenario_of(dataset)
+    except UserError as error:
+        return [f"flight.* and visibility are left out: this is {error}"]
+    return []
+
+
 def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]:
     """How the aircraft flew; nothing when none did, or of a record whose scenario is no longer read."""
     try:
-        scenario = Scenario.of_record(dataset.attrs)
-    except (KeyError, ValueError, UserError):
+        scenario = scenario_of(dataset)
+    except UserError:  # `unscored` says so
         return {}
     if not isinstance(scenario.truth, FlightTruth):
         return {}

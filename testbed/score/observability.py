@@ -52,7 +52,7 @@ from nav.samples import (
 )
 from testbed.errors import UserError
 from testbed.estimators import registry
-from testbed.scenario import Scenario
+from testbed.record.reader import scenario_of
 from testbed.score import metrics as scores
 from testbed.score.metrics import column
 
@@ -82,8 +82,8 @@ class _Way(NamedTuple):
 def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     """Visibility of each estimator that was ever aligned; none of a record whose scenario is no longer read."""
     try:
-        scenario = Scenario.of_record(dataset.attrs)
-    except (KeyError, ValueError, UserError):
+        scenario = scenario_of(dataset)
+    except UserError:  # `metrics.unscored` says so
         return {}
     found = {}
     own = [section for section in scenario.estimator if section.kind in registry.BUILT_IN]  # others say nothing of it
@@ -176,9 +176,11 @@ def _of_filter(
         for sensor, aid in aids.items()
         for part in aid.parts
     ]
-    accuracy = {
+    accuracy: dict[str, tuple[Array, Array] | None] = {
         sensor: _accuracy(dataset, sensor) for sensor, aid, _, used in parts if isinstance(aid, GnssAid) and used.any()
     }
+    # A record cut short may have reports on samples that it lacks: then nobody knows how accurate they were.
+    parts = [part for part in parts if accuracy.get(part[0], ()) is not None]
     looks = []
     for k in range(len(way.middle)):
         lat, lon, h = way.lla[k].tolist()
@@ -199,9 +201,13 @@ def _of_filter(
     )
 
 
-def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array]:
-    """Which 1-sigma of position and of velocity (3,) it usually reports."""
+def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array] | None:
+    """Which 1-sigma of position and of velocity (3,) it usually reports; None when no sample of it was recorded."""
+    if "sensors" not in dataset or receiver not in dataset["sensors"]:
+        return None
     position, velocity = (column(dataset, f"sensors/{receiver}/sigma_{what}_n") for what in ("position", "velocity"))
+    if not np.isfinite(position).all(axis=1).any():
+        return None
     return np.nanmedian(position, axis=0), np.nanmedian(velocity, axis=0)
 
 

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import resource
 import shutil
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +10,7 @@ import pandas
 import pytest
 from scipy.io import loadmat
 from worlds import synthetic_run
+from worlds.full_disk import file_size_limit
 
 from testbed import results
 from testbed.errors import UserError
@@ -79,19 +76,6 @@ def test_a_full_disk_leaves_no_half_export(run_file: Path, tmp_path: Path, form:
     with file_size_limit(100_000), pytest.raises(UserError, match="can't be written: File too large"):
         export(run_file, form, tmp_path / "out")
     assert not list(tmp_path.iterdir())
-
-
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """A disk with little room, as far as this process can tell."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_mat_has_a_struct_per_group_with_units(run_file: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import xarray
 from worlds import synthetic_run
+from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.samples import ImuSamples, Outcome, UpdateReport
@@ -295,6 +296,7 @@ WRITER = """
 import sys
 from pathlib import Path
 from worlds import synthetic_run
+from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 from testbed.record.recorder import Recorder
 
@@ -485,6 +487,23 @@ def test_a_full_disk_is_told_and_the_last_flush_stays(tmp_path: Path, monkeypatc
         recorder.close()
     assert len(load(path)["truth"]["time"]) == 21
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_disk_that_fills_up_is_told_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    with file_size_limit(600_000), pytest.raises(UserError) as told:
+        make(path)
+    assert str(told.value) == f"{path}: can't write the record (File too large)"
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_compresses_well_is_compressed_when_the_run_ends(run_file: Path) -> None:
+    with h5py.File(run_file) as file:
+        assert {file["sensors/imu/dt"].compression, file["sensors/imu/time"].compression} == {"gzip"}
+        assert file["sensors/imu/dtheta"].compression is None
+        text = file["estimators/ins/innovations/gnss_position/reason"]
+        assert text.compression == "gzip"
+        assert text.id.get_storage_size() < 0.1 * text.size
 
 
 def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:

@@ -10,14 +10,17 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
+import xarray
 from scipy.spatial.transform import Rotation
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.samples import FixType, GnssSample, Outcome
+from testbed import Scenario
+from testbed import run as fly
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
-from testbed.score import metrics
+from testbed.score import metrics, observability
 from testbed.score.series import error_series
 from testbed.sensors.faults import FaultTruth
 
@@ -114,7 +117,7 @@ def test_estimators_that_are_not_scored_are_told_and_why() -> None:
     run = synthetic_run.dataset(
         100.0, {"ins": Errors(), "late": Errors(aligned_after=70.0), "other": Errors(aligned_after=np.inf)}
     )
-    late, other = metrics.unscored(run)
+    _, late, other = metrics.unscored(run)  # the first: that the text of a made-up run is no scenario
     assert late.startswith("late: its errors are not scored: they count from 60 s after its alignment, 130.")
     assert late.endswith("and the run ends at 100.0 s")
     assert other == "other: its errors are not scored: it never said that it is aligned (Status.ALIGNED)"
@@ -514,3 +517,48 @@ def test_metrics_are_saved_as_strict_json(tmp_path: Path, computed: dict[str, fl
 def test_every_metric_is_a_finite_number(computed: dict[str, float]) -> None:
     assert np.isfinite(list(computed.values())).all()
     assert all(type(value) is float for value in computed.values())
+
+
+@pytest.fixture(scope="module")
+def flown() -> Any:
+    return fly(Scenario.load("u_turn", ["duration_s=75"])).dataset
+
+
+def test_a_scenario_that_is_no_longer_read_is_told_by_what_it_costs(flown: Any) -> None:
+    old = flown.copy()
+    old.attrs = old.attrs | {"scenario": "[unheard_of]\nx = 1\n", "versions": '{"navigation-testbed": "0.0.9"}'}
+    assert not [key for key in metrics.compute(old) if key.startswith("flight.")]
+    assert observability.of_run(old) == {}
+    told = [text for text in metrics.unscored(old) if "left out" in text]
+    assert len(told) == 1
+    assert told[0].startswith(
+        "flight.* and visibility are left out: this is a record of format 'navigation-testbed run"
+    )
+    assert "written by navigation-testbed 0.0.9, whose scenario is no longer read: " in told[0]
+    assert not [text for text in metrics.unscored(flown) if "left out" in text]
+
+
+def shortened(run: Any, t: float, without: str) -> xarray.DataTree:
+    """A record as somebody who was killed leaves it: rows up to ``t``, none at all of some groups."""
+    groups = {"/": xarray.Dataset(attrs=run.attrs | {"complete": 0})}
+    for node in run.subtree:
+        own = node.to_dataset(inherit=False)
+        time = "sample_time" if "sample_time" in own.dims else "time"
+        if time in own.dims:
+            rows = 0 if node.path.startswith(without) else int(np.sum(own[time].values <= t))
+            groups[node.path] = own.isel({time: slice(rows)})
+    return xarray.DataTree.from_dict(groups)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.1, 1.0, 3.0, 70.0])
+@pytest.mark.parametrize("without", ["/nothing", "/sensors", "/sensors/gnss", "/estimators", "/estimators/ins/inn"])
+def test_a_record_cut_anywhere_is_scored(flown: Any, t: float, without: str) -> None:
+    cut = shortened(flown, t, without)
+    metrics.compute(cut)
+    metrics.unscored(cut)
+    observability.of_run(cut)
+
+
+def test_a_record_without_a_row_is_told(flown: Any) -> None:
+    with pytest.raises(UserError, match="no row of truth, so there is nothing to score"):
+        metrics.compute(shortened(flown, -1.0, "/nothing"))
