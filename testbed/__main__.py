@@ -435,6 +435,7 @@ def _load(name: str, overrides: Sequence[str] | None = None) -> Scenario:
 def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
     """Scenario, folder, seed and requests for running a record again."""
     from testbed.loop import director
+    from testbed.record import format1
     from testbed.record.reader import load, scenario_of
     from testbed.record.recorder import versions as installed
 
@@ -444,10 +445,15 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
         versions, seed = [*json.loads(said["versions"]).items()], int(said["seed"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
-    scenario = scenario_of(dataset, overrides)
+    try:
+        scenario = scenario_of(dataset, overrides)
+    except UserError as error:
+        raise UserError(f"{run_file}: {error}") from None
     other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
     if other:
         _remark(f"{run_file}: was made with {', '.join(other)}: bits may differ")
+    if said["format"] == format1.FORMAT:
+        _remark(f"{run_file}: is of format {said['format']!r}: {format1.CHANGED}")
     if not said["complete"]:
         _remark(f"{run_file}: ends early; the rerun goes on to the scenario's end")
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem

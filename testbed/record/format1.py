@@ -12,6 +12,7 @@ import numpy.typing as npt
 from nav.samples import Array, Outcome
 
 FORMAT = "navigation-testbed run 1"
+CHANGED = "bits differ where no gust_mps was given: its default was 1.0 then (--set estimator.NAME.gust_mps=1.0)"
 
 WORDS = {
     b"outside the gate": Outcome.OUTSIDE_GATE,
