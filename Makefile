@@ -16,10 +16,10 @@ test: $(VENV)/.ready
 	$(BIN)/pytest -n 2 --dist worksteal
 
 test-ci: $(VENV)/.ready
-	$(BIN)/pytest -n 2 --dist worksteal -m "not slow"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow" --hypothesis-profile=ci
 
 test-all: $(VENV)/.ready $(CLIENTS)/.ready
-	$(BIN)/pytest -n 2 --dist worksteal -m "slow or not slow" --hypothesis-profile=searching
+	$(BIN)/pytest -n 2 --dist worksteal -m "slow or not slow" --hypothesis-profile=all
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

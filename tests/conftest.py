@@ -1,7 +1,8 @@
-"""Tests are the same every time; those that draw their examples draw new ones in `make test-all` only."""
+"""How many examples the tests draw that draw some: `make test` and CI the same every time, `make test-all` new ones."""
 
 from hypothesis import settings
 
-settings.register_profile("repeatable", derandomize=True, deadline=None)
-settings.register_profile("searching", deadline=None, print_blob=True)
-settings.load_profile("repeatable")
+settings.register_profile("test", derandomize=True, deadline=None, max_examples=50)
+settings.register_profile("ci", derandomize=True, deadline=None, max_examples=400)
+settings.register_profile("all", deadline=None, max_examples=400, print_blob=True)
+settings.load_profile("test")

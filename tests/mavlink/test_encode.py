@@ -75,7 +75,7 @@ def same(decoded, expected):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=settings.default.max_examples // 6)  # of each message
 @given(data=st.data())
 def test_any_number_in_any_field(name, data):
     values = data.draw(fields(name))
@@ -242,7 +242,6 @@ def broken_run(deal, status, fix):
 
 
 @pytest.mark.parametrize("vehicles", [False, True])
-@settings(max_examples=120, deadline=None)
 @example(state=np.full(397, math.nan), before=np.full(397, math.nan), status=Status.ALIGNED, fix=FixType.FIX_3D)
 @example(state=np.full(397, math.inf), before=np.full(397, -math.inf), status=Status.ALIGNED, fix=FixType.NO_FIX)
 @given(
@@ -269,7 +268,6 @@ def test_no_state_can_stop_the_stream(vehicles, state, before, status, fix):
             vehicle.frame(stream)
 
 
-@settings(max_examples=200, deadline=None)
 @given(text=st.text(max_size=300) | st.text("aé", min_size=20, max_size=110), number=st.integers(0, 10**6))
 @example(text="x" * 50, number=0)
 @example(text="x" * 51, number=0)

@@ -153,6 +153,7 @@ def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
     assert pps * POUND * 3600 == pytest.approx(np.interp(rpm, [6000, 7000], [0.337, 0.408]), rel=0.2)
 
 
+@pytest.mark.ci
 def test_climbs_as_the_plan_check_believes(aircraft: Aircraft) -> None:
     for airspeed, alt in [(21.0, 100.0), (25.0, 100.0), (32.0, 100.0), (27.0, 2500.0), (34.0, 2500.0)]:
         for rate in (LOITER.climb_limit(airspeed, alt), -LOITER.descent_limit(airspeed, alt)):

@@ -236,6 +236,7 @@ def strapdown_error(block: TruthBlock, every: int) -> tuple[np.ndarray, float]:
     return horizontal, tilt
 
 
+@pytest.mark.ci
 def test_strapdown_of_the_increments_follows_jsbsim_for_ten_minutes() -> None:
     horizontal, tilt = strapdown_error(fly(flight(MANOEUVRES, wind=GUSTY), 600.0), 1000)
     assert horizontal < 0.1
@@ -251,7 +252,7 @@ def test_strapdown_of_the_increments_follows_jsbsim_for_an_hour() -> None:
 # --- determinism
 
 
-@pytest.mark.parametrize("rate_hz", [200.0, 130.0])
+@pytest.mark.parametrize("rate_hz", [200.0, pytest.param(130.0, marks=pytest.mark.ci)])
 def test_the_same_bits_however_it_is_advanced(rate_hz: float) -> None:
     whole = fly(flight(MANOEUVRES, 5, rate_hz, GUSTY), 40.0)
     for chunks in ([1], [7, 1, 333], [1000]):
@@ -279,6 +280,7 @@ def test_turbulence_of_its_own_seed() -> None:
     assert bits(fixed) == bits(same) == bits(own)
 
 
+@pytest.mark.ci
 def test_the_same_bits_in_another_process() -> None:
     here = bits(fly(flight(MANOEUVRES, 9, wind=GUSTY), 10.0))
     program = (
@@ -325,6 +327,7 @@ def test_turbulence_has_the_spread_of_its_level(level: str, at_20ft: float) -> N
 # --- feedback
 
 
+@pytest.mark.ci
 def test_loops_closed_on_fed_back_truth_fly_as_on_truth_itself() -> None:
     plan = [{"leg": "loiter", "radius_m": 300, "duration_s": 60}]
     alone, fed = flight(plan), flight(plan)

@@ -354,6 +354,7 @@ def test_the_vector_test_locks_itself_out():
     assert np.mean(few) < 30
 
 
+@pytest.mark.ci
 def test_an_unnoticed_slow_turn():
     plain, _ = level_figures(fly(PAPER, turn_degps=0.4, turn=SLOW_TURN))
     runs = fly(COMPENSATED, turn_degps=0.4, turn=SLOW_TURN, samples=airspeed())
@@ -399,6 +400,7 @@ def test_the_autopilot_has_a_say():
     assert len(unadvised) - len(levelled) > 7
 
 
+@pytest.mark.ci
 def test_the_autopilots_word_counts_whatever_the_blocks():
     truth = level_flight()
     ends = (1 + np.arange(6000)) / 200.0

@@ -323,11 +323,11 @@ def test_nees_over_many_flights():
     ("kind", "structure", "with_velocity"),
     [
         ("chi_square", "no_reset", True),
-        ("eraim", "partial", False),
-        ("sprt", "no_reset", False),
-        ("sprt", "full_reset", True),
+        pytest.param("eraim", "partial", False, marks=pytest.mark.ci),
+        pytest.param("sprt", "no_reset", False, marks=pytest.mark.ci),
+        pytest.param("sprt", "full_reset", True, marks=pytest.mark.ci),
         ("glr", "no_reset", True),
-        ("glr", "full_reset", False),
+        pytest.param("glr", "full_reset", False, marks=pytest.mark.ci),
     ],
 )
 def test_a_spoofed_receiver_is_isolated_and_readmitted(kind, structure, with_velocity):

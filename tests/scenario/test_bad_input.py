@@ -584,7 +584,7 @@ OVERRIDES = st.lists(
 PATIENT = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 
 
-@settings(PATIENT, max_examples=300)
+@settings(PATIENT)
 @given(DOCUMENTS, OVERRIDES)
 def test_only_clean_loads_or_clean_errors(text: str, overrides: list[str]) -> None:
     loads_or_complains(text, overrides)
