@@ -250,16 +250,16 @@ def tables(result: CampaignResult) -> list[Table]:
     from rich.markup import escape  # varied values and units may hold brackets
     from rich.table import Table
 
-    varied = bool(result.combinations[0].values)
     made = []
     for text in texts(result):
         table = Table(title=text.title, box=box.SIMPLE, title_justify="left")
         head, *rows = text.rows
+        grouped = any(not row[0] for row in rows)  # names stand in the first row of each group
         for k, name in enumerate(head):
             number = k >= text.words
             table.add_column(escape(name), justify="right" if number else "left", no_wrap=number, overflow="fold")
         for row, following in zip(rows, [*rows[1:], ["end"]], strict=True):
-            table.add_row(*map(escape, row), end_section=varied and bool(following[0]))
+            table.add_row(*map(escape, row), end_section=grouped and bool(following[0]))
         made.append(table)
     return made
 
