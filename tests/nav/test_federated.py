@@ -366,6 +366,7 @@ def accelerating(fixes, start, stop, acceleration):
     return spoofed
 
 
+@pytest.mark.ci
 def test_cross_check_finds_what_drags_its_own_filter_along():
     """60 m and 2.4 m/s in 50 s: the receiver's own filter believes it, but it contradicts the other one's."""
     truth, increments, one, two, others = world(200)
@@ -407,6 +408,7 @@ def test_the_single_filter_follows_the_spoofer():
         assert max(horizontal(estimates, truth, 50).values()) > 50
 
 
+@pytest.mark.ci
 def test_a_spoofer_that_begins_gently():
     """Velocity grows by 0.05 m/s^2 up to 0.5 m/s, the position with it: alone with its IMU a filter does not notice."""
     truth, increments, one, two, others = world(260)

@@ -145,6 +145,7 @@ def normalised(seeds: range, duration_s: int, *, faults: bool) -> Array:
     return np.array(rows)
 
 
+@pytest.mark.ci
 def test_the_claimed_covariance_is_that_of_the_errors() -> None:
     """Once the speed has changed, which scale factors and the misalignment without a state feel."""
     for found in normalised(range(1, 9), 240, faults=False).T:
@@ -164,6 +165,7 @@ def test_the_claimed_covariance_at_the_end_of_the_flight() -> None:
     assert (federated.sum(axis=0) < high).all()
 
 
+@pytest.mark.ci
 def test_one_flight(flights: list[Any]) -> None:
     """The issues of one flight, with generous room: the claims themselves are judged over all of them."""
     faulty, healthy = flights[3:]
@@ -183,6 +185,7 @@ def test_one_flight(flights: list[Any]) -> None:
     assert healthy["with_star"]["refused"] == (0, 0, 1604)
 
 
+@pytest.mark.ci
 def test_claims_can_fail(flights: list[Any]) -> None:
     claims = {claim.quantity: claim for claim in PAPER.conclude(flights)}
     assert len(claims) == len(PAPER.conclude(flights))
@@ -211,6 +214,7 @@ def test_claims_can_fail(flights: list[Any]) -> None:
     assert not any(name.startswith("detection delay, Doppler") for name in lost)
 
 
+@pytest.mark.ci
 def test_the_reason_is_what_the_optimal_filter_could_not_do(flights: list[Any]) -> None:
     """Out of reach is what was out of its reach, in the same flights, and nothing else."""
     changed = copy.deepcopy(flights)
@@ -232,6 +236,7 @@ def test_the_reason_is_what_the_optimal_filter_could_not_do(flights: list[Any]) 
     assert (claim().verdict, claim().impossible) == ("met", "")
 
 
+@pytest.mark.ci
 def test_the_optimal_filter_is_told_of_the_faults_alone(flights: list[Any]) -> None:
     """It loses what the axes at fault would have told, and no more."""
     nothing = np.zeros(3)
@@ -245,6 +250,7 @@ def test_the_optimal_filter_is_told_of_the_faults_alone(flights: list[Any]) -> N
     np.testing.assert_allclose(with_faults["attitude"], without["attitude"], rtol=0.1)  # the star tracker never failed
 
 
+@pytest.mark.ci
 def test_the_figure_is_drawn(flights: list[Any], tmp_path: Path) -> None:
     PAPER.draw(flights, tmp_path)
     picture = tmp_path / "cui2022.png"
@@ -326,6 +332,7 @@ def test_every_claim(tmp_path: Path) -> None:
     assert not missed
 
 
+@pytest.mark.ci
 def test_a_claim_has_its_paper_s_value(flights: list[Any]) -> None:
     assert all(isinstance(claim, Claim) and claim.paper for claim in PAPER.conclude(flights))
     assert metrics.SETTLING_S == cui2022.AFTER_S

@@ -52,6 +52,7 @@ def test_correction_is_what_levelling_alone_turned() -> None:
     assert jiang2021.largest_correction(made(error), made(np.zeros((5, 3)))) == pytest.approx(0.15)
 
 
+@pytest.mark.ci
 def test_the_flight_turns_when_it_should(flown: dict[Case, Flown]) -> None:
     start, end = flown[AHRS].turn
     assert start == pytest.approx(200.0, abs=0.01)
@@ -63,6 +64,7 @@ def test_the_flight_turns_when_it_should(flown: dict[Case, Flown]) -> None:
     assert np.hypot(*first) == pytest.approx(3.0, abs=0.3)
 
 
+@pytest.mark.ci
 def test_one_seed_keeps_every_claim_and_draws(flown: dict[Case, Flown], tmp_path: Path) -> None:
     claims = jiang2021.conclude([flown])
     assert {claim.quantity: claim.verdict for claim in claims if claim.verdict == "missed"} == {}
@@ -72,6 +74,7 @@ def test_one_seed_keeps_every_claim_and_draws(flown: dict[Case, Flown], tmp_path
         assert (tmp_path / f"{name}.png").stat().st_size > 20_000
 
 
+@pytest.mark.ci
 def test_claims_can_fail(flown: dict[Case, Flown]) -> None:
     def missed(**swapped: Case) -> int:
         names = {"ahrs": AHRS, "gyros": GYROS, "calibrated": CALIBRATED, "tilted": TILTED, "slow": SLOW}

@@ -21,7 +21,9 @@ SCENARIOS = sorted(path.stem for path in (data_dir("scenarios") / "papers").glob
 LONG = {"cheng2020", "zhu2020", "zhu2020_outage"}  # to run: more than 5 s
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] if n in LONG else []) for n in SCENARIOS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow if n in LONG else pytest.mark.ci]) for n in SCENARIOS]
+)
 def test_the_scenario_keeps_its_promises(name: str) -> None:
     shipped = papers.scenario(name)
     assert shipped.expect, "a scenario without [expect] can't fail"
