@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from nav import aiding
+from nav import aids
 from nav._jit import njit
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
@@ -226,7 +226,7 @@ class Ahrs:
         """
         if not self.accepts(sample):
             return []
-        trouble = aiding.problem(sample)
+        trouble = aids.problem(sample)
         if trouble:
             self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
             return [_refused(sample, trouble)]

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nav._jit import njit
-from nav.aiding import has_velocity
+from nav.aids.gnss import has_velocity
 from nav.earth import earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ImuModel
 from nav.rotation import (

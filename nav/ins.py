@@ -14,26 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from nav import aiding
+from nav import aids
+from nav.aids import Aid, AirspeedAid, BarometerAid, Course, GnssAid, MagnetometerAid
+from nav.aids.base import OUTSIDE, Ruling, aid_blocks, refusals, report_on, without_position
+from nav.aids.gnss import has_velocity
 from nav.alignment import AidSigmas, Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
 from nav.error_model import POS, VEL, Block, ImuModel
-from nav.local_filter import (
-    OUTSIDE,
-    Aid,
-    AirspeedAid,
-    BarometerAid,
-    Course,
-    GnssAid,
-    LocalFilter,
-    MagnetometerAid,
-    Policy,
-    Ruling,
-    aid_blocks,
-    refusals,
-    report_on,
-    without_position,
-)
+from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -66,7 +54,7 @@ from nav.samples import (
     UpdateReport,
 )
 from nav.unscented import Scaling
-from nav.weighting import Fading
+from nav.weighting import Fading, Policy
 
 AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
 
@@ -203,7 +191,7 @@ class Ins:
     """Strapdown closed by one local filter; see the estimator protocol in `nav.horizon`.
 
     ``field_n`` gives the reference magnetic field (3,) [T], NED, at (lat, lon, h); without it the magnetometer is not
-    used. ``policies`` may weigh looks by the name of their aid, such as ``gnss_velocity``, and ``fadings`` the P that
+    used. ``policies`` may weigh parts of samples by their names, such as ``gnss_velocity``, and ``fadings`` the P that
     they meet. The filter aligns itself from the samples it is given; `start` sets it at a known state instead.
     """
 
@@ -302,7 +290,7 @@ class Ins:
         if isinstance(sample, GnssSample) and not sample.has_fix:
             self._monitor.heard(sample.t)
             return []
-        trouble = aiding.problem(sample)
+        trouble = aids.problem(sample)
         if trouble:
             self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
             return self.refuse(sample, trouble)
@@ -322,9 +310,9 @@ class Ins:
             return self._update_gnss(state, sample, aid)
         reports = []
         for part, _ in aid.parts:
-            look = self._filter.look(self._reference, state, aid, part, sample)
-            if look is not None:
-                reports.append(self._filter.fuse(self._reference, state, sample, part, look))
+            measurement = self._filter.measure(self._reference, state, aid, part, sample)
+            if measurement is not None:
+                reports.append(self._filter.fuse(self._reference, state, sample, part, measurement))
         return reports
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
@@ -352,11 +340,11 @@ class Ins:
         return self._draft
 
     def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
-        look = self._filter.look(self._reference, state, aid, "gnss_position", sample)
-        assert look is not None
-        nu, H, R, at_points = look.nu, look.H, look.R, look.at_points
+        measurement = self._filter.measure(self._reference, state, aid, "gnss_position", sample)
+        assert measurement is not None
+        nu, H, R, at_points = measurement.nu, measurement.H, measurement.R, measurement.at_points
         S, nis = self._filter.absorb(self._reference, state, nu, H, R, -math.inf, at_points)
-        with_velocity = aiding.has_velocity(sample)
+        with_velocity = has_velocity(sample)
         v_n, sigma_v = (
             (sample.v_n, self._filter.learned_sigma("gnss_velocity", sample.sigma_velocity_n))
             if with_velocity
@@ -370,19 +358,19 @@ class Ins:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]
         if verdict is Verdict.FUSE:
-            ruling = self._filter.weigh(self._reference, state, sample, "gnss_position", look, S)
+            ruling = self._filter.weigh(self._reference, state, sample, "gnss_position", measurement, S)
         elif verdict is Verdict.RECOVER:
-            wide = self._filter.look(self._reference, state, aid, "gnss_position", sample)
+            wide = self._filter.measure(self._reference, state, aid, "gnss_position", sample)
             assert wide is not None
             S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
         withheld = None if ruling.weight else without_position(ruling)
         reports = [report_on(sample, "gnss_position", nu, S, nis, threshold, ruling)]
         if use_velocity:
-            velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
+            velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             reports.append(self._filter.fuse(self._reference, state, sample, "gnss_velocity", velocity, withheld))
         if self._turns is not None and self._turns.straight(sample.t):
-            course = self._filter.look(self._reference, state, aid, "gnss_course", sample)
+            course = self._filter.measure(self._reference, state, aid, "gnss_course", sample)
             if course is not None:
                 reports.append(self._filter.fuse(self._reference, state, sample, "gnss_course", course, withheld))
         return reports
@@ -396,7 +384,7 @@ class Ins:
         """
         P = state.P[0]
         if use_velocity:
-            velocity = self._filter.look(self._reference, state, aid, "gnss_velocity", sample)
+            velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             nu_v, H, R = velocity.nu, velocity.H, velocity.R
             S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, velocity.at_points)

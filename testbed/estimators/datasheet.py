@@ -10,9 +10,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+from nav.aids import Aid, BodyVelocityAid, PositionFixAid, StarAid
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
-from nav.local_filter import Aid, BodyVelocityAid, PositionFixAid, StarAid
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
 from testbed.sensors import SensorConfig, registry

@@ -9,6 +9,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
+from nav.aids import Aid
 from nav.detection import (
     ChiSquare,
     Detector,
@@ -23,11 +24,12 @@ from nav.detection import (
     exponential,
     plain,
 )
-from nav.federated import Config, Federated, Local
+from nav.federated import Federated
+from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import InsConfig
-from nav.local_filter import Aid, Policy, Watched
-from nav.weighting import MahalanobisInflation, SageHusa
+from nav.monitor import MonitoredAid
+from nav.weighting import MahalanobisInflation, Policy, SageHusa
 from testbed.estimators.datasheet import aid_settings, imu_model, own_aid
 from testbed.estimators.ins import scaling
 from testbed.estimators.lane import Lane, handover_errors, mountings
@@ -136,7 +138,7 @@ class LocalSection(Section):
 
 
 class FederatedSection(EstimatorSection):
-    """Keys of a federated estimator, which lists its aids by local filter (`nav.federated.Config`)."""
+    """Keys of a federated estimator, which lists its aids by local filter (`nav.federation.Config`)."""
 
     kind: Literal["federated"] = "federated"
     locals: tuple[LocalSection, ...] = Field(default=(), description="the local filters")
@@ -225,7 +227,8 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
         Local(
             local.name,
             tuple(
-                Watched(aids[name], partial(_detector, local.detector), _policy(local.policy)) for name in local.aids
+                MonitoredAid(aids[name], partial(_detector, local.detector), _policy(local.policy))
+                for name in local.aids
             ),
             local.share,
             scaling(local.engine),

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from nav.aids import Course
 from nav.horizon import FusionHorizon
 from nav.ins import AIDS as INS_AIDS
 from nav.ins import Ins, InsConfig
-from nav.local_filter import Course
 from nav.unscented import Scaling
 from nav.weighting import Fading, SageHusa
 from testbed.estimators.datasheet import aid_settings, imu_model, own_aid

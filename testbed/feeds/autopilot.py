@@ -44,7 +44,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from nav import aiding
+from nav import aids
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, pressure_altitude, radii, wrap_longitude
 from nav.motion import TrueAirspeed
@@ -297,7 +297,7 @@ class AirData:
         arrived = [sample for sample in self._coming if sample.t_arrival <= t]
         self._coming = [sample for sample in self._coming if sample.t_arrival > t]
         for sample in arrived:
-            if aiding.problem(sample):
+            if aids.problem(sample):
                 continue
             if isinstance(sample, BarometerSample):
                 self.altitude, self.altitude_t = float(pressure_altitude(sample.pressure)), sample.t

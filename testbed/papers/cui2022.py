@@ -104,7 +104,7 @@ class Told:
     wrong: tuple[tuple[int, float, float], ...]
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
-        """See `nav.local_filter.Policy`."""
+        """See `nav.weighting.Policy`."""
         out = [axis for axis, start, end in self.wrong if start <= t + metrics.SAME_TIME_S < end]
         told = R.copy()
         told[out] = np.inf

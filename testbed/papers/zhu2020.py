@@ -16,7 +16,8 @@ import numpy as np
 
 from nav.detection import chi_square_threshold
 from nav.earth import position_difference_n
-from nav.federated import Federated, weights_by_covariance, weights_eq13
+from nav.federated import Federated
+from nav.fusion import weights_by_covariance, weights_eq13
 from nav.samples import Array
 from nav.weighting import inflation
 from testbed import sensors

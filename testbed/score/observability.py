@@ -17,23 +17,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from nav.ahrs import LEVEL, MAGNETIC_HEADING, STATES, Ahrs, transition
+from nav.aids import Aid, AirspeedAid, BarometerAid, BodyVelocityAid, GnssAid, MagnetometerAid, PositionFixAid, StarAid
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
 from nav.earth import earth_rate_n, isa_pressure
 from nav.error_model import MOTION
 from nav.federated import Federated
 from nav.ins import AIDS, Ins
-from nav.local_filter import (
-    Aid,
-    AirspeedAid,
-    BarometerAid,
-    BodyVelocityAid,
-    GnssAid,
-    LocalFilter,
-    MagnetometerAid,
-    PositionFixAid,
-    StarAid,
-)
+from nav.local_filter import LocalFilter
 from nav.observability import Visibility, flown, looked_at
 from nav.reference import Reference
 from nav.rotation import dcm_from_quat
@@ -191,7 +182,7 @@ def _of_filter(
         for sensor, aid, part, used in parts:
             if used[k].any():
                 sample = _sample(aid, initial, reference, float(way.airspeed[k]), accuracy.get(sensor))
-                look = inner.look(reference, state, aid, part, sample)
+                look = inner.measure(reference, state, aid, part, sample)
                 if look is not None:  # there is no course at rest
                     found.append((look.H, look.R, used[k]))
         looks.append(_stacked(found, inner.model.size))

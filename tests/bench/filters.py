@@ -13,14 +13,16 @@ from bench.unit import ACCEL_NOISE, DEG, GNSS_SIGMA, GYRO_NOISE, START, site, un
 from nav import strapdown, unscented
 from nav._jit import njit
 from nav.ahrs import Ahrs, AhrsConfig
+from nav.aids import GnssAid
 from nav.alignment import InitialState
 from nav.earth import A as EARTH_RADIUS
 from nav.earth import gravity
 from nav.error_model import POS, VEL, ErrorModel, Indices, transition
-from nav.federated import Config, Federated, Local
+from nav.federated import Federated
+from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import GnssAid, Watched
+from nav.monitor import MonitoredAid
 from nav.reference import integrate
 from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
 
@@ -66,7 +68,7 @@ def federated(effort: Effort) -> Iterator[Row]:
         FusionHorizon(ins).push(samples, receivers[0])
 
     def three() -> None:
-        filters = tuple(Local(name, (Watched(GnssAid(name)),)) for name in names)
+        filters = tuple(Local(name, (MonitoredAid(GnssAid(name)),)) for name in names)
         fused = Federated(Config(unit(), filters))
         fused.start(initial)
         FusionHorizon(fused).push(samples, every)

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from worlds.lanes import lanes
 
+from nav.aids import AirspeedAid, GnssAid
 from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, eq20, exponential, plain
 from nav.earth import position_difference_n
 from nav.federated import Federated
 from nav.ins import Ins
-from nav.local_filter import AirspeedAid, GnssAid
 from nav.unscented import Scaling
 from nav.weighting import MahalanobisInflation, SageHusa
 from testbed import Scenario, papers, run

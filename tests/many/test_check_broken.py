@@ -15,7 +15,8 @@ from typing import Any
 import numba
 import pytest
 
-from nav import aiding, alignment, earth, local_filter, reference, strapdown
+from nav import aids, alignment, earth, reference, strapdown
+from nav.aids.base import Measurement
 from nav.detection import Never
 from nav.error_model import PHI, POS, VEL
 from nav.horizon import FusionHorizon
@@ -44,14 +45,17 @@ def sign(aid: str, start: int) -> Break:
     """The sign of a block of three columns of one aid's Jacobian."""
 
     def apply(monkeypatch: pytest.MonkeyPatch) -> None:
-        right = getattr(aiding, aid)
+        module = {"sideslip": aids.airspeed, "magnetometer": aids.magnetometer, "barometer": aids.barometer}.get(
+            aid, aids.gnss
+        )
+        right = getattr(module, aid)
 
         def wrong(*arguments: Any) -> Any:
             nu, H = right(*arguments)
             H[:, start : start + 3] *= -1
             return nu, H
 
-        monkeypatch.setattr(aiding, aid, wrong)
+        monkeypatch.setattr(module, aid, wrong)
 
     return apply
 
@@ -60,13 +64,17 @@ def noise(part: str, factor: float = 100.0) -> Break:
     """R of the looks whose names begin with ``part``."""
 
     def apply(monkeypatch: pytest.MonkeyPatch) -> None:
-        right = LocalFilter.look
+        right = LocalFilter.measure
 
-        def wrong(self: LocalFilter, *arguments: Any) -> local_filter.Look | None:
-            look = right(self, *arguments)
-            return look if look is None or not arguments[3].startswith(part) else look._replace(R=factor * look.R)
+        def wrong(self: LocalFilter, *arguments: Any) -> Measurement | None:
+            measurement = right(self, *arguments)
+            return (
+                measurement
+                if measurement is None or not arguments[3].startswith(part)
+                else measurement._replace(R=factor * measurement.R)
+            )
 
-        monkeypatch.setattr(LocalFilter, "look", wrong)
+        monkeypatch.setattr(LocalFilter, "measure", wrong)
 
     return apply
 

@@ -5,9 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nav import ahrs
+from nav.aids import BodyVelocityAid, GnssAid
+from nav.aids.base import aid_blocks
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import PAPERS, ErrorModel, ImuModel
-from nav.local_filter import BodyVelocityAid, GnssAid, aid_blocks
 from nav.observability import continuous, state_names
 
 PLAIN = ImuModel(1e-4, 1e-3, 1e-4, 0.05)

@@ -9,21 +9,16 @@ from scipy.stats import chi2
 from worlds.federated import DETECTORS, differ, field, fly, horizontal, ramp, three, true_start, world
 from worlds.ins import CONSUMER, DEG, DT, error, feed, gnss
 
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
 from nav.detection import Decision, Event
 from nav.error_model import POS, VEL
-from nav.federated import (
-    Config,
-    Federated,
-    Local,
-    blend,
-    combine,
-    reset,
-    weights_by_covariance,
-    weights_eq13,
-)
+from nav.federated import Federated
+from nav.federation import Config, Local
+from nav.fusion import blend, combine, reset, weights_by_covariance, weights_eq13
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import BarometerAid, GnssAid, LocalFilter, MagnetometerAid, Watched
+from nav.local_filter import LocalFilter
+from nav.monitor import MonitoredAid
 from nav.samples import BarometerSample, FixType, ImuSamples, Outcome, Status
 from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
@@ -61,7 +56,7 @@ def test_full_reset_is_the_centralised_filter():
             central = kalman(*central, H[i], R[i], z[i])
             x[i], P[i] = Phi @ x[i], Phi @ P[i] @ Phi.T + Q / shares[i]
             x[i], P[i] = kalman(x[i], P[i], H[i], R[i], z[i])
-        master = combine(x, P, 2, np.ones(2), INFORMATION)
+        master = combine(x, P, 2, np.ones(2), INFORMATION.combination)
         for i in range(2):
             reset(x[i], P[i], master.x, master.P / shares[i])
         np.testing.assert_allclose(master.x, central[0], rtol=0, atol=1e-9)
@@ -87,7 +82,7 @@ def test_what_a_filter_knows_of_its_aid_survives_a_reset():
         central = kalman(*central, whole, R, z)
         x[i], P[i] = kalman(x[i], P[i], local, R, z)
         if k % 3 == 2:
-            master = combine(x, P, 4, np.ones(2), INFORMATION)
+            master = combine(x, P, 4, np.ones(2), INFORMATION.combination)
             for f in range(2):
                 reset(x[f], P[f], master.x, 2 * master.P)
             np.testing.assert_allclose(master.x, central[0][:4], rtol=0, atol=1e-9)
@@ -117,7 +112,7 @@ def toy_covariances(shared, steps=60):
             L[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] -= K @ H
             joint = L @ joint @ L.T
             joint[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += R[i] * K @ K.T
-    claimed = combine(np.zeros((2, 2)), P, 2, np.ones(2), INFORMATION).P
+    claimed = combine(np.zeros((2, 2)), P, 2, np.ones(2), INFORMATION.combination).P
     gain = np.hstack([claimed @ np.linalg.inv(p) for p in P])
     return claimed, gain @ joint @ gain.T
 
@@ -136,7 +131,7 @@ def test_marginalises_to_the_common_states():
     """The sub-block of P is taken and inverted; the sub-block of the inverse would take the aid's error for known."""
     rng = np.random.default_rng(3)
     P, x = np.stack([spread(rng, 6), spread(rng, 6)]), rng.normal(size=(2, 6))
-    master = combine(x, P, 4, np.ones(2), INFORMATION)
+    master = combine(x, P, 4, np.ones(2), INFORMATION.combination)
     inverses = [np.linalg.inv(p[:4, :4]) for p in P]
     P_g = np.linalg.inv(sum(inverses))
     np.testing.assert_allclose(master.P, P_g, rtol=1e-9)
@@ -150,7 +145,7 @@ def test_units_that_differ_by_twelve_orders_are_no_trouble():
     unit = np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.1), np.full(3, 1e3), np.full(3, 1e-7), np.full(3, 1e-2)])
     correlation = [np.eye(15) + 0.05 * spread(rng, 15) / 15 for _ in range(3)]
     P = np.stack([unit @ c @ unit for c in correlation])
-    master = combine(np.zeros((3, 15)), P, 15, np.ones(3), INFORMATION)
+    master = combine(np.zeros((3, 15)), P, 15, np.ones(3), INFORMATION.combination)
     units = np.outer(unit.diagonal(), unit.diagonal())
     expected = np.linalg.inv(sum(np.linalg.inv(c) for c in correlation))
     np.testing.assert_allclose(master.P / units, expected, rtol=1e-9, atol=1e-12)
@@ -160,7 +155,7 @@ def test_a_member_with_weight_zero_is_left_out():
     rng = np.random.default_rng(5)
     P, x = np.stack([spread(rng, 9), spread(rng, 9)]), rng.normal(size=(2, 9))
     for config in (INFORMATION, SCALAR, INTERSECTION):
-        master = combine(x, P, 9, np.array([0.0, 1.0]), config)
+        master = combine(x, P, 9, np.array([0.0, 1.0]), config.combination)
         np.testing.assert_allclose(master.x, x[1], rtol=1e-9)
         np.testing.assert_allclose(master.P, P[1], rtol=1e-9)
 
@@ -173,7 +168,7 @@ def test_scalar_weights_and_intersection_hold_for_any_correlation(config, correl
     P = np.stack([spread(rng, 9), spread(rng, 9)])
     cross = correlation * np.linalg.cholesky(P[0]) @ np.linalg.cholesky(P[1]).T
     joint = np.block([[P[0], cross], [cross.T, P[1]]])
-    claimed, weights = (lambda m: (m.P, m.weights))(combine(np.zeros((2, 9)), P, 9, np.ones(2), config))
+    claimed, weights = (lambda m: (m.P, m.weights))(combine(np.zeros((2, 9)), P, 9, np.ones(2), config.combination))
     assert weights.sum() == pytest.approx(1.0)
     if config is SCALAR:
         gain = np.hstack([w * np.eye(9) for w in weights])
@@ -204,11 +199,10 @@ def test_printed_weights_do_not_see_a_lost_position():
     P = lost_position()
     assert weights_eq13(P, 15, np.ones(2))[1] > 0.45
     assert weights_by_covariance(P, 15, np.ones(2))[1] < 0.02
-    literal = dataclasses.replace(SCALAR, literal=True)
     x = np.zeros((2, 15))
     x[1, POS] = 185.0
-    assert combine(x, P, 15, np.ones(2), literal).x[POS] > 80.0
-    assert combine(x, P, 15, np.ones(2), SCALAR).x[POS] < 4.0
+    assert combine(x, P, 15, np.ones(2), "scalar", weights_eq13).x[POS] > 80.0
+    assert combine(x, P, 15, np.ones(2), "scalar").x[POS] < 4.0
 
 
 @pytest.mark.parametrize(
@@ -236,7 +230,7 @@ def test_what_makes_no_sense_is_refused(wrong, message):
 def test_one_local_filter_is_the_ins():
     """Corrected every second instead of at once: only linearisation differs."""
     truth, increments, one, _, others = world()
-    sensors = (Watched(GnssAid()), Watched(BarometerAid()), Watched(MagnetometerAid()))
+    sensors = (MonitoredAid(GnssAid()), MonitoredAid(BarometerAid()), MonitoredAid(MagnetometerAid()))
     _, estimates, _ = fly(Config(CONSUMER, (Local("only", sensors),)), one + others, increments)
     config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"))
     central, _ = feed(FusionHorizon(Ins(config, field)), increments, one + others)
@@ -482,7 +476,7 @@ def weights_of(reports, after):
 def test_normalised_weights_of_two_receivers(ratios, options, expected):
     _, increments, one, two, others = world(50)
     pair = tuple(
-        Local(name, (Watched(GnssAid(name), lambda ratio=ratio: Suspects(ratio)),))
+        Local(name, (MonitoredAid(GnssAid(name), lambda ratio=ratio: Suspects(ratio)),))
         for name, ratio in zip(("gnss", "gnss2"), ratios, strict=True)
     )
     magnetic = tuple(s for s in others if s.sensor == "magnetometer")  # for the alignment
@@ -495,9 +489,13 @@ def test_a_weight_needs_somebody_to_compare_with_and_comes_after_the_own_policy(
     """A sensor left alone is not weakened short of its limit; a suspect part speaks for the whole of its filter."""
     _, increments, one, two, others = world(50)
     locals_ = (
-        Local("one", (Watched(GnssAid(), lambda: Suspects(0.5), lambda: Weight(0.5)),)),
+        Local("one", (MonitoredAid(GnssAid(), lambda: Suspects(0.5), lambda: Weight(0.5)),)),
         Local(
-            "two", (Watched(GnssAid("gnss2"), lambda: Suspects(0.0)), Watched(BarometerAid(), lambda: Suspects(0.3)))
+            "two",
+            (
+                MonitoredAid(GnssAid("gnss2"), lambda: Suspects(0.0)),
+                MonitoredAid(BarometerAid(), lambda: Suspects(0.3)),
+            ),
         ),
     )
     two = [fix for fix in two if fix.t < 30]
@@ -524,7 +522,7 @@ def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
 
 def alone(recall_s):
     """One receiver, and aids that know no position across."""
-    locals_ = (Local("one", (Watched(GnssAid(), DETECTORS["eraim"]),)), three()[2])
+    locals_ = (Local("one", (MonitoredAid(GnssAid(), DETECTORS["eraim"]),)), three()[2])
     return Config(CONSUMER, locals_, recall_s=recall_s)
 
 
@@ -579,7 +577,7 @@ def test_what_is_fused_after_an_isolation_is_seen_from_the_new_start(monkeypatch
     correlated = GnssAid(position_error_sigma=(1.0, 1.0, 1.0))
     locals_ = (Local("one", (dataclasses.replace(first.sensors[0], aid=correlated),)), *rest)
     now, off = [], []
-    use, take = Federated._use_look, LocalFilter.take
+    use, take = Federated._use_part, LocalFilter.take
 
     def noted(self, state, filter_, sample, part, look, withheld):
         now[:] = sample, part
@@ -587,12 +585,12 @@ def test_what_is_fused_after_an_isolation_is_seen_from_the_new_start(monkeypatch
 
     def checked(self, reference, state, look, nu, S, used, *more):
         sample, part = now
-        fresh = self.look(reference, state, self.aids[sample.sensor], part, sample)
+        fresh = self.measure(reference, state, self.aids[sample.sensor], part, sample)
         if not used.all():
             off.append(np.abs(self.innovate(state, fresh)[0] - nu)[used].max())
         return take(self, reference, state, look, nu, S, used, *more)
 
-    monkeypatch.setattr(Federated, "_use_look", noted)
+    monkeypatch.setattr(Federated, "_use_part", noted)
     monkeypatch.setattr(LocalFilter, "take", checked)
     fly(Config(CONSUMER, locals_), bad + two + others, increments)
     assert len(off) >= 10
@@ -725,8 +723,8 @@ def test_looking_at_an_estimate_changes_none():
 def test_two_filters_may_share_a_sensor_or_a_name_of_a_state():
     _, increments, one, two, others = world(120)
     locals_ = (
-        Local("one", (Watched(GnssAid()), Watched(BarometerAid()))),
-        Local("two", (Watched(GnssAid("gnss2")), Watched(BarometerAid()))),
+        Local("one", (MonitoredAid(GnssAid()), MonitoredAid(BarometerAid()))),
+        Local("two", (MonitoredAid(GnssAid("gnss2")), MonitoredAid(BarometerAid()))),
     )
     few = ImuSamples(increments.t[:6000], increments.dt[:6000], increments.dtheta[:6000], increments.dv[:6000])
     _, estimates, reports = fly(Config(CONSUMER, locals_), [s for s in one + two + others if s.t < 30], few)

@@ -10,17 +10,23 @@ from scipy.spatial.transform import Rotation
 from worlds.federated import DETECTORS, differ, field, fly, horizontal, named, ramp, three, true_start, world
 from worlds.ins import CONSUMER, DEG, DT, error, feed, flight, gnss, imu
 
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
 from nav.alignment import InitialState
 from nav.detection import Never
-from nav.federated import Config, Federated, Local
+from nav.federated import Federated
+from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
+from nav.monitor import MonitoredAid
 from nav.reference import turned
 from nav.samples import ImuSamples
 from nav.unscented import Scaling
 
-EVERYTHING = (Watched(GnssAid(), Never), Watched(BarometerAid(), Never), Watched(MagnetometerAid(), Never))
+EVERYTHING = (
+    MonitoredAid(GnssAid(), Never),
+    MonitoredAid(BarometerAid(), Never),
+    MonitoredAid(MagnetometerAid(), Never),
+)
 
 
 def by_points(locals_):
@@ -91,7 +97,7 @@ def from_bad_headings(engine, structure, sigma_deg=60.0, seeds=8):
             0.0, truth.lat[0] + wrong[6] / 6.37e6, truth.lon[0] + wrong[7] / 4.26e6, truth.h[0] - wrong[8],
             truth.v_n[0] + wrong[3:6], q_nb.as_quat(scalar_first=True), np.diag(sigma**2),
         )  # fmt: skip
-        locals_ = [Local(name, (Watched(GnssAid(name), Never),)) for name in ("gnss", "gnss2")]
+        locals_ = [Local(name, (MonitoredAid(GnssAid(name), Never),)) for name in ("gnss", "gnss2")]
         both = by_points(locals_) if engine == "unscented" else tuple(locals_)
         estimates = begin(Federated(Config(CONSUMER, both, structure), field), start, increments, fixes)
         errors = [(e, error(e, truth)) for e in (estimates[t] for t in (4, 9, 19, 28))]

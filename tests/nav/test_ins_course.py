@@ -8,11 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from worlds.ins import CONSUMER, DEG, DT, FIELD_N, airspeed, error, feed, flight, gnss, imu
 
+from nav.aids import AirspeedAid, Course, GnssAid
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import AirspeedAid, Course, GnssAid, LocalFilter
+from nav.local_filter import LocalFilter
 from nav.reference import Reference
 from nav.samples import FixType, GnssSample, ImuSamples
 from nav.unscented import Scaling
@@ -72,7 +73,7 @@ def test_course_in_wind_is_heading_and_drift():
         state = reference.start(InitialState(0.0, 0.0, 0.0, 0.0, np.array([25.0, 0, 0]), q, np.eye(9)))
         wind = inner.model.start("wind")
         state.x[0, wind : wind + 2] = 0.0, 5.0
-        look = inner.look(reference, state, aids[1], "gnss_course", fix)
+        look = inner.measure(reference, state, aids[1], "gnss_course", fix)
         assert look.nu[0] == pytest.approx(nu, abs=1e-9)
         assert np.abs(look.H[0, wind : wind + 2]).max() > 0.03
     assert "wind" not in GnssAid().states

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 from worlds.ins import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
 
+from nav.aids import AirspeedAid, BarometerAid, GnssAid
+from nav.aids.base import aid_blocks
 from nav.alignment import InitialState
 from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import AirspeedAid, BarometerAid, Change, GnssAid, LocalFilter, Watch, aid_blocks
+from nav.local_filter import LocalFilter
+from nav.monitor import Change, Monitor
 from nav.samples import Outcome
 
 
@@ -28,7 +31,7 @@ class Scripted:
 
 
 def changes(masks, isolate_after=3, readmit_after=4):
-    watch = Watch(Scripted(masks), None, 2, isolate_after, readmit_after)
+    watch = Monitor(Scripted(masks), None, 2, isolate_after, readmit_after)
     rows = []
     for k in range(len(masks)):
         _, change = watch.judge(np.zeros(2), np.eye(2), float(k))
@@ -53,7 +56,7 @@ def test_readmission_needs_consecutive_passes():
 
 def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     """Ten times four looks, of all isolated axes; then the detector begins anew."""
-    watch = Watch(Glr(1e-6), None, 2, 3, 4)
+    watch = Monitor(Glr(1e-6), None, 2, 3, 4)
     nu = np.array([1.2, 1.2])  # a sound look, and a fault for one that gathers them
     rows = [watch.judge(nu, np.eye(2), 0.2 * k) for k in range(200)]
     changed = [(k, change) for k, (_, change) in enumerate(rows) if change]
@@ -61,14 +64,14 @@ def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     assert (first, second) == (Change.ISOLATED, Change.READMITTED)
     assert readmitted == isolated + 40
     assert not rows[readmitted + 1][0].alarm
-    watch = Watch(Glr(1e-6), None, 2, 3, 4)
+    watch = Monitor(Glr(1e-6), None, 2, 3, 4)
     for k in range(200):
         watch.judge(np.array([1.2, 5.0]), np.eye(2), 0.2 * k)
     assert watch.suspect  # one of them is not sound
 
 
 def test_a_conviction_holds_until_looks_are_sound():
-    watch = Watch(ChiSquare(1e-3), None, 2, 3, 4)
+    watch = Monitor(ChiSquare(1e-3), None, 2, 3, 4)
     watch.convict()
     assert watch.out
     assert watch.suspect
@@ -147,7 +150,7 @@ def test_a_sensor_can_be_given_to_a_filter_once():
 
 
 def test_a_watch_passes_on_what_its_detector_says():
-    watch = Watch(ChiSquare(1e-3), None, 1, 1, 2)
+    watch = Monitor(ChiSquare(1e-3), None, 1, 1, 2)
     assert not watch.judge(np.array([3.0]), np.eye(1), 0.0)[0].alarm
     decision, change = watch.judge(np.array([3.4]), np.eye(1), 1.0)
     assert decision.alarm

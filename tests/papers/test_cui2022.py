@@ -13,11 +13,13 @@ import pytest
 from scipy.stats import chi2, ncx2
 from worlds.lanes import lanes
 
+from nav.aids import GnssAid
+from nav.aids.base import OperatingPoint
 from nav.detection import Eraim, Glr
 from nav.error_model import POS, VEL
 from nav.federated import Federated
 from nav.kalman import correct, innovate
-from nav.local_filter import GnssAid, LocalFilter, Seat
+from nav.local_filter import LocalFilter
 from nav.samples import Array, FixType, GnssSample
 from testbed import papers, run
 from testbed.estimators.datasheet import imu_model
@@ -301,9 +303,9 @@ def test_the_measurement_matrix_of_eq_35_would_see_the_misalignments() -> None:
     assert isinstance(aid, GnssAid)
     three = np.full(3, 1.0)
     fix = GnssSample(0.0, 0.0, 0.6, 1.9, 1000.0, np.zeros(3), three, three, FixType.FIX_3D, 9, 1.0, 1.0, "gps")
-    seat = Seat(reference, state, state.x[0], (-1, -1))
-    looks = [aid.look(part, fix, seat) for part, _ in aid.parts]
-    H = np.vstack([look.H for look in looks if look is not None])
+    here = OperatingPoint(reference, state, state.x[0], (-1, -1))
+    measured = [aid.measure(part, fix, here) for part, _ in aid.parts]
+    H = np.vstack([one.H for one in measured if one is not None])
     printed = np.zeros_like(H)
     printed[[0, 3], 0] = printed[[1, 4], 1] = printed[[2, 5], 2] = 1.0
     assert np.linalg.matrix_rank(printed) == 3  # rows 4 to 6 say nothing new

@@ -5,14 +5,13 @@ import functools
 
 import numpy as np
 
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
 from nav.alignment import InitialState
 from nav.detection import ChiSquare, Eraim, Glr, Reset, Sprt, exponential
-from nav.federated import (
-    Federated,
-    Local,
-)
+from nav.federated import Federated
+from nav.federation import Local
 from nav.horizon import FusionHorizon
-from nav.local_filter import BarometerAid, GnssAid, MagnetometerAid, Watched
+from nav.monitor import MonitoredAid
 from nav.samples import Status
 from worlds.ins import CONSUMER, DEG, FIELD_N, barometer, error, feed, flight, gnss, imu, magnetometer
 
@@ -41,9 +40,9 @@ def world(duration=120, seed=2):
 
 def three(detector=lambda: ChiSquare(1e-3)):
     return (
-        Local("one", (Watched(GnssAid(), detector),)),
-        Local("two", (Watched(GnssAid("gnss2"), detector),)),
-        Local("air", (Watched(BarometerAid(), detector), Watched(MagnetometerAid(), detector))),
+        Local("one", (MonitoredAid(GnssAid(), detector),)),
+        Local("two", (MonitoredAid(GnssAid("gnss2"), detector),)),
+        Local("air", (MonitoredAid(BarometerAid(), detector), MonitoredAid(MagnetometerAid(), detector))),
     )
 
 

@@ -8,7 +8,7 @@ import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 
-from nav import aiding
+from nav import aids
 from nav.earth import OMEGA_IE, pressure_altitude, quat_en, quat_ie, radii
 from nav.error_model import MOTION, PHI, POS, VEL, Block, ErrorModel, ImuModel, markov, sensor_errors
 from nav.ins import InsConfig
@@ -68,7 +68,7 @@ def displaced(at, delta):
 def gnss_position(at):
     """The fix a few metres away, where the arcs are straight."""
     q, _, lla, x, _ = at
-    return aiding.gnss_position(q, lla, x, ARM, MODEL.start("gnss_position_error"), FIX["lat"], FIX["lon"], FIX["h"])
+    return aids.gnss.gnss_position(q, lla, x, ARM, MODEL.start("gnss_position_error"), FIX["lat"], FIX["lon"], FIX["h"])
 
 
 def gnss_velocity(at):
@@ -76,27 +76,29 @@ def gnss_velocity(at):
     errors = np.zeros((4, 3))
     sensor_errors(errors, x, MODEL.driven)
     start = MODEL.start("gnss_velocity_error")
-    return aiding.gnss_velocity(q, v_n, lla, x, measured, errors, MODEL.driven, ARM, start, np.array([1.0, 2.0, 3.0]))
+    return aids.gnss.gnss_velocity(
+        q, v_n, lla, x, measured, errors, MODEL.driven, ARM, start, np.array([1.0, 2.0, 3.0])
+    )
 
 
 def barometer(at):
-    return aiding.barometer(at[2], at[3], MODEL.start("barometer_bias"), pressure_altitude(95_000.0))
+    return aids.barometer.barometer(at[2], at[3], MODEL.start("barometer_bias"), pressure_altitude(95_000.0))
 
 
 def magnetometer(at):
     states = [MODEL.start(f"magnetometer_{name}") for name in ("bias", "error", "anomaly")]
-    return aiding.magnetometer(at[0], at[3], *states, FIELD_N, np.array([1e-5, 2e-5, 3e-5]))
+    return aids.magnetometer.magnetometer(at[0], at[3], *states, FIELD_N, np.array([1e-5, 2e-5, 3e-5]))
 
 
 def airspeed(at):
     q, v_n, lla, x, _ = at
-    return aiding.airspeed(
+    return aids.airspeed.airspeed(
         q, v_n, lla, x, MODEL.start("wind"), MODEL.start("gust"), MODEL.start("airspeed_scale"), 24.0
     )
 
 
 def sideslip(at):
-    return aiding.sideslip(at[0], at[1], at[3], MODEL.start("wind"), MODEL.start("gust"))
+    return aids.airspeed.sideslip(at[0], at[1], at[3], MODEL.start("wind"), MODEL.start("gust"))
 
 
 def body_velocity(at, arm=ARM):
@@ -112,14 +114,14 @@ def moving_point(at, arm, *measured):
     q, v_n, lla, x, omega = at
     errors = np.zeros((4, 3))
     sensor_errors(errors, x, MODEL.driven)
-    return aiding.body_velocity(q, v_n, lla, x, omega, errors, MODEL.driven, arm, *measured)
+    return aids.body_velocity.body_velocity(q, v_n, lla, x, omega, errors, MODEL.driven, arm, *measured)
 
 
 def nonholonomic(at, arm=ARM):
     q, v_n, lla, x, omega = at
     errors = np.zeros((4, 3))
     sensor_errors(errors, x, MODEL.driven)
-    return aiding.nonholonomic(q, v_n, lla, x, omega, errors, MODEL.driven, arm)
+    return aids.body_velocity.nonholonomic(q, v_n, lla, x, omega, errors, MODEL.driven, arm)
 
 
 def at_the_imu(aid):
@@ -132,25 +134,25 @@ def at_the_imu(aid):
 
 
 def star_attitude(at):
-    return aiding.star_attitude(at[0], at[2], at[3], STAR_TIME, FIX["q_ib"])
+    return aids.star_tracker.star_attitude(at[0], at[2], at[3], STAR_TIME, FIX["q_ib"])
 
 
 def position_fix(at, arm=ARM):
-    return aiding.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], FIX["h"])
+    return aids.position_fix.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], FIX["h"])
 
 
 def flat_position_fix(at, arm=ARM):
-    return aiding.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], math.nan)
+    return aids.position_fix.position_fix(at[0], at[2], at[3], arm, FIX["lat"], FIX["lon"], math.nan)
 
 
 def gnss_course(at):
     """Course from heading and drift, near the prediction."""
     q, v_n, _, x, _ = at
-    return aiding.gnss_course(q, v_n, x, MODEL.start("wind"), MODEL.start("gust"), FIX["course_v_n"])
+    return aids.gnss.gnss_course(q, v_n, x, MODEL.start("wind"), MODEL.start("gust"), FIX["course_v_n"])
 
 
 def gnss_course_as_heading(at):
-    return aiding.gnss_course(at[0], at[1], at[3], -1, -1, FIX["course_v_n"])
+    return aids.gnss.gnss_course(at[0], at[1], at[3], -1, -1, FIX["course_v_n"])
 
 
 FIX = {}
@@ -222,7 +224,7 @@ def test_position_fix_is_of_the_sensor_not_of_the_imu(seed):
     q, _, lla, x, _ = state(seed)
     north, east, down = scipy_rotation(q).apply(ARM)
     lat, lon, h = pymap3d.enu2geodetic(east, north, -down, *np.degrees(lla[:2]), lla[2])
-    nu, _ = aiding.position_fix(q, lla, x, ARM, np.radians(lat), np.radians(lon), h)
+    nu, _ = aids.position_fix.position_fix(q, lla, x, ARM, np.radians(lat), np.radians(lon), h)
     np.testing.assert_allclose(nu, 0.0, atol=1e-5)
 
 
@@ -260,21 +262,21 @@ def test_course_is_heading_and_drift():
     v_n = np.array([air * math.cos(heading), air * math.sin(heading) + 5, 0.0])
     course = math.atan2(v_n[1], v_n[0])
     assert math.degrees(course - heading) == pytest.approx(8.5, abs=0.1)
-    nu, _ = aiding.gnss_course(q, v_n, x, wind, -1, v_n)
+    nu, _ = aids.gnss.gnss_course(q, v_n, x, wind, -1, v_n)
     assert nu[0] == pytest.approx(0, abs=1e-12)
-    nu, H = aiding.gnss_course(q, v_n, x, -1, -1, v_n)
+    nu, H = aids.gnss.gnss_course(q, v_n, x, -1, -1, v_n)
     assert nu[0] == pytest.approx(course - heading, abs=1e-12)  # the drift, taken for an error of heading
     assert H[0, PHI + 2] == -1.0
     assert not H[0, VEL : VEL + 3].any()
-    backwards = aiding.gnss_course(q, v_n, x, -1, -1, np.array([-1.0, -0.9, 0.0]))[0][0]
+    backwards = aids.gnss.gnss_course(q, v_n, x, -1, -1, np.array([-1.0, -0.9, 0.0]))[0][0]
     assert -math.pi < backwards <= math.pi
     assert backwards == pytest.approx(math.atan2(-0.9, -1.0) - heading + 2 * math.pi, abs=1e-12)
 
 
 def test_axes_that_a_sample_has():
     sample = BodyVelocitySample(1.0, 1.0, np.array([3.0, NAN, 0.0]))
-    assert aiding.measures(sample, np.array([0, 2]))
-    assert not aiding.measures(sample, np.array([0, 1]))
+    assert aids.body_velocity.measures(sample, np.array([0, 2]))
+    assert not aids.body_velocity.measures(sample, np.array([0, 1]))
 
 
 GOOD = GnssSample(1.0, 1.0, 0.8, 0.2, 500.0, np.array([20.0, 1.0, 0.0]), np.ones(3), np.full(3, 0.1),
@@ -323,5 +325,5 @@ NAN = math.nan
     ],
 )
 def test_broken_samples_are_named(sample, reason):
-    found = aiding.problem(sample)
+    found = aids.problem(sample)
     assert (reason in found) if reason else found == ""

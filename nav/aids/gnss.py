@@ -1,0 +1,232 @@
+"""A GNSS receiver: position, velocity and course over ground."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from nav._jit import njit
+from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Measurement, OperatingPoint, position_problem, put_skew
+from nav.earth import displacement_n, earth_rate_n, wrap_longitude
+from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov
+from nav.rotation import cross, dcm_from_quat, quat_rotate
+from nav.samples import Array, GnssSample, Sample
+
+WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+
+
+@dataclass(frozen=True)
+class Course:
+    """Course over ground as a measurement of heading (Cheng et al. 2020, Eq 22-24): see `gnss_course`.
+
+    It is worth the receiver's velocity and the ``slip`` of the body, over the speed; nothing below ``minimum`` speed.
+    Where it turned faster than ``max_turn_rate`` within the last ``quiet_s`` there is none (`nav.motion`).
+    """
+
+    max_turn_rate: float = math.inf  # [rad/s]
+    quiet_s: float = 0.0
+    slip: float = 0.0  # sideways through the air, 1 sigma [m/s]
+    minimum: float = 1.0  # [m/s]
+
+
+@dataclass(frozen=True)
+class GnssAid:
+    """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)."""
+
+    sensor: str = "gnss"
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to antenna [m]
+    use_velocity: bool = True
+    position_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m]
+    position_error_correlation_s: float = 100.0
+    velocity_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m/s]
+    velocity_error_correlation_s: float = 20.0
+    course: Course | None = None
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        velocity = (("gnss_velocity", 3),) if self.use_velocity else ()
+        return (("gnss_position", 3), *velocity, *((("gnss_course", 1),) if self.course else ()))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        own = f"{self.sensor}_position_error", f"{self.sensor}_velocity_error"
+        return (*own, "wind", "gust") if self.course else own
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        position, velocity = self.states[:2]
+        return [
+            markov(position, 3, self.position_error_sigma, self.position_error_correlation_s),
+            markov(velocity, 3, self.velocity_error_sigma, self.velocity_error_correlation_s),
+        ]
+
+    @cached_property
+    def arm(self) -> Array:
+        """IMU to antenna (3,) [m]."""
+        return np.array(self.arm_b, dtype=float)
+
+    @cached_property
+    def _correlated(self) -> tuple[Array, Array]:
+        return np.array(self.position_error_sigma) ** 2, np.array(self.velocity_error_sigma) ** 2
+
+    def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
+        """See `Aid`."""
+        assert isinstance(sample, GnssSample)
+        state = at.state
+        if part == "gnss_position":
+            nu, H = gnss_position(state.q_nb, state.lla, at.x, self.arm, at.starts[0], sample.lat, sample.lon, sample.h)
+            return Measurement(nu, H, _white(sample.sigma_position_n, self._correlated[0]))
+        if not has_velocity(sample):
+            return None
+        if part == "gnss_course":
+            return self._course(sample, at)
+        nu, H = gnss_velocity(
+            state.q_nb, state.v_n, state.lla, at.x, state.rates[0], state.errors, at.reference.driven,
+            self.arm, at.starts[1], sample.v_n,
+        )  # fmt: skip
+        unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
+        return Measurement(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]), unknown)
+
+    def _course(self, sample: GnssSample, at: OperatingPoint) -> Measurement | None:
+        assert self.course is not None
+        speed2 = float(sample.v_n[0] ** 2 + sample.v_n[1] ** 2)
+        if not speed2 > self.course.minimum**2:
+            return None
+        nu, H = gnss_course(at.state.q_nb, at.state.v_n, at.x, at.starts[2], at.starts[3], sample.v_n)
+        sigma2 = float(sample.sigma_velocity_n[:2] @ sample.sigma_velocity_n[:2]) / 2
+        return Measurement(nu, H, np.array([(sigma2 + self.course.slip**2) / speed2]))
+
+
+def _white(sigma: Array, correlated_variance: Array) -> Array:
+    """The white part of a receiver's reported variance, when the correlated part is a state of the filter."""
+    reported = sigma * sigma
+    return np.maximum(reported - correlated_variance, WHITE_SHARE * reported)
+
+
+def problem(sample: GnssSample) -> str:
+    """See `nav.aids.problem`; velocity may be missing (NaN) altogether."""
+    if trouble := position_problem(sample.lat, sample.lon, sample.h):
+        return trouble
+    if not _positive(sample.sigma_position_n):
+        return "reported accuracy of position is not a positive number"
+    speed = math.hypot(*sample.v_n.tolist())
+    if math.isnan(speed):
+        return "" if np.isnan(sample.v_n).all() else "velocity is not finite"
+    if speed > SPEED_LIMIT:
+        return f"speed {speed:.6g} is out of range"
+    return "" if _positive(sample.sigma_velocity_n) else "reported accuracy of velocity is not a positive number"
+
+
+def _positive(sigma: Array) -> bool:
+    return all(0.0 < s < math.inf for s in sigma.tolist())
+
+
+def has_velocity(sample: GnssSample) -> bool:
+    """Whether a sound GNSS sample carries velocity."""
+    return math.isfinite(sample.v_n[0])
+
+
+@njit
+def gnss_position(
+    q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float, lon: float, h: float
+) -> tuple[Array, Array]:
+    """Antenna position [m], NED: p + C_nb arm_b + correlated receiver error."""
+    arm_n = quat_rotate(q_nb, arm_b)
+    nu = displacement_n(lat, lon, h, lla[0], lla[1], lla[2])
+    H = np.zeros((3, len(x)))
+    put_skew(H, arm_n)
+    for i in range(3):
+        H[i, POS + i] = 1.0
+        nu[i] -= arm_n[i]
+        if gnss_position_error >= 0:
+            H[i, gnss_position_error + i] = 1.0
+            nu[i] -= x[gnss_position_error + i]
+    return nu, H
+
+
+@njit
+def gnss_velocity(
+    q_nb: Array,
+    v_n: Array,
+    lla: Array,
+    x: Array,
+    omega_measured_b: Array,
+    errors: Array,
+    driven: Indices,
+    arm_b: Array,
+    gnss_velocity_error: int,
+    antenna_v_n: Array,
+) -> tuple[Array, Array]:
+    """Antenna velocity over ground [m/s], NED: v + C_nb (omega_ib x arm) - omega_ie x (C_nb arm) + correlated error.
+
+    omega_ib is the measured angular rate less the estimated sensor ``errors`` (4, 3), rows as `Drive`; ``driven`` tells
+    which states those are (`ErrorModel.driven`).
+    """
+    C_nb = dcm_from_quat(q_nb)
+    gain, omega_b = np.empty(3), np.empty(3)
+    for i in range(3):
+        gain[i] = 1 / (1 + errors[Drive.GYRO_SCALE, i])
+        omega_b[i] = (omega_measured_b[i] - errors[Drive.GYRO, i]) * gain[i]
+    arm_n = quat_rotate(q_nb, arm_b)
+    swing_n = quat_rotate(q_nb, cross(omega_b, arm_b))
+    earth_n = earth_rate_n(lla[0])
+    carried_n = cross(earth_n, arm_n)
+    nu = np.empty(3)
+    H = np.zeros((3, len(x)))
+    put_skew(H, swing_n)
+    along = earth_n[0] * arm_n[0] + earth_n[1] * arm_n[1] + earth_n[2] * arm_n[2]
+    for i in range(3):
+        nu[i] = antenna_v_n[i] - v_n[i] - swing_n[i] + carried_n[i]
+        for j in range(3):
+            H[i, PHI + j] -= arm_n[i] * earth_n[j]  # [earth x] [arm x] = arm earth' - (earth . arm) I
+        H[i, PHI + i] += along
+        H[i, VEL + i] = 1.0
+        if gnss_velocity_error >= 0:
+            H[i, gnss_velocity_error + i] = 1.0
+            nu[i] -= x[gnss_velocity_error + i]
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        if kind == Drive.GYRO or kind == Drive.GYRO_SCALE:
+            for i in range(3):
+                for j in range(3):
+                    # C_nb [arm x]: a gyro bias estimated too high leaves too little rate
+                    one, two = (j + 1) % 3, (j + 2) % 3
+                    from_gyro = (C_nb[i, one] * arm_b[two] - C_nb[i, two] * arm_b[one]) * gain[j]
+                    H[i, start + j] = from_gyro if kind == Drive.GYRO else from_gyro * omega_b[j]
+    return nu, H
+
+
+@njit
+def gnss_course(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int, antenna_v_n: Array) -> tuple[Array, Array]:
+    """Course over ground, clockwise from north [rad]: heading + drift, nu in (-pi, pi].
+
+    The measured course is atan2(vE, vN) of the receiver's velocity. Drift is the angle from the velocity through the
+    air, v - wind - gust, to v, both horizontal: of an aircraft that does not slip. Without wind states it is zero and
+    course is taken for heading, as on a road (Cheng et al. 2020, equation 22; their z = heading - course is -nu).
+
+    Sign: phi down turns the estimate anticlockwise, so H[PHI + 2] is -1, and the rest of phi counts with the tangent
+    of pitch. Course is worth sigma_v / speed and nothing near rest: gate the speed.
+    """
+    C_nb = dcm_from_quat(q_nb)
+    fwd_n, fwd_e, fwd_d = C_nb[0, 0], C_nb[1, 0], C_nb[2, 0]
+    level = fwd_n * fwd_n + fwd_e * fwd_e
+    H = np.zeros((1, len(x)))
+    H[0, PHI], H[0, PHI + 1], H[0, PHI + 2] = fwd_n * fwd_d / level, fwd_e * fwd_d / level, -1.0
+    predicted = math.atan2(fwd_e, fwd_n)
+    if wind >= 0 or gust >= 0:
+        air_n, air_e = v_n[0], v_n[1]
+        for start in (wind, gust):
+            if start >= 0:
+                air_n, air_e = air_n - x[start], air_e - x[start + 1]
+        ground2, air2 = v_n[0] * v_n[0] + v_n[1] * v_n[1], air_n * air_n + air_e * air_e
+        predicted += math.atan2(v_n[1], v_n[0]) - math.atan2(air_e, air_n)
+        H[0, VEL], H[0, VEL + 1] = air_e / air2 - v_n[1] / ground2, v_n[0] / ground2 - air_n / air2
+        for start in (wind, gust):
+            if start >= 0:
+                H[0, start], H[0, start + 1] = -air_e / air2, air_n / air2
+    return np.array([wrap_longitude(math.atan2(antenna_v_n[1], antenna_v_n[0]) - predicted)]), H

@@ -1,0 +1,94 @@
+"""A magnetometer of three axes: the geomagnetic field in body axes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from nav._jit import njit
+from nav.aids.base import Measurement, OperatingPoint, range_problem
+from nav.error_model import PHI, Block, markov
+from nav.rotation import dcm_from_quat
+from nav.samples import Array, MagnetometerSample, Sample
+
+FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Earth's is 22 to 67 uT [T]
+
+
+@dataclass(frozen=True)
+class MagnetometerAid:
+    """Three axes; without a reference field it is not used."""
+
+    sensor: str = "magnetometer"
+    sigma: float = 0.5e-6  # [T]
+    bias_sigma: float = 1.0e-6  # hard iron left after calibration [T]
+    anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
+    error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
+    error_correlation_s: float = 30.0
+
+    parts = (("magnetometer", 3),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return f"{self.sensor}_bias", f"{self.sensor}_anomaly", f"{self.sensor}_error"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        bias, anomaly, error = self.states
+        return [
+            Block(bias, 3, self.bias_sigma),
+            Block(anomaly, 3, self.anomaly_sigma),
+            markov(error, 3, self.error_sigma, self.error_correlation_s),
+        ]
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.full(3, self.sigma**2)
+
+    def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
+        """See `Aid`."""
+        assert isinstance(sample, MagnetometerSample)
+        state, (bias, anomaly, error) = at.state, at.starts
+        if not at.reference.has_field:
+            return None
+        field_n = at.reference.field_n(state.lla)
+        nu, H = magnetometer(state.q_nb, at.x, bias, error, anomaly, field_n, sample.field_b)
+        return Measurement(nu, H, self._R)
+
+
+def problem(sample: MagnetometerSample) -> str:
+    """See `nav.aids.problem`."""
+    return range_problem("field", math.hypot(*sample.field_b), FIELD_LIMITS)
+
+
+@njit
+def magnetometer(
+    q_nb: Array, x: Array, bias: int, error: int, anomaly: int, field_n: Array, field_b: Array
+) -> tuple[Array, Array]:
+    """Magnetic field [T] in body axes: C_nb' (field_n + anomaly) + bias + error, ``field_n`` the reference field there.
+
+    ``bias`` and ``error`` are fixed to the body, ``anomaly`` to n; each is where its states begin, -1 for none.
+    """
+    C_nb = dcm_from_quat(q_nb)
+    H = np.zeros((3, len(x)))
+    nu = np.zeros(3)
+    m0, m1, m2 = field_n[0], field_n[1], field_n[2]
+    if anomaly >= 0:
+        m0, m1, m2 = m0 + x[anomaly], m1 + x[anomaly + 1], m2 + x[anomaly + 2]
+    for i in range(3):
+        c0, c1, c2 = C_nb[0, i], C_nb[1, i], C_nb[2, i]
+        nu[i] = field_b[i] - (c0 * m0 + c1 * m1 + c2 * m2)
+        # -C_nb' [field x]
+        H[i, PHI] = c2 * m1 - c1 * m2
+        H[i, PHI + 1] = c0 * m2 - c2 * m0
+        H[i, PHI + 2] = c1 * m0 - c0 * m1
+        if anomaly >= 0:
+            H[i, anomaly], H[i, anomaly + 1], H[i, anomaly + 2] = c0, c1, c2
+        for start in (bias, error):
+            if start >= 0:
+                H[i, start + i] = 1.0
+                nu[i] -= x[start + i]
+    return nu, H

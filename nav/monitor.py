@@ -1,0 +1,96 @@
+"""Monitors: what is known of the soundness of a sensor, and which of its axes are isolated for it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+
+from nav.aids.base import Aid
+from nav.detection import ChiSquare, Decision, Detector, Mask, chi_square_threshold
+from nav.samples import Array
+from nav.weighting import Policy, split
+
+PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Monitor`
+
+
+@dataclass(frozen=True)
+class MonitoredAid:
+    """A sensor of a local filter; detector and policy are made anew for each part of its samples."""
+
+    aid: Aid
+    detector: Callable[[], Detector] = lambda: ChiSquare(1e-3)
+    policy: Callable[[], Policy] | None = None
+
+
+class Change(Enum):
+    """What a measurement changed in the isolation of its sensor; NONE is false."""
+
+    NONE = auto()
+    ISOLATED = auto()
+    READMITTED = auto()
+
+    def __bool__(self) -> bool:
+        return self is not Change.NONE
+
+
+class Monitor:
+    """What is known of one part of a sensor's samples: which axes are isolated, how long each has been bad or good.
+
+    Of its policy ``noise`` is what learns R, before the detector judges, and ``policy`` the rest (`split`).
+
+    A refused measurement goes axis by axis (`Decision.axis_mask`). An axis that the detector refused ``isolate_after``
+    times in a row is isolated. It is readmitted when it has been sound ``readmit_after`` times in a row, or when all
+    isolated axes would each be sound alone `PATIENT` times as often: while a sensor is isolated nothing estimates its
+    slow errors, its innovations are correlated, and a detector that gathers them might never let it go. The detector
+    begins anew then.
+
+    ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
+    measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement [s].
+    """
+
+    def __init__(
+        self, detector: Detector, policy: Policy | None, size: int, isolate_after: int, readmit_after: int
+    ) -> None:
+        self.detector = detector
+        self.noise, self.policy = split(policy)
+        self._isolate_after, self._readmit_after = isolate_after, readmit_after
+        self.isolated: Mask = np.full(size, False)
+        self.suspect = self.out = False
+        self.suspicion, self.judged = 0.0, -math.inf
+        self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._clean = True
+        self._new_detector = deepcopy(detector)
+
+    def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
+        """The detector's decision on a measurement, and what it changes; an axis isolated outweighs one readmitted."""
+        decision = self.detector.step(nu, S, t)
+        ratio = decision.statistic / decision.threshold
+        self.suspicion, self.judged = max(ratio, 0.0) if ratio == ratio else math.inf, t
+        if not decision.alarm and self._clean:
+            return decision, Change.NONE
+        sound, before = decision.axis_mask, self.isolated
+        self._bad = np.where(sound, 0.0, self._bad + 1.0)
+        self._good = np.where(sound, self._good + 1.0, 0.0)
+        alone = nu * nu <= chi_square_threshold(ALONE_FALSE_ALARM, 1) * S.diagonal()
+        self._alone = np.where(before & alone, self._alone + 1.0, 0.0)
+        patient = self.suspect and bool((self._alone[before] >= PATIENT * self._readmit_after).all())
+        kept = before & (self._good < self._readmit_after) & (not patient)
+        self.isolated = kept | (~before & (self._bad >= self._isolate_after))
+        if patient:
+            self.detector, self._alone = deepcopy(self._new_detector), np.zeros(len(nu))
+        self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())
+        self._clean = not self.suspect and not self._bad.any()
+        if (self.isolated & ~before).any():
+            return decision, Change.ISOLATED
+        return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
+
+    def isolate(self) -> None:
+        """Isolate every axis, whatever the detector found."""
+        self.isolated, self._good = np.full(len(self.isolated), True), np.zeros(len(self.isolated))
+        self.suspect = self.out = True
+        self._clean = False
