@@ -13,6 +13,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.error_model import POS, VEL
+from nav.kalman import keep_positive
 from nav.samples import Array
 
 Combination = Literal["information", "scalar", "covariance_intersection"]
@@ -104,7 +105,8 @@ def reset(x: Array, P: Array, x_g: Array, P_g: Array) -> None:
 
     With G = P_ac P_cc^-1: ``x_a += G (x_g - x_c)``, ``P_ac = G P_g``, ``P_aa += G (P_g - P_cc) G'``. The errors of an
     aid depend on all other filters' measurements through the common states only, so this is Bayes' rule and no
-    approximation, apart from the process noise over a step.
+    approximation, apart from the process noise over a step. Where the aid is known far better given the common states
+    than by itself, rounding may take more than that: see `nav.kalman.keep_positive`.
     """
     n, common = len(x), len(x_g)
     inverse, _ = scaled_inverse(P, common)
@@ -135,6 +137,7 @@ def reset(x: Array, P: Array, x_g: Array, P_g: Array) -> None:
         x[i] = x_g[i]
         for j in range(common):
             P[i, j] = P_g[i, j]
+    keep_positive(P)
 
 
 @njit

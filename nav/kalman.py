@@ -14,6 +14,9 @@ from nav._jit import inlined, njit
 from nav.matrix import multiply
 from nav.samples import Array
 
+CRITICAL = 1e9  # of the variance that a measurement is predicted with over its own: rounding may take all that is left
+MARGIN = 1e-14  # by which a covariance scaled to a unit diagonal must be positive; its rounding errors are some 1e-16
+
 
 @inlined
 def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
@@ -88,10 +91,84 @@ def update(x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float) 
     """`innovate` and, if nis is at most ``threshold``, `correct` ``x`` (n,) and ``P`` (n, n) in place; (S, nis)."""
     S, S_inverse, HP, nis = innovate(P, H, R, nu)
     if nis <= threshold:
+        critical = is_critical(P, H, R)
         correction = correct(P, H, R, HP, S_inverse, nu)
+        if critical:
+            keep_positive(P)
         for i in range(len(x)):
             x[i] += correction[i]
     return S, nis
+
+
+@njit
+def is_critical(P: Array, H: Array, R: Array) -> bool:
+    """Whether rounding may leave ``P`` indefinite after an update by ``H`` (m, n) and variances ``R`` (m,).
+
+    The states that a measurement sees may each be known so much worse than their sum (a position and the error of its
+    receiver, say) that products with H cancel to less than their rounding; Joseph's form is then positive on paper
+    only.
+    """
+    for i in range(len(R)):
+        size = 0.0
+        for j in range(len(P)):
+            if H[i, j] != 0.0:
+                size += abs(H[i, j]) * math.sqrt(abs(P[j, j]))
+        if size * size > CRITICAL * R[i]:
+            return True
+    return False
+
+
+@njit
+def is_positive(P: Array, share: float) -> bool:
+    """Whether ``P`` (n, n), each variance raised by a ``share`` of itself, is positive definite by a `MARGIN`.
+
+    By Cholesky on ``P`` scaled to a unit diagonal: the units of the states differ by 1e12. Rows of zeros, states that
+    are not in use, are left out.
+    """
+    n = len(P)
+    L, scale = np.zeros((n, n)), np.zeros(n)
+    for i in range(n):
+        if P[i, i] > 0.0:
+            scale[i] = 1.0 / math.sqrt(P[i, i])
+        else:
+            for j in range(n):
+                if P[i, j] != 0.0:
+                    return False
+    for i in range(n):
+        for j in range(i + 1):
+            total = 1.0 + share - MARGIN if i == j else P[i, j] * scale[i] * scale[j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i != j:
+                L[i, j] = total / L[j, j]
+            elif total > 0.0:
+                L[i, i] = math.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@njit
+def keep_positive(P: Array) -> None:
+    """Make ``P`` (n, n) positive definite, if it isn't, by raising its variances by a small share of themselves.
+
+    The share is the least power of ten that does it, so that no more is claimed than is known. A variance that has
+    become negative itself is given back its size, without correlations.
+    """
+    if is_positive(P, 0.0):
+        return
+    n = len(P)
+    for i in range(n):
+        if P[i, i] <= 0.0:
+            for j in range(n):
+                if j != i:
+                    P[i, j] = P[j, i] = 0.0
+            P[i, i] = -P[i, i]
+    share = MARGIN
+    while share < 1.0 and not is_positive(P, share):
+        share *= 10.0
+    for i in range(n):
+        P[i, i] += share * P[i, i]
 
 
 @njit

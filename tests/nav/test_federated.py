@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from worlds.covariances import position_and_its_error, scaled_eigenvalues
 from worlds.federated import DETECTORS, differ, field, fly, horizontal, ramp, three, true_start, world
 from worlds.ins import CONSUMER, DEG, DT, error, feed, gnss
 
@@ -192,6 +193,17 @@ def lost_position():
     other = sigma.copy()
     other[POS : POS + 3], other[VEL : VEL + 3] = 185.0, 0.3
     return np.stack([np.diag(sigma**2), np.diag(other**2)])
+
+
+def test_a_reset_keeps_the_covariance_positive():
+    """An aid known to half a millimetre given a position lost by kilometres; a sixth of these was indefinite."""
+    for seed in range(40):
+        P, _, _ = position_and_its_error(seed)
+        root = np.array([[7.0], [3.0], [2000.0]]) * np.random.default_rng(seed).normal(size=(3, 3))
+        P_g = (root @ root.T + np.diag([1e-2, 1e-2, 1.0])) / 0.02
+        reset(np.zeros(6), P, np.zeros(3), P_g)
+        assert scaled_eigenvalues(P)[0] > 0, seed
+        np.testing.assert_allclose(P[:3, :3], P_g, rtol=1e-9)
 
 
 def test_printed_weights_do_not_see_a_lost_position():

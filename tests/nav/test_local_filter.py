@@ -70,9 +70,9 @@ def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     assert watch.suspect  # one of them is not sound
 
 
-def test_a_conviction_holds_until_looks_are_sound():
+def test_an_isolation_from_outside_holds_until_samples_are_sound():
     watch = Monitor(ChiSquare(1e-3), None, 2, 3, 4)
-    watch.convict()
+    watch.isolate()
     assert watch.out
     assert watch.suspect
     found = [watch.judge(np.zeros(2), np.eye(2), float(k))[1] for k in range(4)]
