@@ -232,7 +232,8 @@ def scenario_reference() -> str:
             parts.append(f"## `{chapter}`\n\n{of_the_run[chapter][:1].upper()}{of_the_run[chapter][1:]}.")
         rows = [(f"`{row.key}`", row.type, row.unit, row.range, row.default, row.description) for row in table.rows]
         head = ("key", "type", "unit", "range", "default", "what it is")
-        parts.append(f"{'#' * table.level} {table.heading}\n\n{table.about}\n\n{_table(head, rows) if rows else ''}")
+        about = table.about if now else "The keys at the top of the file, and its sections."
+        parts.append(f"{'#' * table.level} {table.heading}\n\n{about}\n\n{_table(head, rows) if rows else ''}")
         if any(row.key == "grade" for row in table.rows):
             kind = re.findall(r'"(.+)"', table.heading)[0]
             parts.append(f"What the grades preset: [Sensors](sensors.md#{kind.replace('_', '-')}).")
@@ -396,6 +397,14 @@ def commands() -> str:
     return "\n\n".join(parts)
 
 
+def conventions() -> str:
+    """Frames, names, units, signs and time, from the docstring of `nav`."""
+    import nav
+
+    found = re.findall(r"^(\w[\w ]*)\n((?:    .+\n)+)", inspect.cleandoc(nav.__doc__ or "") + "\n", re.MULTILINE)
+    return "\n\n".join(f"{word}\n:   {_plain(text)}" for word, text in found)
+
+
 def aircraft_modes() -> str:
     """Modes of the main aircraft without its autopilot."""
     from testbed.motion.modes import modes_table
@@ -502,6 +511,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "shipped_scenarios": shipped_scenarios,
     "metric_names": metric_names,
     "commands": commands,
+    "conventions": conventions,
     "aircraft_modes": aircraft_modes,
     "envelopes": envelopes,
     "record_format": record_format,
