@@ -131,12 +131,16 @@ def tree(
     """A record as labelled arrays, from the columns of each group and the attributes of the root."""
     import xarray
 
+    def labelled(dims: Sequence[str], values: Data, attrs: Mapping[str, Any] | None = None) -> xarray.Variable:
+        # Arrays that it has to look at, xarray compares with those of Dask, which take longer to load than a short run.
+        return xarray.Variable(dims, values, attrs, fastpath=True)
+
     nodes = {"/": xarray.Dataset(attrs=dict(attributes))}
     for path, group in columns.items():
         time_name = "sample_time" if "sample_time" in group else "time"
         nodes[path] = xarray.Dataset(
             {
-                name: (
+                name: labelled(
                     (time_name, *variable.dims),
                     np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
                     variable.labels,
@@ -144,6 +148,6 @@ def tree(
                 for name, (variable, values) in group.items()
             }
         ).set_coords(time_name)
-        labels = {str(dim): list(AXES[str(dim)]) for dim in nodes[path].dims if dim in AXES}
+        labels = {str(dim): labelled([str(dim)], np.array(AXES[str(dim)])) for dim in nodes[path].dims if dim in AXES}
         nodes[path] = nodes[path].assign_coords(labels)
     return xarray.DataTree.from_dict(nodes)

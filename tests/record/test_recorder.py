@@ -166,6 +166,15 @@ def test_memory_file_and_plain_xarray_agree(run_file: Path) -> None:
         assert plain["estimators/ins"]["v_n"].sel(ned="east").attrs["units"] == "m/s"
 
 
+def test_reading_does_not_load_dask(run_file: Path) -> None:
+    """Its arrays would be half of what a short run loads, and none of them is there."""
+    script = (
+        "import sys; from pathlib import Path; from testbed.record.reader import load;"
+        "load(Path(sys.argv[1])); sys.exit('dask.array' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", script, str(run_file)], timeout=120).returncode == 0
+
+
 def test_chunking_changes_no_byte(tmp_path: Path, run_file: Path) -> None:
     for chunk in (7, 33, 4096):
         path = tmp_path / f"{chunk}.nc"
