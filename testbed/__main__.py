@@ -182,7 +182,7 @@ def run(
     if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with _output_folder(folder):
-        require_own(folder, [RECORD, METRICS, *([REPORT] if report else [])], force)
+        _require_own(loaded, folder, report, force)
         links = _connect(
             mavlink or [],
             loaded,
@@ -458,6 +458,19 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
         _remark(f"{run_file}: ends early; the rerun goes on to the scenario's end")
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
     return scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario)
+
+
+def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) -> None:
+    """See before a run that nothing of somebody else's is where its results go."""
+    if force:  # what figures there will be is not known; each is forced as it is written
+        require_own(folder, [RECORD, METRICS], force)
+        return
+    names = [RECORD, METRICS]
+    if report:
+        from testbed.report import page
+
+        names += page.files([*(one.name for one in scenario.estimator), *scenario.sensors])
+    require_own(folder, names)
 
 
 @contextmanager

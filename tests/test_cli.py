@@ -453,6 +453,19 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "1:00:00 of 1:00:00  87.7 × real time  leg [2]" in out.getvalue()
 
 
+def test_own_files_are_named_before_a_run_and_left(testbed: Testbed, tmp_path: Path) -> None:
+    mine = [tmp_path / name for name in ("flight.png", "ins_biases.png", "report.html", "photo.png")]
+    for path in mine:
+        path.write_text("mine")
+    ended = testbed("run", "static_bench", "--out", ".")
+    assert ended.code == 2
+    assert ended.err.startswith("testbed: .: there is report.html, flight.png, ins_biases.png already, not made by")
+    assert not (tmp_path / "run.nc").exists()
+    ended = testbed("run", "static_bench", *QUICK, "--out", ".", "--force")
+    assert ended.code == 0, ended.err
+    assert {path.read_text() for path in mine} == {"mine"}
+
+
 def test_what_a_file_name_may_hold_is_not_obeyed_by_the_terminal(testbed: Testbed) -> None:
     ended = testbed("report", "\x1b[31mred.nc")
     assert (ended.code, ended.err.startswith(r"testbed: \x1b[31mred.nc: no such file")) == (2, True)

@@ -6,7 +6,7 @@ import base64
 import functools
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,6 +63,18 @@ def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder:
                 shown.append(Shown(title, caption, picture))
         write_result(page, render("run.html", figures=shown, **_told(run, metrics)).encode(), force)
     return page
+
+
+def files(subjects: Iterable[str]) -> list[str]:
+    """Every file that a report may consist of, with these estimators and inertial sensors."""
+    of_each = list(subjects)
+    names = [
+        plot.name.format(subject)
+        for chapter in CHAPTERS
+        for plot in chapter.plots
+        for subject in (of_each if chapter.subjects else [""])
+    ]
+    return [REPORT, *(f"{name}.png" for name in names)]
 
 
 def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
