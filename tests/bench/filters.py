@@ -7,7 +7,7 @@ from functools import cache
 from statistics import median
 
 import numpy as np
-from bench.measure import Effort, Row, compare, need, ratios, wall_seconds
+from bench.measure import Effort, Row, compare, cpu_seconds, need, ratios
 from bench.unit import ACCEL_NOISE, DEG, GNSS_SIGMA, GYRO_NOISE, START, site, unit
 
 from nav import strapdown, unscented
@@ -40,7 +40,7 @@ def ahrs_batch(effort: Effort) -> Iterator[Row]:
         ahrs.propagate(samples)
 
     ours()
-    rates = tuple(len(samples) / wall_seconds(ours) / 1e6 for _ in range(effort.rounds))
+    rates = tuple(len(samples) / cpu_seconds(ours) / 1e6 for _ in range(effort.rounds))
     yield Row("AHRS in a batch", rates, "M updates/s", at_least=1.5)
     need("vqf")
     from vqf import VQF
