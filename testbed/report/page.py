@@ -108,7 +108,11 @@ def _events(run: Run) -> list[tuple[str, str, str]]:
 def png(figure: Figure) -> bytes:
     """A figure as the bytes of a PNG file."""
     picture = io.BytesIO()
-    figure.savefig(picture, format="png", pil_kwargs={"compress_level": 4})
+    figure.savefig(
+        picture,
+        format="png",
+        pil_kwargs={"compress_level": 2},  # as small as 6, in half the time
+    )
     return picture.getvalue()
 
 

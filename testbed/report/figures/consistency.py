@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -81,8 +82,9 @@ def ellipses(run: Run) -> Figure | None:
         return None
     drawn = sheet(-(-len(moments) // ABREAST), ABREAST, height=2.75, gap=0.75, shared=False)
     drawn.figure.subplots_adjust(wspace=0.28)
+    claimed = {name: (run.estimate(name, "time"), run.estimate(name, "covariance")) for name in run.positioned}
     for ax, (t, title) in zip(drawn.axes.flat, moments, strict=False):
-        _ellipses_at(run, ax, t)
+        _ellipses_at(run, ax, t, claimed)
         ax.set_title(title, fontsize=9, loc="left")
         ax.set_xlabel("east [m]", fontsize=9)
     for ax in drawn.axes[:, 0]:
@@ -115,14 +117,18 @@ def _moments(run: Run) -> list[tuple[float, str]]:
     return moments
 
 
-def _ellipses_at(run: Run, ax: Axes, t: float) -> None:
-    """Ellipse and error of all that have one; what is far larger than the smallest is cut off, and named."""
+def _ellipses_at(run: Run, ax: Axes, t: float, claimed: Mapping[str, tuple[Array, Array]]) -> None:
+    """Ellipse and error of all that have one at a time; what is far larger than the smallest is cut off, and named.
+
+    ``claimed``: times (N,) and covariances (N, 9, 9) of each estimator.
+    """
     shown: dict[str, tuple[Array, Array]] = {}
     for name, e in run.positioned.items():
         row = int(np.argmin(np.abs(e.t - t)))
         if e.valid[row]:
-            at = int(np.argmin(np.abs(run.estimate(name, "time") - e.t[row])))
-            shown[name] = (ellipse(run.estimate(name, "covariance")[at, :2, :2], SIGMAS), e.position[row, :2])
+            times, covariance = claimed[name]
+            at = int(np.argmin(np.abs(times - e.t[row])))
+            shown[name] = (ellipse(covariance[at, :2, :2], SIGMAS), e.position[row, :2])
     sizes = {name: float(np.abs([*corners, error]).max()) for name, (corners, error) in shown.items()}
     sizes = {name: size for name, size in sizes.items() if np.isfinite(size)}
     limit = 1.25 * max([s for s in sizes.values() if s <= FAR * FAR * min(sizes.values())], default=1.0)
