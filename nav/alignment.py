@@ -11,12 +11,13 @@ on a biased accelerometer is not independent of that bias.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from nav._jit import njit
+from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
 from nav.aids.gnss import has_velocity
 from nav.earth import earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ImuModel
@@ -89,9 +90,28 @@ class Alignment:
 
     def __init__(self, imu: ImuModel, aids: AidSigmas, arm_b: Array, duration_s: float) -> None:
         self.imu, self.aids, self.arm_b, self.duration_s = imu, aids, arm_b, duration_s
+        self.names: dict[str, str] = {}  # of the blocks in `InitialState.correlated`, where a filter has others
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
         self._restart(None)
+
+    @classmethod
+    def from_aids(cls, imu: ImuModel, aids: Iterable[Aid], duration_s: float) -> Alignment:
+        """By the first receiver, magnetometer and wind of a filter's ``aids``, and what such are by default."""
+        aids = list(aids)
+        gnss = next((aid for aid in aids if isinstance(aid, GnssAid)), GnssAid())
+        magnetometer = next((aid for aid in aids if isinstance(aid, MagnetometerAid)), MagnetometerAid())
+        sigmas = AidSigmas(
+            field=magnetometer.sigma,
+            field_bias=magnetometer.bias_sigma,
+            gnss_position=np.array(gnss.position_error_sigma),
+            gnss_velocity=np.array(gnss.velocity_error_sigma),
+            wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),
+        )
+        made = cls(imu, sigmas, gnss.arm, duration_s)
+        made.names = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=False))
+        made.names["magnetometer_bias"] = magnetometer.states[0]
+        return made
 
     def _restart(self, fix: GnssSample | None) -> None:
         self._first = fix

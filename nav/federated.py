@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from nav import aids
-from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
+from nav.aids import Aid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Measurement, Ruling, refusals, report_on, without_position
-from nav.alignment import AidSigmas, Alignment, InitialState
+from nav.alignment import Alignment, InitialState
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
@@ -109,24 +109,8 @@ class Federated:
         self._refused_since = self._last_refused = -math.inf  # positions, without one fused in between
         self._fused_at = self._remembered_at = -math.inf
         self._aligning = self._alignment_aids()
-        gnss = next((a for a in self._aligning.values() if isinstance(a, GnssAid)), GnssAid())
-        magnetometer = next((a for a in self._aligning.values() if isinstance(a, MagnetometerAid)), MagnetometerAid())
-        used = [w.aid for local in config.locals for w in local.sensors]
-        wind_sigma = next((a.wind_sigma for a in used if isinstance(a, AirspeedAid)), AirspeedAid().wind_sigma)
-        self._alignment = Alignment(
-            config.imu,
-            AidSigmas(
-                field=magnetometer.sigma,
-                field_bias=magnetometer.bias_sigma,
-                gnss_position=np.array(gnss.position_error_sigma),
-                gnss_velocity=np.array(gnss.velocity_error_sigma),
-                wind=wind_sigma,
-            ),
-            gnss.arm,
-            config.alignment_s,
-        )
-        self._renamed = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=True))
-        self._renamed["magnetometer_bias"] = magnetometer.states[0]
+        used = [monitored.aid for local in config.locals for monitored in local.sensors]
+        self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
         self._extra = self._extras()
 
     def _alignment_aids(self) -> dict[str, Aid]:
@@ -177,7 +161,7 @@ class Federated:
 
     def start(self, initial: InitialState) -> None:
         """Begin at a given state instead of aligning."""
-        state = self._reference.start(initial, [self._renamed] * len(self._reference.models))
+        state = self._reference.start(initial, [self._alignment.names] * len(self._reference.models))
         common = self._common
         for row, share in enumerate(self._noise_shares()):
             reset(state.x[row], state.P[row], np.zeros(common), state.P[row, :common, :common] / share)

@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nav import aids
-from nav.aids import Aid, AirspeedAid, BarometerAid, Course, GnssAid, MagnetometerAid
-from nav.aids.base import OUTSIDE, Ruling, aid_blocks, refusals, report_on, without_position
+from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
+from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
-from nav.alignment import AidSigmas, Alignment, InitialState
+from nav.alignment import Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
-from nav.error_model import POS, VEL, Block, ImuModel
+from nav.error_model import POS, VEL, ImuModel
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
@@ -41,9 +41,7 @@ from nav.reference import (
     spread,
 )
 from nav.samples import (
-    AirspeedSample,
     Array,
-    BarometerSample,
     Estimate,
     GnssSample,
     ImuSamples,
@@ -56,15 +54,6 @@ from nav.samples import (
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
 
-AIDS = ("gnss", "barometer", "magnetometer", "airspeed")
-
-KINDS: dict[type[Sample], str] = {
-    GnssSample: "gnss",
-    BarometerSample: "barometer",
-    MagnetometerSample: "magnetometer",
-    AirspeedSample: "airspeed",
-}
-
 RULINGS = {
     Verdict.FUSE: Ruling(Outcome.FUSED, weight=1.0),
     Verdict.REJECT: OUTSIDE,
@@ -75,49 +64,18 @@ RULINGS = {
 
 @dataclass(frozen=True)
 class InsConfig:
-    """What the filter is told: SI, radians, body axes from the IMU. A block whose sigma is zero is left out.
+    """What the filter is told: SI, radians, body axes from the IMU.
 
-    ``aids`` names the kinds of sample that are fused (`AIDS`), one sensor of each; samples of other kinds serve the
-    alignment only. ``others`` are further aids, by the names of their sensors.
+    ``aids`` are the sensors whose samples it uses, one GNSS receiver at most; ``alignment_aids`` serve the alignment
+    only.
     """
 
     imu: ImuModel
-    aids: tuple[str, ...] = AIDS
-    others: tuple[Aid, ...] = ()
+    aids: tuple[Aid, ...] = (GnssAid(), BarometerAid(), MagnetometerAid(), AirspeedAid())
+    alignment_aids: tuple[Aid, ...] = ()
     mounting_sigma: float = 0.0  # between the axes of the IMU, whose attitude is found, and of the body, reported [rad]
     covariance_period: int = 10  # IMU samples per covariance step; 50 ms and less lose nothing on an aircraft
     scaling: Scaling | None = None  # of sigma points instead of derivatives
-
-    # GNSS: the receiver's own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)
-    gnss_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)  # IMU to antenna [m]
-    gnss_use_velocity: bool = True
-    gnss_position_error_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m]
-    gnss_position_error_correlation_s: float = 100.0
-    gnss_velocity_error_sigma: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [m/s]
-    gnss_velocity_error_correlation_s: float = 20.0
-    course: Course | None = None
-
-    # Barometer, as pressure altitude
-    barometer_sigma: float = 0.5  # [m]
-    barometer_bias_sigma: float = 300.0  # weather and geoid, before the first GNSS height tells [m]
-    barometer_bias_walk: float = 0.03  # [m/sqrt(s)]
-
-    # Magnetometer, three axes
-    magnetometer_sigma: float = 0.5e-6  # [T]
-    magnetometer_bias_sigma: float = 1.0e-6  # hard iron left after calibration [T]
-    magnetometer_anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
-    magnetometer_error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
-    magnetometer_error_correlation_s: float = 30.0
-
-    # Airspeed along body x, and the constraint of no sideslip (None leaves it out)
-    airspeed_sigma: float = 0.5  # [m/s]
-    airspeed_scale_sigma: float = 0.0  # [1]
-    airspeed_min: float = 10.0  # equivalent; below it neither airspeed nor sideslip is used [m/s]
-    sideslip_sigma: float | None = 1.0  # [m/s]
-    wind_sigma: float = 8.0  # per horizontal axis, before anything is known [m/s]
-    wind_walk: float = 0.03  # [m/s/sqrt(s)]
-    gust_sigma: float = 0.0  # turbulence as a Markov part of the wind [m/s]
-    gust_correlation_s: float = 5.0
 
     # Belief
     false_rejection: float = 1e-3  # probability that the gate turns a sound measurement away; 0: there is no gate
@@ -129,62 +87,10 @@ class InsConfig:
     alignment_s: float = 2.0  # shortest time over which the initial attitude is found
 
     def __post_init__(self) -> None:
-        unknown = set(self.aids) - set(AIDS)
-        if unknown:
-            raise ValueError(f"unknown aids {sorted(unknown)}, choose from {list(AIDS)}")
+        if sum(isinstance(aid, GnssAid) for aid in self.aids) > 1:
+            raise ValueError("one GNSS receiver can be aided by: several make a federation")
         if self.covariance_period < 1:
             raise ValueError("covariance_period is a number of samples, at least 1")
-
-    def aid_of(self, kind: str, sensor: str = "") -> Aid:
-        """An aid as a filter is told of it, its sensor by the name of its kind unless it has another."""
-        name = sensor or kind
-        match kind:
-            case "gnss":
-                return GnssAid(
-                    name,
-                    arm_b=self.gnss_arm_b,
-                    use_velocity=self.gnss_use_velocity,
-                    position_error_sigma=self.gnss_position_error_sigma,
-                    position_error_correlation_s=self.gnss_position_error_correlation_s,
-                    velocity_error_sigma=self.gnss_velocity_error_sigma,
-                    velocity_error_correlation_s=self.gnss_velocity_error_correlation_s,
-                    course=self.course,
-                )
-            case "barometer":
-                return BarometerAid(
-                    name,
-                    sigma=self.barometer_sigma,
-                    bias_sigma=self.barometer_bias_sigma,
-                    bias_walk=self.barometer_bias_walk,
-                )
-            case "magnetometer":
-                return MagnetometerAid(
-                    name,
-                    sigma=self.magnetometer_sigma,
-                    bias_sigma=self.magnetometer_bias_sigma,
-                    anomaly_sigma=self.magnetometer_anomaly_sigma,
-                    error_sigma=self.magnetometer_error_sigma,
-                    error_correlation_s=self.magnetometer_error_correlation_s,
-                )
-        return AirspeedAid(
-            name,
-            sigma=self.airspeed_sigma,
-            scale_sigma=self.airspeed_scale_sigma,
-            minimum=self.airspeed_min,
-            sideslip_sigma=self.sideslip_sigma,
-            wind_sigma=self.wind_sigma,
-            wind_walk=self.wind_walk,
-            gust_sigma=self.gust_sigma,
-            gust_correlation_s=self.gust_correlation_s,
-        )
-
-    def used(self) -> list[Aid]:
-        """The aids in use."""
-        return [*(self.aid_of(kind) for kind in AIDS if kind in self.aids), *self.others]
-
-    def aid_blocks(self) -> list[Block]:
-        """The error states of the aids in use."""
-        return aid_blocks(self.used())
 
 
 class Ins:
@@ -204,32 +110,21 @@ class Ins:
     ) -> None:
         self.config, self.field_n = config, field_n
         self.t = math.nan
-        self._by_type = {type_: config.aid_of(kind) for type_, kind in KINDS.items() if kind in config.aids}
-        self._others = {aid.sensor: aid for aid in config.others}
         self._gate = ChiSquareGate(config.false_rejection)
-        self._filter = LocalFilter(config.imu, config.used(), self._gate, scaling=config.scaling)
+        self._filter = LocalFilter(config.imu, config.aids, self._gate, scaling=config.scaling)
         self._filter.weigh_by(policies or {})
         self._filter.fadings = fadings or {}
         self.model = self._filter.model
         self._reference = Reference([self.model], [1.0], config.covariance_period, field_n, config.scaling)
-        self._turns = TurnDetector(config.course.max_turn_rate, config.course.quiet_s) if config.course else None
+        self._gnss = next((aid for aid in config.aids if isinstance(aid, GnssAid)), None)
+        course = self._gnss.course if self._gnss is not None else None
+        self._turns = TurnDetector(course.max_turn_rate, course.quiet_s) if course is not None else None
         self._monitor = GnssMonitor(
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
-        self._alignment = Alignment(
-            config.imu,
-            AidSigmas(
-                field=config.magnetometer_sigma,
-                field_bias=config.magnetometer_bias_sigma,
-                gnss_position=np.array(config.gnss_position_error_sigma),
-                gnss_velocity=np.array(config.gnss_velocity_error_sigma),
-                wind=config.wind_sigma,
-            ),
-            np.array(config.gnss_arm_b, dtype=float),
-            config.alignment_s,
-        )
+        self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]
 
     @property
@@ -240,7 +135,7 @@ class Ins:
     @property
     def listening(self) -> bool:
         """Whether a sample of some kind would still be used."""
-        return self._state is None or bool(self.config.aids or self.config.others)
+        return self._state is None or bool(self.config.aids)
 
     @property
     def problem(self) -> str:
@@ -249,7 +144,7 @@ class Ins:
 
     def start(self, initial: InitialState) -> None:
         """Begin at a given state instead of aligning."""
-        self._state = self._reference.start(initial)
+        self._state = self._reference.start(initial, [self._alignment.names])
         self._draft = self._state.copy()
         self.t = initial.t
         self._monitor.last_fused = initial.t
@@ -275,11 +170,7 @@ class Ins:
         """Whether the sample is of an aid, or can still serve the alignment."""
         if self._state is None:
             return isinstance(sample, (GnssSample, MagnetometerSample))
-        return self._aid(sample) is not None
-
-    def _aid(self, sample: Sample) -> Aid | None:
-        """The aid that a sample is of."""
-        return self._others.get(sample.sensor) or self._by_type.get(type(sample))
+        return sample.sensor in self._filter.aids
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the filter's own time (ValueError otherwise: `nav.horizon.FusionHorizon` sees to that).
@@ -302,11 +193,11 @@ class Ins:
             if initial is not None:
                 self.start(initial)
             return []
-        aid = self._aid(sample)
+        aid = self._filter.aids.get(sample.sensor)
         if aid is None:
             return []
         self._reference.settle(state)
-        if isinstance(sample, GnssSample):
+        if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
             return self._update_gnss(state, sample, aid)
         reports = []
         for part, _ in aid.parts:
@@ -317,7 +208,7 @@ class Ins:
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
-        aid = self._aid(sample)
+        aid = self._filter.aids.get(sample.sensor)
         return [] if aid is None else refusals(sample, aid, reason, self.t)
 
     def estimate(self) -> Estimate:
@@ -339,7 +230,7 @@ class Ins:
         self._draft.take(self._state)
         return self._draft
 
-    def _update_gnss(self, state: State, sample: GnssSample, aid: Aid) -> list[UpdateReport]:
+    def _update_gnss(self, state: State, sample: GnssSample, aid: GnssAid) -> list[UpdateReport]:
         measurement = self._filter.measure(self._reference, state, aid, "gnss_position", sample)
         assert measurement is not None
         nu, H, R, at_points = measurement.nu, measurement.H, measurement.R, measurement.at_points
@@ -353,7 +244,7 @@ class Ins:
         threshold = self._gate.threshold(3)
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
         verdict = self._monitor.judge(replace(sample, sigma_position_n=sigma_p), v_n, sigma_v, nis <= threshold)
-        use_velocity = with_velocity and self.config.gnss_use_velocity
+        use_velocity = with_velocity and aid.use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]
@@ -392,12 +283,12 @@ class Ins:
                 forget(P, VEL, nu_v**2 + np.diag(S_v))
                 wind = self.model.start("wind")
                 if wind >= 0:
-                    forget(P, wind, np.full(2, self.config.wind_sigma**2))
+                    forget(P, wind, self.model.sigma[wind : wind + 2] ** 2)
         forget(P, POS, nu**2 + np.diag(S))
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        aided = "gnss" in self.config.aids and t - self._monitor.last_fused <= RECENT_S
+        aided = self._gnss is not None and t - self._monitor.last_fused <= RECENT_S
         status = Status.ALIGNING if state is None else FUSED if aided else UNAIDED
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -115,37 +115,40 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
     errors, site = rig.imu(section.imu).errors(), rig.site
     aids = {rig.sensors[name].kind: rig.sensors[name] for name in section.aids}
     field_n = geomagnetic_field_n(site.lat, site.lon, site.h, site.date)
-    told: dict[str, object] = {"force_sigma": LEVELLING_FORCE}
+    config = AhrsConfig(
+        imu_model(errors, rig.turn_rate(section.turn_degps), usual=rig.usual),
+        site.lat,
+        site.h,
+        tuple(aids),
+        airspeed_sigma=rig.gust_mps(section.gust_mps),
+        force_sigma=LEVELLING_FORCE,
+        literal=section.literal,
+    )
     level = section.level
     if level is not None:
         yaw_rate, roll_rate = math.radians(level.yaw_rate_degps), math.radians(level.roll_rate_degps)
         limits = LowDynamics(level.acceleration_mps2, yaw_rate, roll_rate, level.test)
-        told |= {"motion": limits, "compensated_motion": limits}
-        told |= {"force_sigma": level.force_sigma_mps2, "phi_limit": math.radians(level.limit_deg)}
-        told |= {"gyro_bias_feedback": level.gyro_bias_feedback}
+        config = replace(
+            config,
+            motion=limits,
+            compensated_motion=limits,
+            force_sigma=level.force_sigma_mps2,
+            phi_limit=math.radians(level.limit_deg),
+            gyro_bias_feedback=level.gyro_bias_feedback,
+        )
     if not section.levelling:
-        told |= {"motion": NEVER_LEVEL, "compensated_motion": NEVER_LEVEL}
+        config = replace(config, motion=NEVER_LEVEL, compensated_motion=NEVER_LEVEL)
     if section.heading_deg is not None:
-        told |= {"heading": math.radians(section.heading_deg)}
+        config = replace(config, heading=math.radians(section.heading_deg))
     magnetometer = aids.get("magnetometer")
     if isinstance(magnetometer, MagnetometerConfig):
         m = magnetometer.errors()
         iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * rig.usual.current_a)
         turn_s = IRON_TURN_S * (UNKNOWN_BODY.turn_rate_radps / rig.usual.turn_rate_radps)
         lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * turn_s * magnetometer.rate_hz)
-        told |= {"magnetometer_sigma": math.hypot(m.noise, lasting) / math.hypot(field_n[0], field_n[1])}
-    ahrs = Ahrs(
-        AhrsConfig(
-            imu_model(errors, rig.turn_rate(section.turn_degps), usual=rig.usual),
-            site.lat,
-            site.h,
-            tuple(aids),
-            airspeed_sigma=rig.gust_mps(section.gust_mps),
-            literal=section.literal,
-            **told,  # type: ignore[arg-type]
-        ),
-        field_n,
-    )
+        level_field = math.hypot(field_n[0], field_n[1])
+        config = replace(config, magnetometer_sigma=math.hypot(m.noise, lasting) / level_field)
+    ahrs = Ahrs(config, field_n)
     imus, voter = mountings(section, rig)
     return Lane(
         FusionHorizon(ahrs, rig.lag_s(section.aids), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),

@@ -7,10 +7,18 @@ A filter knows the datasheets, never the errors that were drawn from them. Terms
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
-from nav.aids import Aid, BodyVelocityAid, PositionFixAid, StarAid
+from nav.aids import (
+    Aid,
+    AirspeedAid,
+    BarometerAid,
+    BodyVelocityAid,
+    GnssAid,
+    MagnetometerAid,
+    PositionFixAid,
+    StarAid,
+)
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from testbed.estimators.section import ImuStates
@@ -90,63 +98,53 @@ def _drive(sigma: float, tau: float) -> float:
     return sigma * math.sqrt(2 / tau)
 
 
-def own_aid(name: str, section: SensorConfig, imu: ImuErrors, slip_mps: float | None) -> Aid | None:
-    """An aid of which a filter may have several, None for a sensor of any other kind.
+def aid_of(
+    name: str, section: SensorConfig, imu: ImuErrors, gust_mps: float, usual: Usual, slip_mps: float | None = None
+) -> Aid | None:
+    """A sensor as a filter is told of it, None for one that aids none.
 
-    What they measure is of the centre of gravity; ``slip_mps`` is of wheels, None without that constraint.
+    ``slip_mps`` is of wheels, None without that constraint. Body velocity and position fixes are of the centre of
+    gravity.
     """
-    arm_b: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
+    from_imu: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
+        case GnssConfig():
+            e = section.errors()
+            return GnssAid(
+                name,
+                arm_b=tuple(e.lever_arm_b - imu.lever_arm_b),
+                position_error_sigma=tuple(e.position_correlated_n),
+                position_error_correlation_s=e.position_tau,
+                velocity_error_sigma=tuple(e.velocity_correlated_n),
+                velocity_error_correlation_s=e.velocity_tau,
+            )
+        case BarometerConfig():
+            b = section.errors()
+            walk = _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL
+            return BarometerAid(name, sigma=b.noise * METRES_PER_PASCAL, bias_walk=walk)
+        case MagnetometerConfig():
+            m = section.errors()
+            iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
+            bias = math.hypot(m.hard_iron, m.current * usual.current_a)
+            return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron)
+        case AirspeedConfig():
+            a = section.errors()
+            return AirspeedAid(
+                name,
+                sigma=math.hypot(a.noise, SHORT_GUSTS * gust_mps),
+                scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
+                sideslip_sigma=math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
+                wind_walk=WIND_WALK,
+                gust_sigma=gust_mps,
+                gust_correlation_s=GUST_LENGTH / usual.airspeed_mps,
+            )
         case BodyVelocityConfig():
             v = section.errors()
-            return BodyVelocityAid(name, v.axes, v.noise, v.scale, v.correlated, v.tau, slip_mps, arm_b)
+            return BodyVelocityAid(name, v.axes, v.noise, v.scale, v.correlated, v.tau, slip_mps, from_imu)
         case StarTrackerConfig():
             return StarAid(name, tuple(section.errors().noise_b))
         case PositionFixConfig():
             p = section.errors()
-            return PositionFixAid(name, tuple(p.position_n), p.height, arm_b)
+            return PositionFixAid(name, tuple(p.position_n), p.height, from_imu)
     maker = registry.of(section).aid  # of a sensor of the user's
     return None if maker is None else maker(name, section, imu)
-
-
-def aid_settings(kinds: Mapping[str, SensorConfig], imu: ImuErrors, gust_mps: float, usual: Usual) -> dict[str, object]:
-    """The keys of `InsConfig` that one sensor of each kind decides on."""
-    told: dict[str, object] = {}
-    gnss = kinds.get("gnss")
-    if isinstance(gnss, GnssConfig):
-        e = gnss.errors()
-        told |= {
-            "gnss_arm_b": tuple(e.lever_arm_b - imu.lever_arm_b),
-            "gnss_position_error_sigma": tuple(e.position_correlated_n),
-            "gnss_position_error_correlation_s": e.position_tau,
-            "gnss_velocity_error_sigma": tuple(e.velocity_correlated_n),
-            "gnss_velocity_error_correlation_s": e.velocity_tau,
-        }
-    barometer = kinds.get("barometer")
-    if isinstance(barometer, BarometerConfig):
-        b = barometer.errors()
-        told |= {
-            "barometer_sigma": b.noise * METRES_PER_PASCAL,
-            "barometer_bias_walk": _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL,
-        }
-    magnetometer = kinds.get("magnetometer")
-    if isinstance(magnetometer, MagnetometerConfig):
-        m = magnetometer.errors()
-        told |= {
-            "magnetometer_sigma": m.noise,
-            "magnetometer_error_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
-            "magnetometer_anomaly_sigma": SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE,
-            "magnetometer_bias_sigma": math.hypot(m.hard_iron, m.current * usual.current_a),
-        }
-    airspeed = kinds.get("airspeed")
-    if isinstance(airspeed, AirspeedConfig):
-        a = airspeed.errors()
-        told |= {
-            "airspeed_sigma": math.hypot(a.noise, SHORT_GUSTS * gust_mps),
-            "airspeed_scale_sigma": math.hypot(a.scale, a.bias / REFERENCE_EAS),
-            "gust_sigma": gust_mps,
-            "gust_correlation_s": GUST_LENGTH / usual.airspeed_mps,
-            "wind_walk": WIND_WALK,
-            "sideslip_sigma": math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
-        }
-    return told

@@ -27,10 +27,9 @@ from nav.detection import (
 from nav.federated import Federated
 from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
-from nav.ins import InsConfig
 from nav.monitor import MonitoredAid
 from nav.weighting import MahalanobisInflation, Policy, SageHusa
-from testbed.estimators.datasheet import aid_settings, imu_model, own_aid
+from testbed.estimators.datasheet import aid_of, imu_model
 from testbed.estimators.ins import scaling
 from testbed.estimators.lane import Lane, handover_errors, mountings
 from testbed.estimators.rig import Rig
@@ -210,12 +209,10 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
     errors = rig.imu(section.imu).errors()
 
     def aid(name: str) -> Aid:
-        sensor = rig.sensors[name]
-        other = own_aid(name, sensor, errors, section.nonholonomic_mps)
-        if other is not None:
-            return other
-        told = aid_settings({sensor.kind: sensor}, errors, rig.gust_mps(section.gust_mps), rig.usual)
-        return InsConfig(imu_model(errors, usual=rig.usual), (sensor.kind,), **told).aid_of(sensor.kind, name)  # type: ignore[arg-type]
+        slip = section.nonholonomic_mps
+        made = aid_of(name, rig.sensors[name], errors, rig.gust_mps(section.gust_mps), rig.usual, slip)
+        assert made is not None  # the scenario was checked
+        return made
 
     used = dict.fromkeys(name for local in section.locals for name in local.aids)
     # Without a receiver or magnetometer among the aids, the first in the file serves the alignment.

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Literal
 
 from pydantic import Field
 
-from nav.aids import Course
+from nav.aids import Aid, AirspeedAid, Course, GnssAid
 from nav.horizon import FusionHorizon
-from nav.ins import AIDS as INS_AIDS
 from nav.ins import Ins, InsConfig
 from nav.unscented import Scaling
 from nav.weighting import Fading, SageHusa
-from testbed.estimators.datasheet import aid_settings, imu_model, own_aid
+from testbed.estimators.datasheet import aid_of, imu_model
 from testbed.estimators.lane import Lane, handover_errors, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import (
@@ -35,6 +35,7 @@ from testbed.estimators.section import (
 from testbed.schema import Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 
+STATE_ORDER = ("gnss", "barometer", "magnetometer", "airspeed")  # the order in the state, which decides on its rounding
 GNSS_MEASUREMENTS = ("gnss_position", "gnss_velocity", "gnss_course")
 
 
@@ -97,37 +98,37 @@ class InsSection(EstimatorSection):
 
 def build(section: InsSection, rig: Rig) -> Lane:
     """The INS that a section asks for, not yet aligned."""
-    sensors = rig.sensors
+    sensors, errors = rig.sensors, rig.imu(section.imu).errors()
+
+    def aid(name: str) -> Aid | None:
+        return aid_of(name, sensors[name], errors, rig.gust_mps(section.gust_mps), rig.usual, section.nonholonomic_mps)
+
     # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
-    offered = {sensors[name].kind: name for name in section.aids if sensors[name].kind in INS_AIDS}
-    aids = tuple(offered)
+    offered = {sensors[name].kind: name for name in section.aids if sensors[name].kind in ONE_EACH}
     for name, sensor in sensors.items():
-        if sensor.kind in INS_AIDS:
+        if sensor.kind in ONE_EACH:
             offered.setdefault(sensor.kind, name)
-    errors = rig.imu(section.imu).errors()
-    kinds: Mapping[str, SensorConfig] = {kind: sensors[name] for kind, name in offered.items()}
-    told = aid_settings(kinds, errors, rig.gust_mps(section.gust_mps), rig.usual)
+    singles = [name for kind in STATE_ORDER for name in section.aids if sensors[name].kind == kind]
+    several = [name for name in section.aids if sensors[name].kind not in ONE_EACH]
+    aids = [made for made in map(aid, (*singles, *several)) if made is not None]
     if section.course is not None:
-        # With the wind, course says what the constraint of no sideslip says: both would count it twice.
-        slip = told.pop("sideslip_sigma", 0.0) if "airspeed" in aids else 0.0
-        told |= {"course": _course(section.course, slip), "sideslip_sigma": None}
-    others = {name: own_aid(name, sensors[name], errors, section.nonholonomic_mps) for name in section.aids}
+        aids = _with_course(aids, section.course)
+    used = tuple(dict.fromkeys((*offered.values(), *(made.sensor for made in aids))))
+    idle = [made for name in offered.values() if name not in singles and (made := aid(name)) is not None]
     learning, fading = section.sage_husa, section.fading
     ins = Ins(
         InsConfig(
             imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
-            aids,
-            tuple(aid for aid in others.values() if aid is not None),
+            tuple(aids),
+            tuple(idle),
             mounting_sigma=errors.accel_misalignment,
             scaling=scaling(section.engine),
             false_rejection=section.false_rejection,
-            **told,  # type: ignore[arg-type]
         ),
         partial(geomagnetic_field_n, date=rig.site.date),
         {part: SageHusa(learning.b) for part in GNSS_MEASUREMENTS} if learning else None,
         {part: Fading(fading.window, fading.alpha) for part in fading.looks} if fading else None,
     )
-    used = tuple(dict.fromkeys((*offered.values(), *(name for name, aid in others.items() if aid is not None))))
     imus, voter = mountings(section, rig)
     return Lane(
         FusionHorizon(ins, rig.lag_s(used), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
@@ -143,8 +144,18 @@ def scaling(engine: Engine) -> Scaling | None:
     return Scaling() if engine == "unscented" else None
 
 
-def _course(section: CourseSection, slip: object) -> Course:
-    """Course with the slip [m/s] that the constraint of no sideslip would be told, none on a road."""
-    assert isinstance(slip, float)
+def _with_course(aids: Sequence[Aid], section: CourseSection) -> list[Aid]:
+    """The same aids with the course of their receiver, its slip [m/s] that of the constraint of no sideslip.
+
+    With the wind, course says what that constraint says: both would count it twice. Without it there is no slip, as on
+    a road.
+    """
     limit = math.inf if section.max_turn_rate_degps is None else math.radians(section.max_turn_rate_degps)
-    return Course(limit, section.quiet_s, slip)
+    slip = next((aid.sideslip_sigma for aid in aids if isinstance(aid, AirspeedAid)), None) or 0.0
+    course = Course(limit, section.quiet_s, slip)
+    return [
+        replace(aid, course=course) if isinstance(aid, GnssAid)
+        else replace(aid, sideslip_sigma=None) if isinstance(aid, AirspeedAid)
+        else aid
+        for aid in aids
+    ]  # fmt: skip

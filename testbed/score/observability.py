@@ -23,7 +23,7 @@ from nav.detection import ChiSquareGate
 from nav.earth import earth_rate_n, isa_pressure
 from nav.error_model import MOTION
 from nav.federated import Federated
-from nav.ins import AIDS, Ins
+from nav.ins import Ins
 from nav.local_filter import LocalFilter
 from nav.observability import Visibility, flown, looked_at
 from nav.reference import Reference
@@ -86,13 +86,10 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
             case Ahrs() as ahrs:
                 found[name] = _of_ahrs(dataset, name, way, ahrs)
             case Ins() as ins:
-                # An INS calls the one sensor of a kind by the kind, the record by its name.
-                named: dict[str, str] = {scenario.sensors[one].kind: one for one in running.sensors}
-                aids = {named[kind]: ins.config.aid_of(kind) for kind in AIDS if kind in ins.config.aids}
-                found[name] = _of_filter(dataset, name, way, ins, aids | {aid.sensor: aid for aid in ins.config.others})
+                found[name] = _of_filter(dataset, name, way, ins, {aid.sensor: aid for aid in ins.config.aids})
             case Federated() as federated:
-                watched = [watched.aid for local in federated.config.locals for watched in local.sensors]
-                found[name] = _of_filter(dataset, name, way, federated, {aid.sensor: aid for aid in watched})
+                own_aids = {one.aid.sensor: one.aid for local in federated.config.locals for one in local.sensors}
+                found[name] = _of_filter(dataset, name, way, federated, own_aids)
     return found
 
 

@@ -63,7 +63,7 @@ def federated(effort: Effort) -> Iterator[Row]:
     every = [fix for second in zip(*receivers, strict=True) for fix in second]
 
     def one() -> None:
-        ins = Ins(InsConfig(unit(), aids=("gnss",)))
+        ins = Ins(InsConfig(unit(), (GnssAid(),)))
         ins.start(initial)
         FusionHorizon(ins).push(samples, receivers[0])
 

@@ -12,6 +12,7 @@ from bench.measure import Effort, Row, compare, need, ratios
 from bench.unit import ACCEL_NOISE, ACCEL_WALK, DEG, GNSS_SIGMA, GYRO_NOISE, GYRO_WALK, START, unit
 
 from nav import strapdown
+from nav.aids import GnssAid
 from nav.alignment import InitialState
 from nav.earth import position_difference_n
 from nav.horizon import FusionHorizon
@@ -165,7 +166,7 @@ def _initial(trajectory: Any) -> tuple[Array, Array, Array]:
 
 def _aligned(trajectory: Any) -> Ins:
     """A 15-state INS told the true error levels, at the start of the hour."""
-    ins = Ins(InsConfig(unit(), aids=("gnss",), covariance_period=1, gnss_use_velocity=False))
+    ins = Ins(InsConfig(unit(), (GnssAid(use_velocity=False),), covariance_period=1))
     q, v, lla = _initial(trajectory)
     covariance = np.diag(np.repeat([2 * DEG, 0.5, 1.0], 3) ** 2)
     ins.start(InitialState(0.0, lla[0], lla[1], lla[2], v, q, covariance))

@@ -4,34 +4,36 @@ Normalised estimation error squared of position, velocity and attitude, three de
 seeds; two-sided 95 % bounds from chi-square. Every run aligns itself from its sensors.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from worlds.ins import CONSUMER, FIELD_N, airspeed, barometer, error, feed, flight, gnss, imu, magnetometer
 
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 
 ARM = (0.5, 0.1, -0.3)
 DURATION = 120
-CONFIG = InsConfig(
-    CONSUMER, gnss_arm_b=ARM, sideslip_sigma=None, wind_walk=0.0, barometer_bias_walk=0.0, false_rejection=1e-6
-)
+AIDS = {
+    "gnss": GnssAid(arm_b=ARM),
+    "barometer": BarometerAid(bias_walk=0.0),
+    "magnetometer": MagnetometerAid(),
+    "airspeed": AirspeedAid(sideslip_sigma=None, wind_walk=0.0),
+}
 
 
-def nees(seed, aids=CONFIG.aids, denied=(np.inf, np.inf)):
+def nees(seed, aids=tuple(AIDS), denied=(np.inf, np.inf)):
     """(DURATION, 3) at every full second, NaN before alignment."""
     truth, rng = flight(DURATION), np.random.default_rng(seed)
     increments, *_ = imu(truth, CONSUMER, rng)
     samples = [s for s in gnss(truth, rng, 5.0, arm_b=ARM) if not denied[0] <= s.t < denied[1]]
-    samples += magnetometer(truth, rng, CONFIG.magnetometer_bias_sigma * rng.normal(size=3))
+    samples += magnetometer(truth, rng, MagnetometerAid().bias_sigma * rng.normal(size=3))
     if "barometer" in aids:
         samples += barometer(truth, rng, 100 * rng.normal())
     if "airspeed" in aids:
         samples += airspeed(truth, rng)
-    ins = Ins(dataclasses.replace(CONFIG, aids=aids), lambda *_: FIELD_N)
+    ins = Ins(InsConfig(CONSUMER, tuple(AIDS[aid] for aid in aids), false_rejection=1e-6), lambda *_: FIELD_N)
     estimates, _ = feed(FusionHorizon(ins), increments, samples)
     result = np.full((DURATION, 3), np.nan)
     for row, estimate in enumerate(estimates):

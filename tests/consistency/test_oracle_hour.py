@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from nav.aids import GnssAid
 from nav.alignment import InitialState
 from nav.earth import position_difference_n, radii
 from nav.error_model import ImuModel
@@ -74,7 +75,7 @@ def navigate(hour, seed, covariance_period):
     sigma[2] = 3 * DEG
     wrong = sigma * rng.normal(size=9)
     attitude = Rotation.from_rotvec(-wrong[:3]) * Rotation.from_quat(q_nb[0], scalar_first=True)
-    ins = Ins(InsConfig(MODEL, aids=("gnss",), covariance_period=covariance_period, gnss_use_velocity=False))
+    ins = Ins(InsConfig(MODEL, (GnssAid(use_velocity=False),), covariance_period=covariance_period))
     ins.start(
         InitialState(
             0.0,

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from nav import aids
+from nav.aids.base import aid_blocks
 from nav.earth import OMEGA_IE, pressure_altitude, quat_en, quat_ie, radii
 from nav.error_model import MOTION, PHI, POS, VEL, Block, ErrorModel, ImuModel, markov, sensor_errors
-from nav.ins import InsConfig
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import (
     AirspeedSample,
@@ -25,17 +25,14 @@ from nav.samples import (
 )
 
 IMU = ImuModel(1e-4, 1e-3, 1e-4, 0.05, 0, 0, 1e-5, 1e-3, 300.0, 300.0, 1e-3, 1e-3)
-CONFIG = InsConfig(
-    IMU,
-    gnss_position_error_sigma=(1.0, 1.0, 2.0),
-    gnss_velocity_error_sigma=(0.1, 0.1, 0.1),
-    gust_sigma=1.0,
-    airspeed_scale_sigma=0.02,
-    magnetometer_anomaly_sigma=1e-7,
-    magnetometer_error_sigma=1e-7,
+AIDS = (
+    aids.GnssAid(position_error_sigma=(1.0, 1.0, 2.0), velocity_error_sigma=(0.1, 0.1, 0.1)),
+    aids.BarometerAid(),
+    aids.MagnetometerAid(anomaly_sigma=1e-7, error_sigma=1e-7),
+    aids.AirspeedAid(gust_sigma=1.0, scale_sigma=0.02),
 )
 BODY_VELOCITY = [Block("body_velocity_scale", 2, 0.01), markov("body_velocity_error", 2, 0.1, 300.0)]
-MODEL = ErrorModel(IMU, [*CONFIG.aid_blocks(), *BODY_VELOCITY])
+MODEL = ErrorModel(IMU, [*aid_blocks(AIDS), *BODY_VELOCITY])
 ARM = np.array([0.7, -0.3, -1.2])
 FIELD_N = np.array([28e-6, -2e-6, 40e-6])
 STEPS = {"phi": 1e-5, "dv": 1e-2, "dp": 1.0, "gyro_bias": 1e-3, "gyro_drift": 1e-3, "gyro_scale": 1e-3,

@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 from worlds.ins import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
 
+from nav.aids import GnssAid, MagnetometerAid
 from nav.alignment import AidSigmas, Alignment
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
@@ -19,8 +20,8 @@ NAVIGATION = ImuModel(0.002 * DEG / 60, 1e-4, 0.003 * DEG / 3600, 3e-4)
 def align(truth, model, rng, with_field=True, arm_b=(0.0, 0.0, 0.0), seconds=60.0, sigma_v=0.1, **config):
     """The first estimate after alignment, the Ins, and the true sensor biases then."""
     increments_, _, accel_bias = imu(truth, model, rng)
-    settings = InsConfig(model, aids=("gnss", "magnetometer"), gnss_arm_b=arm_b, **config)
-    hard_iron = settings.magnetometer_bias_sigma * rng.normal(size=3)
+    settings = InsConfig(model, (GnssAid(arm_b=arm_b), MagnetometerAid()), **config)
+    hard_iron = MagnetometerAid().bias_sigma * rng.normal(size=3)
     samples = gnss(truth, rng, 4.0, arm_b=arm_b, sigma_v=sigma_v)
     if with_field:
         samples += magnetometer(truth, rng, hard_iron)

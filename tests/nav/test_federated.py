@@ -244,7 +244,7 @@ def test_one_local_filter_is_the_ins():
     truth, increments, one, _, others = world()
     sensors = (MonitoredAid(GnssAid()), MonitoredAid(BarometerAid()), MonitoredAid(MagnetometerAid()))
     _, estimates, _ = fly(Config(CONSUMER, (Local("only", sensors),)), one + others, increments)
-    config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"))
+    config = InsConfig(CONSUMER, (GnssAid(), BarometerAid(), MagnetometerAid()))
     central, _ = feed(FusionHorizon(Ins(config, field)), increments, one + others)
     for t in (20, 60, 119):
         shift, ratio = differ(estimates[t], central[t], truth)
@@ -409,7 +409,7 @@ def test_the_single_filter_follows_the_spoofer():
     truth, increments, one, _, others = world(260)
     spoofed = ramp(one, 100, 220, 0.5, True)
     for false_rejection in (1e-3, 1e-300):
-        config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"), false_rejection=false_rejection)
+        config = InsConfig(CONSUMER, (GnssAid(), BarometerAid(), MagnetometerAid()), false_rejection=false_rejection)
         estimates, _ = feed(FusionHorizon(Ins(config, field)), increments, spoofed + others)
         assert max(horizontal(estimates, truth, 50).values()) > 50
 

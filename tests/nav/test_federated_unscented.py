@@ -70,7 +70,7 @@ def test_one_filter_is_the_closed_ins_however_wrong_the_heading(structure, perio
     start = dataclasses.replace(
         true_start(truth), q_nb=q_nb.as_quat(scalar_first=True), covariance=np.diag(sigma**2)
     )  # fmt: skip
-    config = InsConfig(CONSUMER, aids=("gnss", "barometer", "magnetometer"), scaling=Scaling(), false_rejection=0.0)
+    config = InsConfig(CONSUMER, (GnssAid(), BarometerAid(), MagnetometerAid()), scaling=Scaling(), false_rejection=0.0)
     closed = begin(Ins(config, field), start, few, one)
     only = Config(CONSUMER, (Local("only", EVERYTHING, scaling=Scaling()),), structure, fusion_period_s=period_s)
     estimates = begin(Federated(only, field), start, few, one)

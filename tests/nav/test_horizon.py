@@ -21,6 +21,7 @@ from worlds.ins import (
     magnetometer,
 )
 
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.alignment import InitialState
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
@@ -28,6 +29,7 @@ from nav.samples import BarometerSample, ImuSamples
 from nav.strapdown import compensate
 
 ARM = (0.5, 0.1, -0.3)
+EVERY_AID = (GnssAid(arm_b=ARM), BarometerAid(), MagnetometerAid(), AirspeedAid())
 
 
 class Logbook:
@@ -133,7 +135,7 @@ def test_a_sample_without_a_time_waits_for_nobody():
     truth = flight(30)
     increments_, samples = everything(truth, np.random.default_rng(3))
     broken = [dataclasses.replace(s, t=math.nan) for s in samples if 10 < s.t < 10.5]
-    ins = Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N)
+    ins = Ins(InsConfig(CONSUMER, EVERY_AID), lambda *_: FIELD_N)
     _, reports = feed(FusionHorizon(ins, lag_s=0.2), increments_, samples + broken)
     assert {r.aid for r in reports if r.reason == "time is not finite"} == {r.aid for r in reports}
     assert all(10 < r.t < 11 for r in reports if math.isnan(r.nis))
@@ -158,7 +160,7 @@ def test_the_same_bits_between_increments_whether_or_not_the_next_is_there(ticks
     times = np.arange(0, 2390) * DT
     tracks, ends = [], []
     for size in (8, 20, 37, 2390):  # ticks
-        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N), lag_s, coning=True)
+        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, EVERY_AID), lambda *_: FIELD_N), lag_s, coning=True)
         track, reports = [], []
         for start in range(0, len(times), size):
             now = times[start : start + size]
@@ -203,7 +205,7 @@ def test_the_same_bits_however_the_data_are_pushed():
     increments_, samples = everything(truth, np.random.default_rng(3))
     results = []
     for seconds in (DT, 0.035, 0.1, 1.0, 7.5, 100.0):
-        ins = Ins(InsConfig(CONSUMER, gnss_arm_b=ARM, covariance_period=7), lambda *_: FIELD_N)
+        ins = Ins(InsConfig(CONSUMER, EVERY_AID, covariance_period=7), lambda *_: FIELD_N)
         horizon = FusionHorizon(ins, lag_s=0.2)
         _, reports = feed(horizon, increments_, samples, seconds)
         final = horizon.estimate_at(30.0)
@@ -222,7 +224,7 @@ def test_estimates_on_the_way_know_only_what_had_arrived():
     increments_, samples = everything(truth, np.random.default_rng(3))
     tracks = []
     for size in (20, 37, 6000):
-        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N), lag_s=0.2)
+        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, EVERY_AID), lambda *_: FIELD_N), lag_s=0.2)
         track = []
         for start in range(0, 6000, size):
             block = part(increments_, start, start + size)
@@ -240,7 +242,7 @@ def test_asking_changes_nothing():
     increments_, samples = everything(truth, np.random.default_rng(3))
     final = []
     for ask in (False, True):
-        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, gnss_arm_b=ARM), lambda *_: FIELD_N), lag_s=0.2)
+        horizon = FusionHorizon(Ins(InsConfig(CONSUMER, EVERY_AID), lambda *_: FIELD_N), lag_s=0.2)
         for k in range(300):
             block = part(increments_, 20 * k, 20 * k + 20)
             horizon.push(block, [s for s in samples if block.t[0] - DT / 2 <= s.t_arrival < block.t[-1] + DT / 2])
@@ -262,7 +264,7 @@ def test_latency_and_fixes_between_increments_cost_no_accuracy(offset_s):
     worst = []
     for latency in (0.0, 0.2):
         fixes = gnss(truth, rng, 5.0, sigma_p=0.0, sigma_v=0.0, arm_b=ARM, offset_s=0.2 + offset_s, latency_s=latency)
-        ins = Ins(InsConfig(NOISELESS, aids=("gnss",), gnss_arm_b=ARM))
+        ins = Ins(InsConfig(NOISELESS, EVERY_AID[:1]))
         ins.start(InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0],
                                np.diag(np.r_[np.full(3, 1e-3), np.full(3, 0.1), np.full(3, 1.0)] ** 2)))  # fmt: skip
         ins.t = math.nan

@@ -22,6 +22,7 @@ from worlds.ins import (
     magnetometer,
 )
 
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.alignment import InitialState
 from nav.detection import GnssMonitor, Verdict
 from nav.horizon import FusionHorizon
@@ -29,7 +30,8 @@ from nav.ins import Ins, InsConfig
 from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
 
 ARM = (0.5, 0.1, -0.3)
-CONFIG = InsConfig(CONSUMER, gnss_arm_b=ARM, sideslip_sigma=None, gnss_use_velocity=True)
+RECEIVER, PRESSURE, COMPASS = GnssAid(arm_b=ARM), BarometerAid(), MagnetometerAid()
+CONFIG = InsConfig(CONSUMER, (RECEIVER, PRESSURE, COMPASS, AirspeedAid(sideslip_sigma=None)))
 
 
 def field(*_):
@@ -177,12 +179,12 @@ def test_a_filter_too_sure_of_itself_gives_in_to_consistent_gnss():
     """The filter believes in gyros and accelerometers a thousand times better than they are, and drifts off."""
     vain = dataclasses.replace(
         CONFIG,
-        aids=("gnss",),
+        aids=(RECEIVER,),
+        alignment_aids=(MagnetometerAid(bias_sigma=1e-8, sigma=1e-7),),
         imu=dataclasses.replace(
             CONSUMER, accel_bias_sigma=1e-4, gyro_bias_sigma=1e-6, accel_noise=1e-5, gyro_noise=1e-6,
             accel_bias_walk=0.0, gyro_bias_walk=0.0,
         ),
-        magnetometer_bias_sigma=1e-8, magnetometer_sigma=1e-7,
     )  # fmt: skip
 
     truth = flight(120)
@@ -225,7 +227,9 @@ def test_correlated_gnss_errors_do_not_make_it_sure_of_itself():
         )
         fade = math.exp(-0.2 / 100)
         wander = fade * wander + 1.2 * math.sqrt(1 - fade**2) * rng.normal(size=3)
-    told = dataclasses.replace(CONFIG, gnss_position_error_sigma=(1.2, 1.2, 1.2))
+    told = dataclasses.replace(
+        CONFIG, aids=(GnssAid(arm_b=ARM, position_error_sigma=(1.2, 1.2, 1.2)), *CONFIG.aids[1:])
+    )
     estimates, reports = feed(FusionHorizon(Ins(told, field)), increments, wandering + others)
     plain, _ = feed(FusionHorizon(Ins(CONFIG, field)), increments, wandering + others)
     sigma = [math.sqrt(e[-1].covariance[0, 0]) for e in (estimates, plain)]
@@ -284,7 +288,7 @@ def test_broken_increments_are_bridged():
 
 
 def test_slow_air_is_not_fused():
-    ins = Ins(dataclasses.replace(CONFIG, sideslip_sigma=1.0), field)
+    ins = Ins(dataclasses.replace(CONFIG, aids=(*CONFIG.aids[:3], AirspeedAid(sideslip_sigma=1.0))), field)
     ins.start(true_start(flight(30)))
     reports = ins.update(AirspeedSample(0.0, 0.0, 2.0))
     assert [(r.aid, r.weight, r.outcome) for r in reports] == [
@@ -298,7 +302,7 @@ def test_sideslip_observes_the_wind_across():
     truth = flight(30)
     sigma = []
     for sideslip in (None, 1.0):
-        ins = Ins(dataclasses.replace(CONFIG, sideslip_sigma=sideslip), field)
+        ins = Ins(dataclasses.replace(CONFIG, aids=(*CONFIG.aids[:3], AirspeedAid(sideslip_sigma=sideslip))), field)
         ins.start(true_start(truth))
         for _ in range(20):
             ins.update(AirspeedSample(0.0, 0.0, float(np.linalg.norm(truth.v_n[0]))))
@@ -316,9 +320,21 @@ def test_a_sample_at_another_time_is_a_mistake_of_the_caller():
         ins.update(BarometerSample(0.02, 0.02, 95_000.0))
 
 
-def test_unknown_aid():
-    with pytest.raises(ValueError, match=r"unknown aids \['sonar'\]"):
-        InsConfig(CONSUMER, aids=("gnss", "sonar"))
+def test_one_receiver_and_each_sensor_once():
+    with pytest.raises(ValueError, match="several make a federation"):
+        InsConfig(CONSUMER, (GnssAid("one"), GnssAid("two")))
+    with pytest.raises(ValueError, match="listed twice"):
+        Ins(InsConfig(CONSUMER, (BarometerAid(), BarometerAid())))
+
+
+def test_aids_go_by_the_names_of_their_sensors():
+    ins = Ins(
+        InsConfig(CONSUMER, (GnssAid("front", position_error_sigma=(1.0, 1.0, 1.0)), BarometerAid("static"))), field
+    )
+    ins.start(true_start(flight(30)))
+    assert {"front_position_error", "static_bias"} <= set(ins.model.slices)
+    assert [r.aid for r in ins.update(BarometerSample(0.0, 0.0, 95_000.0, "static"))] == ["barometer"]
+    assert not ins.accepts(BarometerSample(0.0, 0.0, 95_000.0, "other"))
 
 
 def test_the_reference_field_is_looked_up_rarely():

@@ -19,7 +19,7 @@ from nav.samples import FixType, GnssSample, ImuSamples
 from nav.unscented import Scaling
 from nav.weighting import Fading, SageHusa, residual
 
-ROAD = InsConfig(CONSUMER, ("gnss",), course=Course(2 * DEG, 2.0), alignment_s=1.0)
+ROAD = InsConfig(CONSUMER, (GnssAid(course=Course(2 * DEG, 2.0)),), alignment_s=1.0)
 
 
 def drive(ins, speed, turn_degps, seconds):
@@ -45,15 +45,15 @@ def test_course_is_used_on_straights_only_and_not_near_rest():
     used = ["gnss_course" in one for one in drive(Ins(ROAD), 5.0, quick, 9)]
     assert used == [False, True, True, True, False, False, True, True, True]
     assert not any("gnss_course" in one for one in drive(Ins(ROAD), 0.9, [0.0] * 4, 4))
-    always = dataclasses.replace(ROAD, course=Course())
+    always = dataclasses.replace(ROAD, aids=(GnssAid(course=Course()),))
     assert all("gnss_course" in one for one in drive(Ins(always), 1.1, quick, 9))
-    without = dataclasses.replace(ROAD, course=None)
+    without = dataclasses.replace(ROAD, aids=(GnssAid(),))
     assert not any("gnss_course" in one for one in drive(Ins(without), 5.0, quick, 9))
 
 
 def test_course_is_worth_the_velocity_over_the_speed():
     """R = (mean of 0.3^2 and 0.4^2, and slip^2) / 25, and course 0.1 rad off pulls the heading there."""
-    ins = Ins(dataclasses.replace(ROAD, course=Course(slip=0.2)))
+    ins = Ins(dataclasses.replace(ROAD, aids=(GnssAid(course=Course(slip=0.2)),)))
     first = drive(ins, 5.0, [0.0], 1)[0]["gnss_course"]
     assert first.innovation[0] == pytest.approx(0.1, abs=0.01)
     assert first.S[0, 0] - 0.1 == pytest.approx((0.125 + 0.04) / 25, rel=0.03)
@@ -100,7 +100,7 @@ def test_noise_is_learned_inside_the_filter(scaling):
     increments, *_ = imu(truth, CONSUMER, rng)
     fixes = noisy(truth, rng, 2)
     policies = {part: SageHusa(0.99) for part in ("gnss_position", "gnss_velocity")}
-    ins = Ins(InsConfig(CONSUMER, ("gnss",), false_rejection=0.0, scaling=scaling), lambda *_: FIELD_N, policies)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(),), false_rejection=0.0, scaling=scaling), lambda *_: FIELD_N, policies)
     ins.start(_start(truth, 1 * DEG))
     _, reports = feed(FusionHorizon(ins), increments, fixes)
     for part, policy in policies.items():
@@ -124,7 +124,7 @@ def learning(times, outage=(0.0, 0.0)):
     increments, *_ = imu(truth, CONSUMER, rng)
     fixes = [fix for fix in noisy(truth, rng, times) if not outage[0] <= fix.t < outage[1]]
     policies = {part: SageHusa(0.99) for part in ("gnss_position", "gnss_velocity")}
-    ins = Ins(InsConfig(CONSUMER, ("gnss",)), lambda *_: FIELD_N, policies)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(),)), lambda *_: FIELD_N, policies)
     ins.start(_start(truth, 1 * DEG))
     return policies, feed(FusionHorizon(ins), increments, fixes)[1]
 
@@ -155,7 +155,7 @@ def _start(truth, heading_sigma, heading_error=0.0):
 
 
 def _fly(truth, increments, samples, seconds=1.0, heading_sigma=1 * DEG, heading_error=0.0, **keys):
-    ins = Ins(InsConfig(CONSUMER, ("gnss", "airspeed"), **keys))
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(), AirspeedAid()), **keys))
     ins.start(_start(truth, heading_sigma, heading_error))
     estimates, _ = feed(FusionHorizon(ins), increments, samples, seconds)
     return estimates
@@ -214,7 +214,7 @@ def test_fading_raises_P_after_the_gate():
     fixes = [dataclasses.replace(fix, v_n=fix.v_n + np.array([0.8, 0, 0]) * (fix.t > 40)) for fix in fixes]
     sigma = {}
     for name, fadings in (("plain", None), ("fading", {"gnss_velocity": Fading(10, 3.0)})):
-        ins = Ins(InsConfig(CONSUMER, ("gnss",), false_rejection=0.0), fadings=fadings)
+        ins = Ins(InsConfig(CONSUMER, (GnssAid(),), false_rejection=0.0), fadings=fadings)
         ins.start(_start(truth, 1 * DEG))
         estimates, _ = feed(FusionHorizon(ins), increments, fixes)
         sigma[name] = np.sqrt(estimates[40].covariance[3, 3]), error(estimates[40], truth)[3]

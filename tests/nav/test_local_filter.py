@@ -102,7 +102,7 @@ def run(policies, scale=1.0, seconds=20):
     rng = np.random.default_rng(1)
     increments, *_ = imu(truth, CONSUMER, rng)
     fixes = [dataclasses.replace(f, sigma_position_n=scale * f.sigma_position_n) for f in gnss(truth, rng, 5.0)]
-    ins = Ins(InsConfig(CONSUMER, aids=("gnss",), false_rejection=1e-12), lambda *_: FIELD_N, policies)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(),), false_rejection=1e-12), lambda *_: FIELD_N, policies)
     covariance = np.diag(np.repeat([1e-3, 0.1, 1.0], 3) ** 2)
     ins.start(InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0], covariance))
     estimates, reports = feed(FusionHorizon(ins), increments, [f for f in fixes if f.t < seconds])

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from worlds.lanes import lanes
 
+from nav.aids import Course, GnssAid
 from nav.ins import Ins
 from testbed import papers
 from testbed.papers import cheng2020
@@ -21,13 +22,18 @@ def test_the_scenario_tells_the_filters_what_it_says() -> None:
     for name, ins in filters.items():
         assert isinstance(ins, Ins)
         assert ins.config.scaling is not None
-        assert (ins.config.course is None) == (name == "no_course")
+        assert (course_of(ins) is None) == (name == "no_course")
         assert ins.model.size == 15
     improved = filters["improved"]
     assert isinstance(improved, Ins)
-    assert improved.config.course is not None
-    assert improved.config.course.max_turn_rate == pytest.approx(cheng2020.KAPPA)
-    assert improved.config.course.slip == 0.0
+    course = course_of(improved)
+    assert course is not None
+    assert course.max_turn_rate == pytest.approx(cheng2020.KAPPA)
+    assert course.slip == 0.0
+
+
+def course_of(ins: Ins) -> Course | None:
+    return next(aid.course for aid in ins.config.aids if isinstance(aid, GnssAid))
 
 
 @pytest.fixture(scope="module")
