@@ -1,12 +1,13 @@
 """Whether a measurement may be believed: the fault detectors, the chi-square gate, and GNSS after an outage.
 
 Every detector has one method, ``step(nu, S, t) -> Decision``, for the innovation ``nu`` (m,), its covariance ``S``
-(m, m) by the filter and the time ``t`` [s] of one look. A sound innovation is zero-mean with covariance S. Residuals
-are whitened, ``r = L^-1 nu`` with ``S = L L'``, so that a mean over looks stays one of unit normals when S changes.
+(m, m) by the filter and the time ``t`` [s] of one sample. A sound innovation is zero-mean with covariance S. Residuals
+are whitened, ``r = L^-1 nu`` with ``S = L L'``, so that a mean over samples stays one of unit normals when S changes.
 A detector holds the state of one sensor: build one for each.
 
-Which one: `ChiSquare` sees a fault in one look or not at all; `Eraim` is the same test and keeps the sound axes; `Sprt`
-gathers evidence over looks, as Zhou et al. 2025 do; `Glr` finds slow faults sooner and knows best when they end.
+Which one: `ChiSquare` sees a fault in one sample or not at all; `Eraim` is the same test and keeps the sound axes;
+`Sprt` gathers evidence over samples, as Zhou et al. 2025 do; `Glr` finds slow faults sooner and knows best when they
+end.
 
 Sources: Zhou et al. 2025 (SINS/GNSS/odometer, completely reset SPRT; "Eq" below), Cui et al. 2022 (ERAIM), Siegmund,
 Sequential Analysis (1985). Evidence is a logarithm of a likelihood ratio [nats].
@@ -39,7 +40,7 @@ Mask = NDArray[np.bool_]
 
 
 class Event(Enum):
-    """What changed with this look."""
+    """What changed with this sample."""
 
     NONE = ""
     ONSET = "onset"
@@ -47,17 +48,17 @@ class Event(Enum):
 
 
 class Decision(NamedTuple):
-    """A detector's word on one look."""
+    """A detector's word on one sample."""
 
     alarm: bool  # the sensor is taken for faulty
-    statistic: float  # NaN or infinite when the look can't be judged: no number, or S not positive definite
+    statistic: float  # NaN or infinite when the sample can't be judged: no number, or S not positive definite
     threshold: float
     axis_mask: Mask  # (m,) True where the axis may be used, all True without an alarm
     event: Event
 
 
 class Detector(Protocol):
-    """Anything that judges one sensor look by look."""
+    """Anything that judges one sensor sample by sample."""
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
         """Judge the innovation ``nu`` (m,) with covariance ``S`` (m, m) at ``t`` [s]."""
@@ -118,13 +119,13 @@ def w_tests(nu: Array, S: Array) -> Array:
 @cache
 def _every_axis(m: int) -> Mask:
     mask = np.full(m, True)
-    mask.flags.writeable = False  # shared by all healthy looks
+    mask.flags.writeable = False  # shared by all healthy samples
     return mask
 
 
 @dataclass
 class _Alarm:
-    """Whether the last look was an alarm."""
+    """Whether the last sample was an alarm."""
 
     on: bool = False
 
@@ -149,9 +150,9 @@ def _sound_axes(mean: Array, variance: float, false_alarm: float) -> Mask:
 
 @dataclass
 class ChiSquare:
-    """One look: nu' S^-1 nu, the squared Mahalanobis distance, against chi-square of m degrees of freedom.
+    """One sample: nu' S^-1 nu, the squared Mahalanobis distance, against chi-square of m degrees of freedom.
 
-    ``false_alarm`` is the probability per look. ``literal`` compares the distance itself with the same quantile, as
+    ``false_alarm`` is the probability per sample. ``literal`` compares the distance itself with the same quantile, as
     Zhou et al. print (Eq 13-14): the limit of one axis moves from 3.3 to 10.8 sigma at 1e-3.
     """
 
@@ -168,7 +169,7 @@ class ChiSquare:
         return self.statistic(gamma2) <= chi_square_threshold(self.false_alarm, m)
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
-        """Judge one look; see `Detector`."""
+        """Judge one sample; see `Detector`."""
         m = len(nu)
         gamma2 = whiten(nu, S)[1]
         sound = None if self.passes(gamma2, m) else np.full(m, False)
@@ -179,7 +180,7 @@ class Never:
     """No alarm, whatever comes: for a sensor whose measurement policy alone shall answer (`nav.weighting`)."""
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
-        """Judge one look; see `Detector`."""
+        """Judge one sample; see `Detector`."""
         return Decision(False, whiten(nu, S)[1], math.inf, _every_axis(len(nu)), Event.NONE)
 
 
@@ -196,7 +197,7 @@ class Eraim:
     _alarm: _Alarm = field(default_factory=_Alarm, init=False)
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
-        """Judge one look; see `Detector`."""
+        """Judge one sample; see `Detector`."""
         m = len(nu)
         gamma2 = whiten(nu, S)[1]
         threshold = chi_square_threshold(self.false_alarm, m)
@@ -269,7 +270,7 @@ class Mean(Protocol):
     variance: float  # of each component when nothing is wrong
 
     def add(self, r: Array, t: float) -> None:
-        """Take the residuals ``r`` (2, m) of one look at ``t`` [s]."""
+        """Take the residuals ``r`` (2, m) of one sample at ``t`` [s]."""
         ...
 
     def restart(self, r: Array, t: float) -> None:
@@ -288,7 +289,7 @@ class RunningMean:
     variance: float = field(default=0.0, init=False)
 
     def add(self, r: Array, t: float) -> None:
-        """Take one look; see `Mean`."""
+        """Take one sample; see `Mean`."""
         self.n = self.decay * self.n + 1.0
         gain = 1.0 / (self.stretch * self.n)
         self.value = self.value + gain * (r - self.value)
@@ -300,12 +301,12 @@ class RunningMean:
 
 
 def plain() -> RunningMean:
-    """The mean of all looks (Eq 12): the longer the sound past, the slower; 20 s to see 5 sigma after 1 h at 5 Hz."""
+    """The mean of all samples (Eq 12): the longer the sound past, the slower; 20 s to see 5 sigma after 1 h at 5 Hz."""
     return RunningMean()
 
 
 def exponential(s: float) -> RunningMean:
-    """The mean that forgets, weights s^age: a memory of 1/(1 - s) looks; 0.95 suits 5-10 Hz, 0.8 suits 1 Hz."""
+    """The mean that forgets, weights s^age: a memory of 1/(1 - s) samples; 0.95 suits 5-10 Hz, 0.8 suits 1 Hz."""
     return RunningMean(decay=_fraction(s))
 
 
@@ -321,7 +322,7 @@ def _fraction(s: float) -> float:
 
 
 class WindowMean:
-    """The mean of the looks of the last ``span_s`` seconds."""
+    """The mean of the samples of the last ``span_s`` seconds."""
 
     decay = 1.0
 
@@ -332,7 +333,7 @@ class WindowMean:
         self.variance = 0.0
 
     def add(self, r: Array, t: float) -> None:
-        """Take one look; see `Mean`."""
+        """Take one sample; see `Mean`."""
         rows = self._window.push(r, t)
         self.n = float(len(rows))
         self.value = _mean(rows)
@@ -345,24 +346,24 @@ class WindowMean:
 
 
 class Reset(Enum):
-    """What `Sprt` does when its evidence is over the limit but falling and the look alone is sound."""
+    """What `Sprt` does when its evidence is over the limit but falling and the sample alone is sound."""
 
     NONE = "none"
     FAST = "fast"  # evidence to zero, the mean is kept (Wang 2016): lasting in the signed form only
-    COMPLETE = "complete"  # evidence and mean start again from this look (Zhou et al. 2025)
+    COMPLETE = "complete"  # evidence and mean start again from this sample (Zhou et al. 2025)
 
 
 @dataclass
 class Sprt:
-    """Evidence for a constant bias, gathered over looks (Zhou et al. 2025, Eq 12-21).
+    """Evidence for a constant bias, gathered over samples (Zhou et al. 2025, Eq 12-21).
 
-    Quadratic form: ``|mean|^2 / (2 variance)``, twice of which is chi-square of m degrees of freedom at each look, so
-    ``false_alarm`` holds per look with half the quantile as the limit. It is a likelihood ratio with the mean
+    Quadratic form: ``|mean|^2 / (2 variance)``, twice of which is chi-square of m degrees of freedom at each sample, so
+    ``false_alarm`` holds per sample with half the quantile as the limit. It is a likelihood ratio with the mean
     estimated, not Wald's test. ``signed`` form: ``E <- decay E + mean' r - |mean|^2 / 2`` with the mean *before* r; it
-    can fall below zero, and as exp(E) has expectation of at most one, ``-ln(false_alarm)`` bounds the alarms per look.
+    can fall below zero, and as exp(E) has expectation of at most one, ``-ln(false_alarm)`` bounds alarms per sample.
 
-    ``end_test`` is what the look alone must pass for a reset. ``axis_mask`` takes out the axes whose own mean is beyond
-    its limit, or all if none is.
+    ``end_test`` is what the sample alone must pass for a reset. ``axis_mask`` takes out the axes whose own mean is
+    beyond its limit, or all if none is.
 
     ``literal`` is Zhou et al. as printed: n |mean|^2 / 2 whatever the weights (Eq 17), the signed form with the mean
     that includes r (drifts upwards: alarms without a fault), and Wald's limit (Eq 18, p_m = p_f) for any m.
@@ -384,7 +385,7 @@ class Sprt:
         return -math.log(self.false_alarm) if self.signed else 0.5 * chi_square_threshold(self.false_alarm, m)
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
-        """Judge one look; see `Detector`."""
+        """Judge one sample; see `Detector`."""
         m = len(nu)
         r, gamma2 = whiten(nu, S)
         threshold = self.threshold(m)
@@ -430,13 +431,13 @@ def glr_false_alarm(threshold: float, m: int, n: int) -> float:
 
 @cache
 def glr_threshold(false_alarm: float, m: int, n: int) -> float:
-    """The limit that `glr_false_alarm` meets with ``n`` looks of ``m`` axes [nats]."""
+    """The limit that `glr_false_alarm` meets with ``n`` samples of ``m`` axes [nats]."""
     low = 0.5 * chi_square_threshold(false_alarm, m)
     if n == 1:
         return low
     from scipy.optimize import brentq  # takes half as long to load as the rest of this package, and few need it
 
-    high = 0.5 * chi_square_threshold(0.1 * false_alarm / n, m)  # beyond the limit of n independent looks
+    high = 0.5 * chi_square_threshold(0.1 * false_alarm / n, m)  # beyond the limit of n independent samples
     return float(brentq(lambda T: math.log(glr_false_alarm(T, m, n) / false_alarm), low, high))
 
 
@@ -458,12 +459,12 @@ def _largest_evidence(rows: Array) -> tuple[float, int]:
 
 @dataclass
 class Glr:
-    """Generalised likelihood ratio for a bias that began at any look within ``window_s``; reverse CUSUM for its end.
+    """Generalised likelihood ratio for a bias that began at any sample within ``window_s``; reverse CUSUM for its end.
 
-    Onset: ``max_j j |mean of the last j|^2 / 2`` over `glr_threshold` of the looks in the window, so ``false_alarm``
-    holds per look at any rate and from the first look on. While the alarm lasts, the fault's mean follows the residuals
+    Onset: ``max_j j |mean of the last j|^2 / 2`` over `glr_threshold` of the samples in the window, so ``false_alarm``
+    holds per sample at any rate and from the first on. While the alarm lasts, the fault's mean follows the residuals
     and ``G <- max(0, G + |mean|^2 / 2 - mean' r)`` gathers evidence that the mean is zero; over ``end_evidence`` [nats]
-    the fault is over and everything starts again from that look.
+    the fault is over and everything starts again from that sample.
     (Basseville and Nikiforov, Detection of Abrupt Changes, 1993, chapter 2.)
 
     ``axis_mask`` takes out the axes whose own mean is beyond the chi-square limit; when none is any more, those that
@@ -484,7 +485,7 @@ class Glr:
         self._window = _Window(self.window_s)
 
     def step(self, nu: Array, S: Array, t: float) -> Decision:
-        """Judge one look; see `Detector`."""
+        """Judge one sample; see `Detector`."""
         m = len(nu)
         r, gamma2 = whiten(nu, S)
         if not math.isfinite(gamma2):

@@ -11,7 +11,6 @@ How information is shared, what is done about faults, and what speaks for which 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance, weights_eq13
 from nav.local_filter import LocalFilter
-from nav.monitor import Change, Monitor
+from nav.monitor import Change, Isolation, Monitor
 from nav.reference import (
     BAD_SAMPLE_S,
     FUSED,
@@ -61,16 +60,6 @@ LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does 
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
-
-
-class Isolation(NamedTuple):
-    """An event: part of a sensor's measurements was isolated or readmitted, by axis."""
-
-    t: float
-    local: str
-    sensor: str
-    part: str
-    isolated: tuple[bool, ...]  # per axis, after the event
 
 
 class Federated:
@@ -502,11 +491,8 @@ class Federated:
         P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
         covariance, sigma = spread(P, self.config.mounting_sigma**2)
         imu = state.imu.copy()
-        extra = {
-            name: (imu[where], sigma[where])
-            for name, where in self.model.slices.items()
-            if where.start < self._common and name not in REPORTED
-        }
+        common = ((name, at) for name, at in self.model.slices.items() if at.start < self._common)
+        extra = {name: (imu[at], sigma[at]) for name, at in common if name not in REPORTED}
         for name, row, where in self._extra:
             extra[name] = (state.x[row, where].copy(), np.sqrt(state.P[row, where, where].diagonal()))
         return describe(state, imu, P, self.model, t, status, covariance, sigma, extra)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from enum import Enum, auto
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,16 @@ class Change(Enum):
 
     def __bool__(self) -> bool:
         return self is not Change.NONE
+
+
+class Isolation(NamedTuple):
+    """An event: part of a sensor's samples was isolated or readmitted, by axis."""
+
+    t: float
+    local: str
+    sensor: str
+    part: str
+    isolated: tuple[bool, ...]  # per axis, after the event
 
 
 class Monitor:

@@ -19,7 +19,7 @@ its factor to P, and form S (and the sigma points) anew before the update.
 Detectors see the S of the R that was told or learned, never of one that was inflated or weighted here: otherwise a
 weight feeds back into the statistic that made it. The learned R must reach them, for a sensor noisier than it says
 would be condemned for that alone. The feedback that this brings is a slow one: only what passed teaches, and by no
-more than 1 - b of the mean. Its price is that a fault which grows more slowly than the memory of 1/(1 - b) looks, and
+more than 1 - b of the mean. Its price is that a fault which grows more slowly than the memory of 1/(1 - b) samples, and
 stays below the limit while it does, is taken for noise: where slow faults are to be found, the memory must be longer
 than what the detector gathers, or R not learned.
 
@@ -183,12 +183,12 @@ class SageHusa:
 
     R <- (1 - d_k) R + d_k (e e' + H P+ H'),  e = z - h(x+),  d_k = (1 - b) / (1 - b^(k+1))
 
-    ``b`` (0.95 to 0.99) sets the memory, 1/(1 - b) looks. k counts from one, so that the nominal R is the first
+    ``b`` (0.95 to 0.99) sets the memory, 1/(1 - b) samples. k counts from one, so that the nominal R is the first
     member of the mean (Eq 25 prints b^k with k = 0 at first: a division by zero). What is learned is the ratio to the
     nominal variance, so a sensor that tells its own sigma is followed; it stays within `R_FLOOR` and `R_CEILING`.
 
     Behind a gate of 1e-3 that judges by what has been learned, a sensor twice as noisy as it says is known to be so
-    after some tens of looks, one four times as noisy after a hundred or so: the few that pass open the gate. In a
+    after some tens of samples, one four times as noisy after a hundred or so: the few that pass open the gate. In a
     federation a sensor that was isolated before teaches nothing, and stays so.
 
     ``literal`` is the mean of nu nu' - sum Wc (z - Z_j)(z - Z_j)' as printed, whose sum has the measurement where the
@@ -198,17 +198,17 @@ class SageHusa:
     b: float = 0.98
     literal: bool = False
     ratio: Array | None = field(default=None, init=False)  # (m,) learned variance / nominal variance
-    _looks: Array = field(default_factory=lambda: np.zeros(1), init=False)  # (m,) that have taught
-    _R: Array = field(default_factory=lambda: np.ones(1), init=False)  # nominal, of the last look
+    _taken: Array = field(default_factory=lambda: np.zeros(1), init=False)  # (m,) that have taught
+    _R: Array = field(default_factory=lambda: np.ones(1), init=False)  # nominal, of the last sample
 
     def __post_init__(self) -> None:
         if not 0.0 < self.b < 1.0:
             raise ValueError(f"a forgetting factor between 0 and 1 is needed, not {self.b}")
 
     def learned(self, R: Array) -> Array:
-        """What the nominal variances ``R`` (m,) of a look are learned to be; it always has all its axes."""
+        """What the nominal variances ``R`` (m,) of a sample are learned to be; it always has all its axes."""
         if self.ratio is None:
-            self.ratio, self._looks = np.ones_like(R), np.zeros_like(R)
+            self.ratio, self._taken = np.ones_like(R), np.zeros_like(R)
         self._R = R
         return self.ratio * R
 
@@ -217,7 +217,7 @@ class SageHusa:
         return self.learned(R)
 
     def learn(self, nu: Array, HPH: Array, used: Array) -> None:
-        """Take the look just adapted: its innovation (m,), H P H' (m, m) before the update, the variances of that (m,).
+        """Take the sample just adapted: innovation (m,), H P H' (m, m) before the update, the variances of that (m,).
 
         An axis whose variance is infinite teaches nothing, nor does one whose residual is no number. A residual whose
         variance was made k times larger by other policies counts as one k^-1/2 times as large, so that an outlier
@@ -227,10 +227,10 @@ class SageHusa:
             return
         left, after = residual(nu, HPH, used)
         taught = np.isfinite(left)
-        self._looks = self._looks + taught
-        d = (1.0 - self.b) / (1.0 - self.b ** (self._looks + 1.0))
-        look = -np.diag(HPH) if self.literal else left**2 * (self.ratio * self._R / used) + np.diag(after)
-        learned = (1.0 - d) * self.ratio + d * look / self._R
+        self._taken = self._taken + taught
+        d = (1.0 - self.b) / (1.0 - self.b ** (self._taken + 1.0))
+        latest = -np.diag(HPH) if self.literal else left**2 * (self.ratio * self._R / used) + np.diag(after)
+        learned = (1.0 - d) * self.ratio + d * latest / self._R
         if not self.literal:
             learned = np.clip(learned, R_FLOOR, R_CEILING)
         self.ratio = np.where(taught, learned, self.ratio)
@@ -277,7 +277,7 @@ class InOrder:
         return R
 
     def learn(self, nu: Array, HPH: Array) -> None:
-        """Show the look just adapted to the first policy, where that learns: see `SageHusa.learn`."""
+        """Show the sample just adapted to the first policy, where that learns: see `SageHusa.learn`."""
         first = self.policies[0] if self.policies else None
         if isinstance(first, SageHusa):
             first.learn(nu, HPH, self._used)
@@ -297,7 +297,7 @@ class Fading:
     """The factor on P that makes it as large as the last innovations say (Cheng et al. 2020, Eq 31-36).
 
     Divergence: nu' S^-1 nu > ``alpha`` m. Then lambda = max(1, tr(S^-1 C) / m), with C the mean of nu nu' over the
-    last ``window`` looks. Both are free of units.
+    last ``window`` samples. Both are free of units.
 
     ``literal`` compares nu' nu with alpha tr(S) and takes tr(C) / tr(S): sums of m^2, (m/s)^2 and rad^2, in which a
     position hides whatever heading does.
@@ -306,19 +306,19 @@ class Fading:
     window: int = 10
     alpha: float = 1.5
     literal: bool = False
-    _looks: deque[Array] = field(default_factory=deque, init=False)
+    _taken: deque[Array] = field(default_factory=deque, init=False)
 
     def factor(self, nu: Array, S: Array) -> float:
         """Lambda (at least 1) to multiply P with, from a gated innovation ``nu`` (m,) and its covariance ``S``."""
         if not np.isfinite(nu).all():
             return 1.0
-        if self._looks and len(self._looks[0]) != len(nu):
-            self._looks.clear()
-        self._looks.append(nu)
-        if len(self._looks) > self.window:
-            self._looks.popleft()
-        looks = np.array(self._looks)
-        distances = np.sum(looks**2, axis=1) if self.literal else np.sum(looks * np.linalg.solve(S, looks.T).T, axis=1)
+        if self._taken and len(self._taken[0]) != len(nu):
+            self._taken.clear()
+        self._taken.append(nu)
+        if len(self._taken) > self.window:
+            self._taken.popleft()
+        rows = np.array(self._taken)
+        distances = np.sum(rows**2, axis=1) if self.literal else np.sum(rows * np.linalg.solve(S, rows.T).T, axis=1)
         expected = float(np.trace(S)) if self.literal else len(nu)
         if not distances[-1] > self.alpha * expected:
             return 1.0
