@@ -501,7 +501,7 @@ def test_a_full_disk_is_told_and_the_last_flush_stays(tmp_path: Path, monkeypatc
 def test_a_disk_that_fills_up_is_told_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
     with file_size_limit(600_000), pytest.raises(UserError) as told:
-        make(path)
+        make(path).close()
     assert str(told.value) == f"{path}: can't write the record (File too large)"
     assert not list(tmp_path.glob(".*"))
 
