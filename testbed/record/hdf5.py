@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ GZIP_LEVEL = 1
 CHUNK_BYTES = 1 << 18
 TRIAL_BYTES = 1 << 14
 SMALL_BYTES = 1 << 12
+COLUMN_BYTES = 1 << 12  # of the structure for each column, at most
 
 
 @dataclass(slots=True)
@@ -48,6 +50,7 @@ def create(
     """
     import h5py
 
+    _see_that_it_fits(path, plans, attributes, whole=contents is not None)
     with h5py.File(path, "w", libver=("earliest", "v110"), track_order=True) as file:
         for name, value in attributes.items():
             file.attrs[name] = value
@@ -61,6 +64,26 @@ def create(
                 if values is None:
                     plan.offsets[name] = dataset.get_offset()
                 yield
+
+
+def _see_that_it_fits(
+    path: Path, plans: Mapping[str, Plan], attributes: Mapping[str, str | int | float], whole: bool
+) -> None:
+    """Raise OSError when there is no room for the file: HDF5 can crash the process when it meets a full disk.
+
+    ``whole`` if all rows are written at once; otherwise only what is not left as a hole.
+    """
+    columns = [
+        (plan.capacity * column.row_bytes, name == plan.time_name)
+        for plan in plans.values()
+        for name, column in plan.columns.items()
+    ]
+    structure = COLUMN_BYTES * (len(columns) + 16) + sum(len(str(value)) for value in attributes.values())
+    size = structure + sum(size for size, _ in columns)
+    with path.open("wb") as file:
+        os.ftruncate(file.fileno(), size)
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, structure + sum(size for size, is_time in columns if whole or is_time))
 
 
 def _dataset(group: h5py.Group, plan: Plan, name: str, values: Data | None) -> Any:

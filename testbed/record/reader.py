@@ -60,8 +60,8 @@ def _upgrade(columns: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
 def scenario_of(dataset: xarray.DataTree, overrides: Sequence[str] = ()) -> Scenario:
     """The scenario that a record was made of, with further ``overrides``.
 
-    Raises UserError, naming the record's format and who wrote it, when that scenario is no longer read; and as
-    `Scenario.parse` does when an override is wrong.
+    Raises UserError, naming the record's format and who wrote it, when that scenario is no longer read; when there is
+    none; and as `Scenario.parse` does when an override is wrong.
     """
     from testbed.scenario import Scenario
 
@@ -70,12 +70,13 @@ def scenario_of(dataset: xarray.DataTree, overrides: Sequence[str] = ()) -> Scen
         if not overrides:
             return Scenario.of_record(said)
         return Scenario.of_record({**said, "overrides": json.dumps([*json.loads(said["overrides"]), *overrides])})
-    except (KeyError, TypeError, ValueError, UserError) as error:
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"damaged record ({error}); run the scenario again") from None
+    except UserError as error:
         if overrides:
             scenario_of(dataset)  # raises where it is the record that is not read
             raise
-        what = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-        raise UserError(f"a record of {_writer(dataset)}, whose scenario is no longer read: {what}") from None
+        raise UserError(f"a record of {_writer(dataset)}, whose scenario is no longer read: {error}") from None
 
 
 def _writer(dataset: xarray.DataTree) -> str:

@@ -322,7 +322,7 @@ def left_out(dataset: xarray.DataTree) -> list[str]:
     try:
         scenario_of(dataset)
     except UserError as error:
-        return [f"flight.* and visibility are left out: this is {error}"]
+        return [f"flight.* and visibility are left out: {error}"]
     return []
 
 

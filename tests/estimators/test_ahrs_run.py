@@ -75,7 +75,7 @@ def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
         ('{name="a", aids=["gnss"], level={}}', "level: is a key of kind 'ahrs', not of 'ins'"),
         ('{name="a", kind="ahrs", aids=[], heading_deg=0, level={test="nrm"}}', 'level.test: can\'t be "nrm"'),
         ('{name="a", aids=["gnss"], literal=true}', "literal: is a key of kind 'federated' or 'ahrs', not of 'ins'"),
-        ('{name="a", kind="ahrz", aids=[]}', 'kind: can\'t be "ahrz": did you mean ahrs'),
+        ('{name="a", kind="ahrz", aids=[]}', 'kind: there is no kind "ahrz": did you mean ahrs'),
     ],
 )
 def test_wrong_scenarios_are_told(estimator: str, says: str) -> None:

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from worlds.loop import same
 
-from testbed import Scenario, run
+from testbed import Scenario, plugins, run
 from testbed.errors import UserError
-from testbed.estimators import custom
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 SHORT = {"duration_s": 12, "expect": {}}
@@ -175,11 +174,11 @@ def test_a_file_that_does_not_run_says_where(tmp_path: Path) -> None:
     with pytest.raises(
         UserError, match=r"can't be imported: ZeroDivisionError: division by zero \(broken.py, line 2\)"
     ):
-        custom.load("./broken.py:Mine", tmp_path)
+        plugins.load("./broken.py:Mine", tmp_path, "none")
 
 
 def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    monkeypatch.setattr(custom, "installed", lambda: {"theirs": "filters_installed:Mine"})
+    monkeypatch.setattr(plugins, "installed", lambda group: {"theirs": "filters_installed:Mine"})
     monkeypatch.syspath_prepend(str(folder))
     (folder / "filters_installed.py").write_text(MINE)
     assert flown(folder, kind="theirs").dataset["estimators/mine"]["time"].size

@@ -349,7 +349,7 @@ def test_a_local_filter_has_its_own_engine_and_policy() -> None:
     assert two.sensors[0].policy is not None
     assert one.sensors[0].policy() == SageHusa(0.9)
     assert two.sensors[0].policy() == MahalanobisInflation(0.01, 50.0, reciprocal=False)
-    assert [watch.noise is not None for watch in federated.locals[0].watches.values()] == [True, True]
+    assert [monitor.noise is not None for monitor in federated.locals[0].monitors.values()] == [True, True]
     assert air.sensors[0].policy is None
 
 

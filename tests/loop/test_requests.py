@@ -523,7 +523,7 @@ def test_a_motion_that_was_handed_over_is_not_begun_anew() -> None:
 def test_an_end_before_the_first_row_leaves_one() -> None:
     result = run(scenario(6), links=[Station([(-1.0, End())])])
     assert result.dataset["truth/time"].values.tolist() == [0.0]
-    assert result.remarks == ("ended on request at 0 s of 6 s",)
+    assert result.remarks[0] == "ended on request at 0 s of 6 s"
 
 
 def test_links_are_told_the_settings_in_force() -> None:

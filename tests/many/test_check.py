@@ -23,6 +23,7 @@ import testbed.__main__ as cli
 from testbed import measures
 from testbed.data import data_dir
 from testbed.errors import UserError
+from testbed.feeds.closed import NEVER_CLOSED
 from testbed.loop import loop
 from testbed.many import check
 from testbed.many.check import Outcome, Row, Task, against_golden, judge
@@ -218,7 +219,7 @@ def test_a_loop_that_never_closes_fails_though_all_bounds_are_kept(
         outcome = check.fly(Task("mine", loaded, tmp_path, None))
         assert [row.verdict for row in outcome.rows] == ["kept"]
         assert outcome.failed == (fault == silent)
-        assert outcome.failure == (loop.NEVER_CLOSED if fault == silent else "")
+        assert outcome.failure == (NEVER_CLOSED if fault == silent else "")
 
 
 def test_a_report_that_fails_hides_no_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -302,7 +302,7 @@ def test_current_leg_is_shown(meet):
 
     def at_leg(leg):
         def change(t):
-            from mavlink_world import truth_row
+            from worlds.mavlink import truth_row
 
             row = truth_row(t)
             row.leg[0] = leg
@@ -681,7 +681,7 @@ def test_serial_port():
 
 
 def test_vehicles(meet):
-    from mavlink_world import estimate, position
+    from worlds.mavlink import estimate, position
 
     peer = meet(calls=0, vehicles=True)
     both = [("second", estimate(1.0, offset_h=50.0)), ("third", estimate(1.0, offset_h=90.0))]

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import all as mav
 from scipy.spatial.transform import Rotation
 
 from testbed import Scenario, run
-from testbed.loop import loop
+from testbed.feeds import build
 from testbed.mavlink import MavlinkPublisher
 
 SECONDS = 12
@@ -186,12 +186,12 @@ def test_station_breaks_the_receiver_and_heals_it(tmp_path, monkeypatch):
 def test_only_what_may_ask_keeps_the_run_from_flying_ahead(listening, monkeypatch, tmp_path):
     ahead = []
 
-    class Counted(loop.Ahead):
+    class Counted(build.Ahead):
         def __init__(self, *arguments):
             ahead.append(self)
             super().__init__(*arguments)
 
-    monkeypatch.setattr(loop, "Ahead", Counted)
+    monkeypatch.setattr(build, "Ahead", Counted)
     monkeypatch.setattr(Counted, "possible", staticmethod(lambda: True))
     scenario = Scenario.load("u_turn", ["duration_s=8"])
     urls = [f"tlog:{tmp_path / 'run.tlog'}", *(["udpout:127.0.0.1:9"] if listening else [])]

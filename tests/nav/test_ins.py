@@ -82,7 +82,7 @@ def test_dead_reckoning_without_aids():
     truth = flight(120)
     rng = np.random.default_rng(1)
     increments, fixes, others = everything(truth, rng)
-    ins = Ins(dataclasses.replace(CONFIG, aids=()), field)
+    ins = Ins(dataclasses.replace(CONFIG, aids=(), alignment_aids=CONFIG.aids), field)
     estimates, reports = feed(FusionHorizon(ins), increments, fixes + others)
     assert reports == []
     assert estimates[-1].status == Status.ALIGNED | Status.DEAD_RECKONING

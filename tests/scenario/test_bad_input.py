@@ -77,7 +77,7 @@ def line_of(text: str, start: str) -> int:
         (
             "date = 2026-06-01",
             "date = 2035-06-01",
-            "date: there is no geomagnetic model for 2035-06-01: choose one from 2010 to 2029, as World Magnetic",
+            "date: there is no geomagnetic model for 2035-06-01: choose one from 2010 to 2029, as the World",
         ),
         ('source = "flight"', 'source = "fly"', 'truth.source: there is no source "fly": '),
         ('source = "flight"', "", "truth.source: is missing: add it, one of flight, kinematic"),

@@ -531,9 +531,7 @@ def test_a_scenario_that_is_no_longer_read_is_told_by_what_it_costs(flown: Any) 
     assert observability.of_run(old) == {}
     told = [text for text in metrics.unscored(old) if "left out" in text]
     assert len(told) == 1
-    assert told[0].startswith(
-        "flight.* and visibility are left out: this is a record of format 'navigation-testbed run"
-    )
+    assert told[0].startswith("flight.* and visibility are left out: a record of format 'navigation-testbed run")
     assert "written by navigation-testbed 0.0.9, whose scenario is no longer read: " in told[0]
     assert not [text for text in metrics.unscored(flown) if "left out" in text]
 
