@@ -29,7 +29,7 @@ from pydantic import (
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from testbed.data import data_dir
-from testbed.errors import UserError
+from testbed.errors import UserError, shown
 from testbed.estimators import registry
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
@@ -53,7 +53,7 @@ def _sensor(table: object, info: ValidationInfo) -> Section:
         raise PydanticCustomError("dict_type", "Input should be a table")
     folder: Path = (info.context or {}).get("folder", Path())
     try:
-        section = sensor_registry.find(str(table.get("kind")), folder).section
+        section = sensor_registry.find(_text(table.get("kind")), folder).section
     except UserError as error:
         raise PydanticCustomError("sensor_kind", "{text}", {"text": str(error)}) from None
     return section.model_validate(table, strict=True)
@@ -65,10 +65,16 @@ def _estimator(table: object) -> EstimatorSection:
         raise PydanticCustomError("dict_type", "Input should be a table")
     kind = table.get("kind", DEFAULT_ESTIMATOR)
     try:
-        section = registry.find(str(kind)).section
+        section = registry.find(_text(kind)).section
     except UserError as error:
         raise PydanticCustomError("estimator_kind", "{text}", {"text": str(error)}) from None
     return section.model_validate({**table, "kind": kind}, strict=True)
+
+
+def _text(kind: object) -> str:
+    if isinstance(kind, str):
+        return kind
+    raise UserError(f'must be text in quotes, such as "text", not {shown(kind)}')
 
 
 class FeedbackConfig(Section):

@@ -407,6 +407,12 @@ def test_federated_recall_needs_filters_of_their_own() -> None:
     assert "recall_s: structure 'full_reset' spreads what it would take back" in message
 
 
+@pytest.mark.parametrize("kind", ['{"" = 0}', "3", "[1]", '{a = "x:y"}'])
+@pytest.mark.parametrize(("part", "key"), [("estimator.ins", "estimator[0]"), ("sensors.gnss", "sensors.gnss")])
+def test_a_kind_that_is_no_text(part: str, key: str, kind: str) -> None:
+    assert f"{key}.kind: must be text in quotes" in complaint(U_TURN, f"{part}.kind={kind}")
+
+
 def test_two_aids_of_a_kind() -> None:
     message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
     assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message
