@@ -18,8 +18,9 @@ turned from north-up-east to north-east-down.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -64,6 +65,15 @@ UNKNOWN = np.full(3, np.nan)
 NO_ATTITUDE = np.full(4, np.nan)
 NO_COVARIANCE = np.full((9, 9), np.nan)
 DEG = math.pi / 180
+Correction: TypeAlias = Callable[[Array, float], Array]  # as `limited`
+
+
+def limited(phi: Array, limit: float) -> Array:
+    """What of an attitude error ``phi`` (3,) is corrected at once: each axis by its own error, at most ``limit`` [rad].
+
+    Equation 10 (which prints the north axis' error for both level axes).
+    """
+    return np.array([min(max(error, -limit), limit) for error in phi.tolist()])
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,7 @@ class AhrsConfig:
     # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
     magnetometer_sigma: float = 30 * DEG
 
-    literal: bool = False  # equation 10 as it is printed: the east axis corrected by the north axis' error
+    correction: Correction = limited  # what of the estimated attitude error is taken out at the end of a period
 
     def __post_init__(self) -> None:
         unknown = set(self.aids) - set(KINDS.values())
@@ -369,13 +379,10 @@ class Ahrs:
         config = self.config
         if max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) >= config.correction_sigma**2:
             return
-        north, east, down = s.x[PHI : PHI + 3].tolist()
-        if config.literal:
-            east = north
+        phi = s.x[PHI : PHI + 3].copy()
         if "magnetometer" not in self._aids:
-            down = 0.0  # nothing sees the heading: what the filter thinks of it, and of its gyro, is a guess
-        limit = config.phi_limit
-        step = np.array([min(max(error, -limit), limit) for error in (north, east, down)])
+            phi[2] = 0.0  # nothing sees the heading: what the filter thinks of it, and of its gyro, is a guess
+        step = config.correction(phi, config.phi_limit)
         s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(step), s.q_nb))  # C = (I + [phi x]) C_hat
         s.x[PHI : PHI + 3] -= step
         s.correction_counter += 1

@@ -21,7 +21,7 @@ from nav.alignment import Alignment, InitialState
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
-from nav.fusion import Master, blend, combine, reset, weights_by_covariance, weights_eq13
+from nav.fusion import Master, blend, combine, reset, weights_by_covariance
 from nav.local_filter import LocalFilter
 from nav.monitor import Change, Isolation, Monitor
 from nav.reference import (
@@ -53,7 +53,7 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
-from nav.weighting import InOrder, Policy, Weight, normalised_weights
+from nav.weighting import InOrder, Policy, Weight
 
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
 LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
@@ -308,7 +308,7 @@ class Federated:
             if other is not filter_
         ]
         suspicions = np.array([monitor.suspicion, *latest])
-        N = float(normalised_weights(suspicions, np.ones(len(suspicions)), literal=self.config.literal)[0])
+        N = float(self.config.normalise(suspicions, np.ones(len(suspicions)))[0])
         if N == 1.0:
             return monitor.policy
         return Weight(N) if monitor.policy is None else InOrder([monitor.policy, Weight(N)])
@@ -445,8 +445,7 @@ class Federated:
         P = state.P[:n]
         if self._reference.scalings:
             P = np.stack([self._charted(state, row) for row in range(n)])
-        weigh = weights_eq13 if self.config.literal else weights_by_covariance
-        return combine(state.x[:n], P, self._common, members, self.config.combination, weigh)
+        return combine(state.x[:n], P, self._common, members, self.config.combination, self.config.weigh)
 
     def _charted(self, state: State, row: int) -> Array:
         """A copy of one filter's P, as the covariance of its x; by sigma points it is that of its own estimate."""

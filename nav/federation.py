@@ -82,10 +82,11 @@ import numpy as np
 
 from nav.aids.base import Aid
 from nav.error_model import ImuModel
-from nav.fusion import Combination
+from nav.fusion import Combination, Weigh, weights_by_covariance
 from nav.monitor import MonitoredAid
 from nav.samples import Array
 from nav.unscented import Scaling
+from nav.weighting import Normalise, normalised_weights
 
 Structure = Literal["no_reset", "full_reset", "partial"]
 Sharing = Literal["fixed", "by_covariance", "none"]
@@ -109,9 +110,8 @@ class Local:
 class Config:
     """What the federation is told.
 
-    ``literal`` takes the weights of the scalar combination from Zhu et al. 2020, Eq 13, as printed: they mix units, are
-    decided by the gyro biases and hardly react to a filter whose position is lost. It also takes the normalised weights
-    from Zhou et al. 2025, Eq 22-25, as printed: every R is multiplied by the number of filters when nothing is wrong.
+    ``weigh`` gives the weights of a combination other than ``information``, and ``normalise`` those of the
+    ``normalised`` weighting: functions of another rule may be handed over.
     """
 
     imu: ImuModel
@@ -121,7 +121,8 @@ class Config:
     combination: Combination = "information"
     retention: float = 0.5  # alpha of ``partial``: 0 is no reset, 1 a full one
     weighting: Weighting = "none"
-    literal: bool = False
+    weigh: Weigh = weights_by_covariance
+    normalise: Normalise = normalised_weights
     fusion_period_s: float = 1.0  # at the first aiding epoch after this; 0 is at every one
     isolate_after: int = 3  # consecutive condemned measurements
     readmit_after: int = 10  # consecutive sound measurements

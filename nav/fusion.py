@@ -62,16 +62,6 @@ def weights_by_covariance(P: Array, common: int, members: Array, shares: Array |
     return weights
 
 
-def weights_eq13(P: Array, common: int, members: Array) -> Array:
-    """Weights (filters,) of Zhu et al. 2020, Eq 13, as printed: ``|diag(P_i^-1 P_i^-T)|_F`` over their sum."""
-    norms = np.zeros(len(P))
-    for i in np.flatnonzero(members):
-        inverse = scaled_inverse(P[i], common)[0]
-        norms[i] = np.linalg.norm(np.sum(inverse * inverse, axis=1))
-    weights: Array = norms / norms.sum()
-    return weights
-
-
 @njit
 def _information(x: Array, P: Array, common: int, weights: Array) -> tuple[Array, Array]:
     """(x_g, P_g) with ``P_g^-1 = sum w_i P_i^-1`` over the filters whose covariance is definite and w_i positive."""

@@ -31,9 +31,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -43,7 +43,8 @@ from nav.kalman import invert
 from nav.samples import Array
 
 TOLERANCE = 1e-7  # of the distance, relative to its limit
-ITERATIONS = 200  # only the literal form needs as many; the others end long before
+ITERATIONS = 200  # a bound: a handful is usual
+Normalise: TypeAlias = Callable[[Array, Array], Array]  # as `normalised_weights`: statistics, thresholds; weights
 R_FLOOR, R_CEILING = 0.25, 100.0  # of the nominal variance, between which `SageHusa` may go
 
 
@@ -67,48 +68,51 @@ class Gate:
 
 
 @njit
-def inflation(nu: Array, HPH: Array, R: Array, limit: float, reciprocal: bool, literal: bool) -> tuple[float, int]:
-    """(lambda, iterations) with ``theta(lambda) = nu' (H P H' + lambda R)^-1 nu = limit``; lambda = 1 when it is less.
+def inflated_distance(nu: Array, HPH: Array, R: Array, lam: float) -> tuple[float, float]:
+    """(nu' y, y' R y), ``y = (H P H' + lambda R)^-1 nu``: the squared distance, and how fast it falls with lambda.
 
-    Newton's method from 1, with ``y = (H P H' + lambda R)^-1 nu`` and ``theta' = -y' R y``:
-
-    on theta:    lambda += (theta - limit) / (y' R y)                           (Eq 12, with its fraction put right)
-    on 1/theta:  lambda += (1/limit - 1/theta) theta^2 / (y' R y)               (``reciprocal``)
-
-    theta is convex and 1/theta concave, so both come from the left and theta stays over the limit until it is within
-    `TOLERANCE` of it. The reciprocal takes one step when H P H' is proportional to R. ``literal`` is Eq 12 as printed,
-    the fraction upside down: it ends at the root by chance only. NaN when S is not positive definite, and when there is
-    no R to inflate.
+    The distance is NaN when that covariance is not positive definite.
     """
     m = len(nu)
     S = np.empty((m, m))
+    for i in range(m):
+        for j in range(m):
+            S[i, j] = HPH[i, j]
+        S[i, i] += lam * R[i]
+    inverse, definite = invert(S)
+    theta, slope = 0.0, 0.0
+    for i in range(m):
+        y = 0.0
+        for j in range(m):
+            y += inverse[i, j] * nu[j]
+        theta += nu[i] * y
+        slope += R[i] * y * y
+    return theta if definite else math.nan, slope
+
+
+@njit
+def inflation(nu: Array, HPH: Array, R: Array, limit: float) -> tuple[float, int]:
+    """(lambda, iterations) with ``theta(lambda) = nu' (H P H' + lambda R)^-1 nu = limit``; lambda = 1 when it is less.
+
+    Newton's method on 1/theta from 1, with ``y = (H P H' + lambda R)^-1 nu`` and ``theta' = -y' R y``:
+
+    lambda += (1/limit - 1/theta) theta^2 / (y' R y)
+
+    1/theta is concave, so lambda comes from the left and theta stays over the limit until it is within `TOLERANCE` of
+    it; one step does when H P H' is proportional to R. (Eq 12 takes theta itself, which takes more steps.) NaN when S
+    is not positive definite, and when there is no R to inflate.
+    """
     lam = 1.0
     for iteration in range(ITERATIONS):
-        for i in range(m):
-            for j in range(m):
-                S[i, j] = HPH[i, j]
-            S[i, i] += lam * R[i]
-        inverse, definite = invert(S)
-        theta, slope = 0.0, 0.0
-        for i in range(m):
-            y = 0.0
-            for j in range(m):
-                y += inverse[i, j] * nu[j]
-            theta += nu[i] * y
-            slope += R[i] * y * y
-        if not (definite and math.isfinite(theta)):
+        theta, slope = inflated_distance(nu, HPH, R, lam)
+        if not math.isfinite(theta):
             return math.nan, iteration
         excess = theta - limit
         if excess <= (TOLERANCE * limit if lam > 1.0 else 0.0):
             return lam, iteration
         if slope == 0.0:
             return math.nan, iteration
-        if literal:
-            lam += slope / excess
-        elif reciprocal:
-            lam += excess * theta / (limit * slope)
-        else:
-            lam += excess / slope
+        lam += excess * theta / (limit * slope)
     return lam, ITERATIONS
 
 
@@ -123,8 +127,6 @@ class MahalanobisInflation:
 
     false_alarm: float = 0.01
     reject_above: float = math.inf
-    reciprocal: bool = True
-    literal: bool = False
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
         """See `Policy`."""
@@ -134,31 +136,24 @@ class MahalanobisInflation:
             return R
         if not theta <= self.reject_above:
             return np.full_like(R, np.inf)
-        lam, _ = inflation(nu, S - np.diag(R), R, limit, self.reciprocal, self.literal)
+        lam, _ = inflation(nu, S - np.diag(R), R, limit)
         return lam * R if math.isfinite(lam) else np.full_like(R, np.inf)
 
 
-def normalised_weights(
-    statistics: Array, thresholds: Array, lower: float = 0.2, upper: float = 0.9, literal: bool = False
-) -> Array:
+def normalised_weights(statistics: Array, thresholds: Array, lower: float = 0.2, upper: float = 0.9) -> Array:
     """Weights N of several sensors from their detectors' ``statistics`` (J,) or, axis by axis, (J, m); same shape.
 
     B_j = 1 - statistic_j / threshold_j says how far sensor j is from an alarm (Eq 22), and
 
-    N_j = B_j / max B                                                           (Eq 24 has the sum: see below)
+    N_j = B_j / max B                                                           (Eq 24 has the sum instead)
 
     with N = 0 (left out) where B is at most ``lower`` or no number, and N = 1 where B is at least ``upper`` (Eq 23).
     R_j = R0_j / N_j: see `Weight`. The best sensor keeps its R, and a sensor that is alone is never weakened.
-
-    ``literal`` is Eq 22-25 as printed, without limits: N_j = B_j / sum B is 1/J for J healthy sensors, which
-    multiplies every R by J although nothing is wrong.
     """
     health = 1.0 - np.asarray(statistics, dtype=float) / thresholds
-    lowest = 0.0 if literal else lower
-    health = np.where(health > lowest, health, 0.0)
-    whole = health.sum(axis=0) if literal else health.max(axis=0)
-    N: Array = health / np.where(whole > 0.0, whole, 1.0)
-    return N if literal else np.where(health < upper, N, 1.0)
+    health = np.where(health > lower, health, 0.0)
+    best = health.max(axis=0)
+    return np.where(health < upper, health / np.where(best > 0.0, best, 1.0), 1.0)
 
 
 @dataclass
@@ -190,13 +185,9 @@ class SageHusa:
     Behind a gate of 1e-3 that judges by what has been learned, a sensor twice as noisy as it says is known to be so
     after some tens of samples, one four times as noisy after a hundred or so: the few that pass open the gate. In a
     federation a sensor that was isolated before teaches nothing, and stays so.
-
-    ``literal`` is the mean of nu nu' - sum Wc (z - Z_j)(z - Z_j)' as printed, whose sum has the measurement where the
-    mean of the sigma points belongs: it is -H P- H' whatever was measured, and R becomes negative.
     """
 
     b: float = 0.98
-    literal: bool = False
     ratio: Array | None = field(default=None, init=False)  # (m,) learned variance / nominal variance
     _taken: Array = field(default_factory=lambda: np.zeros(1), init=False)  # (m,) that have taught
     _R: Array = field(default_factory=lambda: np.ones(1), init=False)  # nominal, of the last sample
@@ -229,10 +220,8 @@ class SageHusa:
         taught = np.isfinite(left)
         self._taken = self._taken + taught
         d = (1.0 - self.b) / (1.0 - self.b ** (self._taken + 1.0))
-        latest = -np.diag(HPH) if self.literal else left**2 * (self.ratio * self._R / used) + np.diag(after)
-        learned = (1.0 - d) * self.ratio + d * latest / self._R
-        if not self.literal:
-            learned = np.clip(learned, R_FLOOR, R_CEILING)
+        latest = left**2 * (self.ratio * self._R / used) + np.diag(after)
+        learned = np.clip((1.0 - d) * self.ratio + d * latest / self._R, R_FLOOR, R_CEILING)
         self.ratio = np.where(taught, learned, self.ratio)
 
 
@@ -297,15 +286,11 @@ class Fading:
     """The factor on P that makes it as large as the last innovations say (Cheng et al. 2020, Eq 31-36).
 
     Divergence: nu' S^-1 nu > ``alpha`` m. Then lambda = max(1, tr(S^-1 C) / m), with C the mean of nu nu' over the
-    last ``window`` samples. Both are free of units.
-
-    ``literal`` compares nu' nu with alpha tr(S) and takes tr(C) / tr(S): sums of m^2, (m/s)^2 and rad^2, in which a
-    position hides whatever heading does.
+    last ``window`` samples. Both are free of units, where Eq 31 and 33 add m^2, (m/s)^2 and rad^2.
     """
 
     window: int = 10
     alpha: float = 1.5
-    literal: bool = False
     _taken: deque[Array] = field(default_factory=deque, init=False)
 
     def factor(self, nu: Array, S: Array) -> float:
@@ -318,8 +303,7 @@ class Fading:
         if len(self._taken) > self.window:
             self._taken.popleft()
         rows = np.array(self._taken)
-        distances = np.sum(rows**2, axis=1) if self.literal else np.sum(rows * np.linalg.solve(S, rows.T).T, axis=1)
-        expected = float(np.trace(S)) if self.literal else len(nu)
-        if not distances[-1] > self.alpha * expected:
+        distances = np.sum(rows * np.linalg.solve(S, rows.T).T, axis=1)
+        if not distances[-1] > self.alpha * len(nu):
             return 1.0
-        return max(1.0, float(distances.mean()) / expected)
+        return max(1.0, float(distances.mean()) / len(nu))

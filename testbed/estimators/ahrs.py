@@ -71,7 +71,6 @@ class AhrsSection(EstimatorSection):
     levelling: bool = Field(default=True, description="false: once it has begun, it goes by its gyros alone")
     level: LevelSection | None = Field(default=None, description="how it levels; none: as light turbulence wants")
     autopilot: bool = Field(default=False, description="true: it levels only while level flight is commanded")
-    literal: bool = Field(default=False, description="as printed: Jiang et al. 2021, equation 10")
 
     @property
     def attitude_only(self) -> bool:
@@ -111,10 +110,14 @@ class FlightControl:
 
 
 def build(section: AhrsSection, rig: Rig) -> Lane:
-    """Attitude alone. It is told its area of operation, and its heading where no magnetometer finds it."""
+    """Attitude alone."""
+    return lane(section, rig, configuration(section, rig))
+
+
+def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
+    """What the filter is told: its area of operation too, and its heading where no magnetometer finds it."""
     errors, site = rig.imu(section.imu).errors(), rig.site
     aids = {rig.sensors[name].kind: rig.sensors[name] for name in section.aids}
-    field_n = geomagnetic_field_n(site.lat, site.lon, site.h, site.date)
     config = AhrsConfig(
         imu_model(errors, rig.turn_rate(section.turn_degps), usual=rig.usual),
         site.lat,
@@ -122,7 +125,6 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
         tuple(aids),
         airspeed_sigma=rig.gust_mps(section.gust_mps),
         force_sigma=LEVELLING_FORCE,
-        literal=section.literal,
     )
     level = section.level
     if level is not None:
@@ -146,9 +148,15 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
         iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * rig.usual.current_a)
         turn_s = IRON_TURN_S * (UNKNOWN_BODY.turn_rate_radps / rig.usual.turn_rate_radps)
         lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * turn_s * magnetometer.rate_hz)
+        field_n = _field_n(rig)
         level_field = math.hypot(field_n[0], field_n[1])
         config = replace(config, magnetometer_sigma=math.hypot(m.noise, lasting) / level_field)
-    ahrs = Ahrs(config, field_n)
+    return config
+
+
+def lane(section: AhrsSection, rig: Rig, config: AhrsConfig) -> Lane:
+    """The estimator of a ``section`` that is told ``config``."""
+    ahrs = Ahrs(config, _field_n(rig))
     imus, voter = mountings(section, rig)
     return Lane(
         FusionHorizon(ahrs, rig.lag_s(section.aids), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
@@ -157,3 +165,8 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
         voter=voter,
         commanded=FlightControl(ahrs).tell if section.autopilot else None,
     )
+
+
+def _field_n(rig: Rig) -> Array:
+    """The reference magnetic field of the area of operation, NED [T]."""
+    return geomagnetic_field_n(rig.site.lat, rig.site.lon, rig.site.h, rig.site.date)

@@ -20,7 +20,6 @@ from nav.detection import (
     Reset,
     Sprt,
     WindowMean,
-    eq20,
     exponential,
     plain,
 )
@@ -64,11 +63,11 @@ class DetectorSection(Section):
         lt=0.5,
         description="probability per sample without a fault; none: 1e-3 of one look, 1e-6 of gathered evidence",
     )
-    mean: Literal["plain", "window", "exponential", "eq20"] = Field(
-        default="exponential", description="sprt: of what it has gathered; eq20 as Zhou et al. 2025 print it"
+    mean: Literal["plain", "window", "exponential"] = Field(
+        default="exponential", description="sprt: of what it has gathered"
     )
     forgetting: float = Field(
-        default=0.95, gt=0, lt=1, description="sprt, mean exponential or eq20: what a look leaves of the weight before"
+        default=0.95, gt=0, lt=1, description="sprt, mean exponential: what a sample leaves of the weight before"
     )
     reset: Literal["none", "fast", "complete"] = Field(default="complete", description="sprt: when a fault seems over")
     window_s: float = Field(
@@ -82,7 +81,7 @@ class DetectorSection(Section):
     def _own_keys(self) -> Self:
         for key, kinds, means in (
             ("mean", ("sprt",), ()),
-            ("forgetting", ("sprt",), ("exponential", "eq20")),
+            ("forgetting", ("sprt",), ("exponential",)),
             ("reset", ("sprt",), ()),
             ("window_s", ("glr", "sprt"), ("window",)),
         ):
@@ -108,9 +107,6 @@ class PolicySection(Section):
     false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="inflate: of the limit, probability per look")
     reject_above: float | None = Field(
         default=None, gt=0, description="inflate: squared distance to leave out; none: never"
-    )
-    solver: Literal["reciprocal", "newton"] = Field(
-        default="reciprocal", description="inflate: Newton's method on the distance's reciprocal, or on itself"
     )
     b: float = Field(default=0.97, ge=0.5, lt=1, description="sage_husa: forgetting factor per look")
 
@@ -168,10 +164,6 @@ class FederatedSection(EstimatorSection):
         default=None, ge=1, le=600, description="isolated, a filter goes back by this; none: to the others' solution"
     )
     cross_check: bool = Field(default=False, description="of the local filters with each other; needs no_reset")
-    literal: bool = Field(
-        default=False,
-        description="as printed: Zhu et al. 2020, equation 13; Zhou et al. 2025, equations 22-25",
-    )
 
     def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
         """What is wrong with it among these sensors."""
@@ -206,6 +198,11 @@ class FederatedSection(EstimatorSection):
 
 def build(section: FederatedSection, rig: Rig) -> Lane:
     """Local filters, each told of its own sensors as an INS would be."""
+    return lane(section, rig, configuration(section, rig))
+
+
+def configuration(section: FederatedSection, rig: Rig) -> Config:
+    """What the federation is told."""
     errors = rig.imu(section.imu).errors()
 
     def aid(name: str) -> Aid:
@@ -232,32 +229,35 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
         )
         for local in section.locals
     )
-    federated = Federated(
-        Config(
-            imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
-            local_filters,
-            structure=section.structure,
-            sharing=section.sharing,
-            combination=section.combination,
-            retention=section.retention,
-            weighting=section.weighting,
-            literal=section.literal,
-            fusion_period_s=section.fusion_period_s,
-            isolate_after=section.isolate_after,
-            readmit_after=section.readmit_after,
-            recall_s=section.recall_s,
-            cross_check=section.cross_check,
-            mounting_sigma=errors.accel_misalignment,
-            alignment_aids=tuple(aids.values()),
-        ),
-        partial(geomagnetic_field_n, date=rig.site.date),
+    return Config(
+        imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
+        local_filters,
+        structure=section.structure,
+        sharing=section.sharing,
+        combination=section.combination,
+        retention=section.retention,
+        weighting=section.weighting,
+        fusion_period_s=section.fusion_period_s,
+        isolate_after=section.isolate_after,
+        readmit_after=section.readmit_after,
+        recall_s=section.recall_s,
+        cross_check=section.cross_check,
+        mounting_sigma=errors.accel_misalignment,
+        alignment_aids=tuple(aids.values()),
     )
+
+
+def lane(section: FederatedSection, rig: Rig, config: Config) -> Lane:
+    """The estimator of a ``section`` that is told ``config``."""
+    federated = Federated(config, partial(geomagnetic_field_n, date=rig.site.date))
+    used = tuple(aid.sensor for aid in config.alignment_aids)
     imus, voter = mountings(section, rig)
+    imu = rig.imu(section.imu)
     return Lane(
-        FusionHorizon(federated, rig.lag_s(used), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
+        FusionHorizon(federated, rig.lag_s(used), coning=imu.rate_hz < rig.tick_rate_hz),
         imus,
-        tuple(used),
-        handover_errors(section.name, section.handover, errors.lever_arm_b, rig.seed),
+        used,
+        handover_errors(section.name, section.handover, imu.errors().lever_arm_b, rig.seed),
         voter,
     )
 
@@ -286,8 +286,6 @@ def _mean(section: DetectorSection) -> Mean:
             return WindowMean(section.window_s)
         case "exponential":
             return exponential(section.forgetting)
-        case "eq20":
-            return eq20(section.forgetting)
 
 
 def _policy(section: PolicySection | None) -> Callable[[], Policy] | None:
@@ -296,6 +294,4 @@ def _policy(section: PolicySection | None) -> Callable[[], Policy] | None:
         return None
     if section.kind == "sage_husa":
         return partial(SageHusa, section.b)
-    return partial(
-        MahalanobisInflation, section.false_alarm, section.reject_above or math.inf, section.solver == "reciprocal"
-    )
+    return partial(MahalanobisInflation, section.false_alarm, section.reject_above or math.inf)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 from testbed import plugins
 from testbed.errors import UserError, choice, shown
@@ -27,6 +27,7 @@ BUILT_IN: Mapping[str, Kind] = {
     "federated": Kind(federated.FederatedSection, federated.build),
     "ahrs": Kind(ahrs.AhrsSection, ahrs.build),
 }
+Build: TypeAlias = Callable[[Sequence[EstimatorSection], Rig], dict[str, Lane]]  # as `build`
 CUSTOM = Kind(custom.CustomSection, custom.build)
 
 

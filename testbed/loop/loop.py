@@ -71,6 +71,7 @@ def run(
     source: MotionSource | None = None,
     controls: Sequence[Callable[[], Sequence[Request]]] = (),
     replay: Sequence[tuple[float, Recorded]] = (),
+    build: registry.Build = registry.build,
 ) -> RunResult:
     """Fly, sense, estimate and record one scenario.
 
@@ -78,9 +79,9 @@ def run(
     metrics.json beside it; without, everything stays in memory. ``links`` watch the estimator ``shown``, the first
     unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
     ``source`` replaces the motion, to share one flown truth between runs. Links and ``controls`` may make requests
-    (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. Same scenario, seed and
-    requests, same bits. Raises UserError when the folder can't be written, the motion can't be started, or the seed or
-    ``shown`` is none.
+    (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. ``build`` makes the estimators
+    of their sections, in place of `registry.build`. Same scenario, seed and requests, same bits. Raises UserError when
+    the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
     with ExitStack() as ending:
         for link in links:
@@ -89,7 +90,7 @@ def run(
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
-        setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source)
+        setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
             require_own(setup.out, [RECORD, METRICS])
@@ -99,7 +100,7 @@ def run(
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
             rehearsal = scenario.model_copy(update={"duration_s": min(REHEARSAL_S, scenario.duration_s)})
-            _fly(rehearsal, Setup(seed), Director(scenario, (), (), None, rate_hz))
+            _fly(rehearsal, Setup(seed, build=build), Director(scenario, (), (), None, rate_hz))
         flown = None
         while flown is None:
             with suppress(Restarted):
@@ -121,6 +122,7 @@ class Setup:
     shown: str | None = None
     progress: Callable[[Progress], None] | None = None
     source: MotionSource | None = None
+    build: registry.Build = registry.build
 
 
 class _Flown(NamedTuple):
@@ -173,7 +175,7 @@ class _Passage:
         self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), max(1, round(EVENTS_S * rate_hz)), publish)
         self.batch = round(BATCH_S * rate_hz)
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
-        self.lanes = registry.build(scenario.estimator, scenario.rig(setup.seed))
+        self.lanes = setup.build(scenario.estimator, scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
         self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead)
         ending.callback(self.feed.close)

@@ -74,7 +74,7 @@ def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
         ('{name="a", aids=["gnss"], levelling=false}', "levelling: is a key of kind 'ahrs', not of 'ins'"),
         ('{name="a", aids=["gnss"], level={}}', "level: is a key of kind 'ahrs', not of 'ins'"),
         ('{name="a", kind="ahrs", aids=[], heading_deg=0, level={test="nrm"}}', 'level.test: can\'t be "nrm"'),
-        ('{name="a", aids=["gnss"], literal=true}', "literal: is a key of kind 'federated' or 'ahrs', not of 'ins'"),
+        ('{name="a", kind="ahrs", aids=[], heading_deg=3, literal=true}', "literal: unknown key"),
         ('{name="a", kind="ahrz", aids=[]}', 'kind: there is no kind "ahrz": did you mean ahrs'),
     ],
 )
@@ -90,8 +90,6 @@ def test_it_is_told_the_datasheets() -> None:
     assert told.imu.gyro_bias_sigma >= math.radians(40) / 3600
     assert (told.lat, told.h, told.heading) == (math.radians(47.0), 300.0, math.pi / 2)
     assert told.aids == ()
-    assert not told.literal
-    assert config('{name="a", kind="ahrs", aids=[], heading_deg=0, literal=true}').literal
     # hard iron of 0.5 uT in about 21 uT of horizontal field is 1.4 deg; 15 s of it at 10 Hz, as white noise: times 17
     assert 0.3 < config(AHRS).magnetometer_sigma < 0.6
     strong = config(AHRS, overrides=("sensors.magnetometer.hard_iron_ut=5.0",))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from worlds.lanes import lanes
 
 from nav.aids import AirspeedAid, GnssAid
-from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, eq20, exponential, plain
+from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, exponential, plain
 from nav.earth import position_difference_n
 from nav.federated import Federated
 from nav.ins import Ins
@@ -313,7 +313,7 @@ def test_a_federation_is_told_of_each_sensor() -> None:
         ('mean="plain"', plain()),
         ('mean="window", window_s=7.0', WindowMean(7.0)),
         ('mean="exponential", forgetting=0.8', exponential(0.8)),
-        ('mean="eq20", forgetting=0.8, reset="fast"', eq20(0.8)),
+        ('mean="exponential", forgetting=0.8, reset="fast"', exponential(0.8)),
         ('reset="none"', exponential(0.95)),
     ],
 )
@@ -339,7 +339,7 @@ def test_a_local_filter_has_its_own_engine_and_policy() -> None:
     keys = [
         "estimator[0].locals[0].engine='unscented'",
         "estimator[0].locals[0].policy={kind='sage_husa', b=0.9}",
-        "estimator[0].locals[1].policy={kind='inflate', solver='newton', reject_above=50.0}",
+        "estimator[0].locals[1].policy={kind='inflate', reject_above=50.0}",
     ]
     federated = lanes(Scenario.load("u_turn", [*FEDERATED, *keys]), 0)["fed"].horizon.estimator
     assert isinstance(federated, Federated)
@@ -348,7 +348,7 @@ def test_a_local_filter_has_its_own_engine_and_policy() -> None:
     assert one.sensors[0].policy is not None
     assert two.sensors[0].policy is not None
     assert one.sensors[0].policy() == SageHusa(0.9)
-    assert two.sensors[0].policy() == MahalanobisInflation(0.01, 50.0, reciprocal=False)
+    assert two.sensors[0].policy() == MahalanobisInflation(0.01, 50.0)
     assert [monitor.noise is not None for monitor in federated.locals[0].monitors.values()] == [True, True]
     assert air.sensors[0].policy is None
 

@@ -14,10 +14,13 @@ from worlds.ahrs import (
     LAT,
     NOISELESS,
     PAPER,
+    SEEDS,
     TURN,
     airspeed,
     errors,
+    fly,
     imu,
+    level_figures,
     level_flight,
     run,
     tilted,
@@ -33,7 +36,6 @@ from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, BarometerSample, ImuSamples, MagnetometerSample, Status
 
 FIELD_N = np.array([28e-6, -4e-6, 40e-6])
-SEEDS = range(4)
 NEVER = LowDynamics(yaw_rate_limit=-1.0)
 INERTIAL = replace(PAPER, motion=NEVER, compensated_motion=NEVER)
 COMPENSATED = replace(PAPER, aids=("airspeed",))
@@ -264,17 +266,6 @@ def test_prediction_is_the_future_and_changes_nothing():
 # --- the U flight: 50 m/s, half a turn at 3 deg/s, 40 deg/h, 2 mg, gusts of 0.15 m/s^2
 
 
-def fly(config, tilt_deg=0.5, turn_degps=3.0, turn=TURN, samples=()):
-    truth = level_flight(turn_degps, turn)
-    return [run(config, truth, imu(truth, seed), samples, tilt_deg) for seed in SEEDS]
-
-
-def level_figures(runs):
-    """Largest level error after 60 s and RMS of the worse axis [deg], each the mean over the seeds."""
-    late = [error[t > 60, :2] for t, error, _, _ in runs]
-    return np.mean([np.abs(e).max() for e in late]), np.mean([rms(e).max() for e in late])
-
-
 def accepted(report_lists, start, stop):
     return [sum(r.aid == "level" and start < r.t <= stop for r in reports) for reports in report_lists]
 
@@ -363,13 +354,6 @@ def test_an_unnoticed_slow_turn():
     assert plain > 2.0
     assert compensated < 1.0
     assert min(accepted([reports for *_, reports in runs], *SLOW_TURN)) > 300
-
-
-def test_equation_10_as_printed_never_levels_the_east_axis():
-    runs = fly(replace(PAPER, literal=True))
-    largest, _ = level_figures(runs)
-    print(f"literal equation 10: max {largest:.2f} deg")
-    assert largest > 2.0
 
 
 def test_counters():

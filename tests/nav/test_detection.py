@@ -1,21 +1,22 @@
-"""The detectors against least squares, exact distributions and brute force, and what the papers' printed forms do."""
+"""The detectors against least squares, exact distributions and brute force."""
 
 import itertools
 
 import numpy as np
 import pytest
 from scipy import stats
+from worlds.innovations import alarm_share, positive, within_binomial
 
 from nav.detection import (
     ChiSquare,
     Eraim,
     Event,
     Glr,
+    Recursive,
     Reset,
     Sprt,
     WindowMean,
     chi_square_threshold,
-    eq20,
     exponential,
     glr_false_alarm,
     glr_threshold,
@@ -24,26 +25,15 @@ from nav.detection import (
     whiten,
 )
 
-MEANS = {"plain": plain, "exponential": lambda: exponential(0.9), "eq20": lambda: eq20(0.85)}
-MEANS["window"] = lambda: WindowMean(8.0)
+MEANS = {"plain": plain, "exponential": lambda: exponential(0.9), "window": lambda: WindowMean(8.0)}
 
 DETECTORS = {
     "chi-square": lambda: ChiSquare(1e-3),
     "eraim": lambda: Eraim(1e-3),
     "sprt": lambda: Sprt(1e-3, exponential(0.9), Reset.COMPLETE),
-    "signed": lambda: Sprt(1e-3, exponential(0.9), Reset.FAST, signed=True),
+    "recursive": lambda: Sprt(1e-3, exponential(0.9), Reset.FAST, Recursive()),
     "glr": lambda: Glr(1e-3),
 }
-
-
-def positive(rng, m):
-    root = rng.normal(size=(m, m))
-    return root @ root.T + 0.1 * np.eye(m)
-
-
-def within_binomial(count, looks, p, sigmas=4.0):
-    """Whether ``count`` of ``looks`` is what the probability ``p`` gives."""
-    return abs(count - looks * p) <= sigmas * np.sqrt(looks * p * (1 - p))
 
 
 # --- one look ---------------------------------------------------------------------------------------------------------
@@ -107,18 +97,6 @@ def test_chi_square_false_alarms(m):
             L = np.linalg.cholesky(S)
         alarms += detector.step(L @ rng.normal(size=m), S, float(k)).alarm
     assert within_binomial(alarms, looks, p)
-
-
-def test_literal_distance_against_a_chi_square_quantile_misses_ten_sigma():
-    right, literal = ChiSquare(1e-3), ChiSquare(1e-3, literal=True)
-    least = {d.literal: min(x for x in np.arange(0, 15, 0.01) if not d.passes(x * x, 1)) for d in (right, literal)}
-    assert least[False] == pytest.approx(3.29, abs=0.02)
-    assert least[True] == pytest.approx(10.83, abs=0.02)
-    ten = np.array([10.0])
-    assert right.step(ten, np.eye(1), 0.0).alarm
-    decision = literal.step(ten, np.eye(1), 0.0)
-    assert not decision.alarm
-    assert decision.statistic == pytest.approx(10.0)
 
 
 # --- ERAIM: least squares over the measurement and the prediction -----------------------------------------------------
@@ -213,20 +191,6 @@ def test_window_is_of_time():
     assert mean.n == 1
 
 
-def test_literal_eq20_never_forgets():
-    """Its weights grow as a power of age, i^(1/s - 1); 200 looks later an old fault is a third of the mean."""
-    one = np.ones((2, 1))
-    literal, forgetting = eq20(0.9), exponential(0.95)
-    for k in range(300):
-        for mean in (literal, forgetting):
-            mean.add(one if k < 100 else 0 * one, float(k))
-    assert literal.value[0, 0] == pytest.approx((100 / 300) ** (1 / 0.9), rel=0.01)
-    assert forgetting.value[0, 0] < 1e-4
-    first = eq20(0.9)
-    first.add(one, 0.0)
-    assert first.value[0, 0] > 1.1  # more than the sample itself
-
-
 @pytest.mark.parametrize("name", MEANS)
 def test_quadratic_evidence_has_the_stated_rate(name):
     rng = np.random.default_rng(7)
@@ -243,52 +207,13 @@ def test_quadratic_evidence_has_the_stated_rate(name):
     assert within_binomial(alarms, runs, p)
 
 
-def test_signed_evidence_keeps_within_the_stated_rate():
+def test_recursive_evidence_keeps_within_the_stated_rate():
     rng = np.random.default_rng(8)
     p, runs, looks = 0.02, 100, 200
-    share = np.mean([alarm_share(Sprt(p, exponential(0.95), signed=True), rng, 3, looks) for _ in range(runs)])
+    share = np.mean([alarm_share(Sprt(p, exponential(0.95), evidence=Recursive()), rng, 3, looks) for _ in range(runs)])
     assert share <= p
-    ever = [alarm_share(Sprt(p, plain(), signed=True), rng, 3, looks) > 0 for _ in range(runs)]
+    ever = [alarm_share(Sprt(p, plain(), evidence=Recursive()), rng, 3, looks) > 0 for _ in range(runs)]
     assert np.mean(ever) <= p + 4 * np.sqrt(p / runs)  # Ville's inequality: at any look
-
-
-def alarm_share(detector, rng, m, looks):
-    """Share of alarms in unit white residuals."""
-    S, x = np.eye(m), rng.normal(size=(looks, m))
-    return np.mean([detector.step(x[k], S, 0.2 * k).alarm for k in range(looks)])
-
-
-def test_literal_signed_evidence_with_its_own_sample_alarms_without_a_fault():
-    rng = np.random.default_rng(9)
-    share = {
-        literal: np.mean(
-            [alarm_share(Sprt(1e-3, eq20(0.9), signed=True, literal=literal), rng, 3, 200) for _ in range(40)]
-        )
-        for literal in (True, False)
-    }
-    assert share[True] > 0.5
-    assert share[False] <= 1e-3
-
-
-def test_literal_wald_limit_is_too_low_for_vectors():
-    assert Sprt(1e-3, plain(), literal=True).threshold(6) == pytest.approx(6.907, abs=1e-3)
-    limits = [Sprt(1e-3, plain()).threshold(m) for m in (1, 2, 3, 6)]
-    np.testing.assert_allclose(limits, [5.41, 6.91, 8.13, 11.23], atol=0.006)
-    rng = np.random.default_rng(10)
-    looks = 4000
-    share = np.mean([Sprt(1e-3, plain(), literal=True).step(rng.normal(size=6), np.eye(6), 0.0).alarm
-                     for _ in range(looks)])  # fmt: skip
-    assert within_binomial(looks * share, looks, 3.2e-2)  # instead of 1e-3
-
-
-def test_literal_count_makes_the_exponential_mean_deaf():
-    """n -> 1/(1 - s) is half of what the weights are worth, (1 + s)/(1 - s): half the quantile for 5 % gives 0.6 %."""
-    detector, literal = Sprt(0.05, exponential(0.95)), Sprt(0.05, exponential(0.95), literal=True)
-    one = np.array([1.0])
-    for k in range(300):
-        right, printed = detector.step(one, np.eye(1), float(k)), literal.step(one, np.eye(1), float(k))
-    assert right.statistic == pytest.approx(39 / 2, rel=1e-3)
-    assert printed.statistic == pytest.approx(20 / 2, rel=1e-3)
 
 
 # --- resets -----------------------------------------------------------------------------------------------------------
@@ -316,28 +241,15 @@ def test_complete_reset_starts_again_from_the_look():
     assert detector.mean.n == pytest.approx((1 - 0.95**60) / 0.05)
 
 
-def test_fast_reset_lasts_in_the_signed_form_only():
+def test_fast_reset_lasts_with_recursive_evidence_only():
     decisions, _ = after_a_fault(reset=Reset.FAST)
     kept, _ = after_a_fault()
     assert decisions[101].statistic == kept[101].statistic
-    signed, _ = after_a_fault(reset=Reset.FAST, signed=True)
-    assert not any(d.alarm for d in signed[100:])
-    assert min(d.statistic for d in signed[100:]) < -20  # the next fault has to climb out of this first
-    again, _ = after_a_fault(reset=Reset.COMPLETE, signed=True)
+    recursive, _ = after_a_fault(reset=Reset.FAST, evidence=Recursive())
+    assert not any(d.alarm for d in recursive[100:])
+    assert min(d.statistic for d in recursive[100:]) < -20  # the next fault has to climb out of this first
+    again, _ = after_a_fault(reset=Reset.COMPLETE, evidence=Recursive())
     assert min(d.statistic for d in again[100:]) == 0.0
-
-
-def test_literal_distance_lets_the_reset_fire_inside_a_fault():
-    def ends(end_test):
-        rng, count = np.random.default_rng(3), 0
-        for _ in range(60):
-            detector = Sprt(1e-3, exponential(0.95), Reset.COMPLETE, end_test=end_test, literal=True)
-            x = rng.normal(size=(300, 1)) + np.where(np.arange(300) < 200, 0.0, 5.0)[:, None]
-            count += sum(detector.step(x[k], np.eye(1), 0.2 * k).event is Event.END for k in range(300))
-        return count / 60
-
-    assert ends(ChiSquare(1e-3)) == pytest.approx(2.9, abs=0.5)
-    assert ends(ChiSquare(1e-3, literal=True)) == pytest.approx(5.2, abs=0.5)
 
 
 # --- generalised likelihood ratio -------------------------------------------------------------------------------------
@@ -411,7 +323,7 @@ def test_units_do_not_matter_even_if_they_change(name):
         assert (a.axis_mask == b.axis_mask).all()
 
 
-@pytest.mark.parametrize("name", ["eraim", "sprt", "signed", "glr"])
+@pytest.mark.parametrize("name", ["eraim", "sprt", "recursive", "glr"])
 def test_the_faulty_axes_are_named(name):
     rng = np.random.default_rng(13)
     S = np.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.2], [0.1, 0.2, 0.5]])
@@ -436,6 +348,5 @@ def test_a_fault_that_no_axis_shows_takes_out_all():
 
 @pytest.mark.parametrize("s", [0.0, 1.0, 1.5])
 def test_forgetting_factor_is_checked(s):
-    for build in (exponential, eq20):
-        with pytest.raises(ValueError, match="forgetting"):
-            build(s)
+    with pytest.raises(ValueError, match="forgetting"):
+        exponential(s)

@@ -6,16 +6,16 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from worlds.covariances import position_and_its_error, scaled_eigenvalues
+from worlds.covariances import lost_position, position_and_its_error, scaled_eigenvalues
 from worlds.federated import DETECTORS, differ, field, fly, horizontal, ramp, three, true_start, world
 from worlds.ins import CONSUMER, DEG, DT, error, feed, gnss
 
 from nav.aids import BarometerAid, GnssAid, MagnetometerAid
 from nav.detection import Decision, Event
-from nav.error_model import POS, VEL
+from nav.error_model import POS
 from nav.federated import Federated
 from nav.federation import Config, Local
-from nav.fusion import blend, combine, reset, weights_by_covariance, weights_eq13
+from nav.fusion import blend, combine, reset, weights_by_covariance
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import LocalFilter
@@ -187,14 +187,6 @@ def test_blend_goes_from_own_to_shared():
     np.testing.assert_allclose(blend(x, P, x_g, P_g, 0.5)[1], half, rtol=1e-9)
 
 
-def lost_position():
-    """A Doppler filter with 10 m, and one that lost its transponder and drifted to 185 m, alike in all else."""
-    sigma = np.r_[np.full(3, 1e-4), np.full(3, 0.05), np.full(3, 10.0), np.full(3, 5e-8), np.full(3, 2e-4)]
-    other = sigma.copy()
-    other[POS : POS + 3], other[VEL : VEL + 3] = 185.0, 0.3
-    return np.stack([np.diag(sigma**2), np.diag(other**2)])
-
-
 def test_a_reset_keeps_the_covariance_positive():
     """An aid known to half a millimetre given a position lost by kilometres; a sixth of these was indefinite."""
     for seed in range(40):
@@ -206,15 +198,14 @@ def test_a_reset_keeps_the_covariance_positive():
         np.testing.assert_allclose(P[:3, :3], P_g, rtol=1e-9)
 
 
-def test_printed_weights_do_not_see_a_lost_position():
-    """Zhu et al. 2020, Eq 13: the gyro biases decide, so a filter 185 m off keeps half; by the traces it keeps 1 %."""
+def test_weights_see_a_lost_position():
     P = lost_position()
-    assert weights_eq13(P, 15, np.ones(2))[1] > 0.45
     assert weights_by_covariance(P, 15, np.ones(2))[1] < 0.02
     x = np.zeros((2, 15))
     x[1, POS] = 185.0
-    assert combine(x, P, 15, np.ones(2), "scalar", weights_eq13).x[POS] > 80.0
     assert combine(x, P, 15, np.ones(2), "scalar").x[POS] < 4.0
+    half = combine(x, P, 15, np.ones(2), "scalar", lambda P, common, members: members / 2)  # weights of another rule
+    assert half.x[POS] == 92.5
 
 
 @pytest.mark.parametrize(
@@ -482,7 +473,7 @@ def weights_of(reports, after):
         ((0.5, 0.5), {}, (1.0, 1.0)),  # alike: nobody is weakened
         ((-3.0, 0.5), {}, (1.0, 0.5)),  # evidence below zero makes nobody sounder than sound
         ((0.5, 0.0), {"weighting": "none"}, (1.0, 1.0)),
-        ((0.0, 0.0), {"literal": True}, (0.5, 0.5)),  # as printed: both weakened though nothing is wrong
+        ((0.0, 0.0), {"normalise": lambda found, limits: 0.25 * limits}, (0.25, 0.25)),  # by a rule of one's own
     ],
 )
 def test_normalised_weights_of_two_receivers(ratios, options, expected):

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
-from worlds.lanes import lanes
 
 from nav.federated import Federated
+from nav.weighting import normalised_weights
 from testbed import papers
 from testbed.feeds.simulated import motion
 from testbed.papers import zhou2025
+from testbed.papers.misprints import weights_by_sum
 from testbed.papers.zhou2025 import (
     CASES,
     COMPLETE,
@@ -43,7 +44,7 @@ def test_the_circuit_is_nearly_closed() -> None:
 
 def test_the_scenario_is_that_of_the_tables() -> None:
     scenario = papers.scenario("zhou2025")
-    running = lanes(scenario, 1)
+    running = zhou2025.build(zhou2025.chosen(list(LABELS)).estimator, scenario.rig(1))
     filters = {name: one.horizon.estimator for name, one in running.items()}
     assert list(filters) == list(LABELS)
     for name, one in filters.items():
@@ -51,7 +52,7 @@ def test_the_scenario_is_that_of_the_tables() -> None:
         assert one.config.structure == "full_reset"
         assert one.config.shares == pytest.approx([0.5, 0.5])
         assert one.config.weighting == ("none" if name == FKF else "normalised")
-        assert one.config.literal == (name == "literal")
+        assert one.config.normalise is (weights_by_sum if name == zhou2025.LITERAL else normalised_weights)
         assert one.config.imu.gyro_noise == pytest.approx(math.radians(5) / 60)
         assert one.config.imu.accel_noise == pytest.approx(60e-6 * 9.80665, rel=1e-3)
         assert one.config.imu.accel_bias_sigma == pytest.approx(15e-6 * 9.80665)

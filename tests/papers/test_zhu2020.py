@@ -16,7 +16,8 @@ from testbed import papers
 from testbed.errors import UserError
 from testbed.loop.loop import run
 from testbed.papers import scenario, zhu2020
-from testbed.papers.zhu2020 import HEADING, P_E, P_N, RUNS, V_E, V_N, Flown
+from testbed.papers.misprints import weights_eq13
+from testbed.papers.zhu2020 import EQ13, HEADING, NO_RESET, P_E, P_N, RUNS, V_E, V_N, Flown
 from testbed.scenario import Scenario
 
 SHORT = ("duration_s=320", "expect={}")
@@ -27,6 +28,13 @@ def test_scenarios_are_sound(name: str) -> None:
     chosen = scenario(name)
     assert chosen.expect
     assert "frkf" in lanes(chosen, 1)
+
+
+def test_equation_13_is_flown_beside_the_outage() -> None:
+    found = zhu2020.estimators(scenario("zhu2020_outage"), 1)
+    told = {name: lane.horizon.estimator.config for name, lane in found.items() if name in (NO_RESET, EQ13)}
+    assert (told[EQ13].weigh, told[EQ13].combination, told[EQ13].sharing) == (weights_eq13, "scalar", "none")
+    assert told[EQ13].locals[0].sensors[0].aid == told[NO_RESET].locals[0].sensors[0].aid
 
 
 @pytest.mark.parametrize(

@@ -364,7 +364,7 @@ def test_same_name_for_two_estimators() -> None:
         ),
         (
             'estimator[0].locals[0].detector={kind="sprt", mean="plain", forgetting=0.9}',
-            "locals[0].detector: forgetting is a key of mean 'exponential' or 'eq20', not of 'plain': leave it out",
+            "locals[0].detector: forgetting is a key of mean 'exponential', not of 'plain': leave it out",
         ),
         ('estimator[0].locals[0].detector.mean="plane"', 'detector.mean: can\'t be "plane": did you mean plain?'),
         (
@@ -372,8 +372,8 @@ def test_same_name_for_two_estimators() -> None:
             "estimator[0].locals[0].policy: b is a key of kind 'sage_husa', not of 'inflate': leave it out",
         ),
         (
-            'estimator[0].locals[0].policy={kind="sage_husa", solver="newton"}',
-            "estimator[0].locals[0].policy: solver is a key of kind 'inflate', not of 'sage_husa': leave it out",
+            'estimator[0].locals[0].policy={kind="sage_husa", reject_above=50.0}',
+            "estimator[0].locals[0].policy: reject_above is a key of kind 'inflate', not of 'sage_husa': leave it out",
         ),
         ('estimator[0].locals[0].policy={kind="sage_husa", b=1.0}', "estimator[0].locals[0].policy.b: must be less"),
         ('estimator[0].engine="unscented"', "engine: is a key of kind 'ins', not of 'federated': give it to"),

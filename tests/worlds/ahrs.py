@@ -28,6 +28,7 @@ DURATION_S = 600.0
 TURN = (200.0, 260.0)  # [s]
 LAT, H = 34.0 * DEG, 500.0
 GUST_S = 0.5
+SEEDS = range(4)
 
 PAPER = AhrsConfig(
     # per second of filter step, as the paper gives its Q
@@ -117,3 +118,16 @@ def errors(q_nb, q_true):
     ours = Rotation.from_quat(q_nb, scalar_first=True).as_euler("ZYX")
     theirs = Rotation.from_quat(q_true, scalar_first=True).as_euler("ZYX")
     return np.degrees((ours - theirs + math.pi) % (2 * math.pi) - math.pi)[:, ::-1]
+
+
+def fly(config, tilt_deg=0.5, turn_degps=3.0, turn=TURN, samples=()):
+    truth = level_flight(turn_degps, turn)
+    return [run(config, truth, imu(truth, seed), samples, tilt_deg) for seed in SEEDS]
+
+
+def level_figures(runs):
+    """Largest level error after 60 s and RMS of the worse axis [deg], each the mean over the seeds."""
+    late = [error[t > 60, :2] for t, error, _, _ in runs]
+    return np.mean([np.abs(e).max() for e in late]), np.mean(
+        [np.sqrt(np.mean(np.square(e), axis=0)).max() for e in late]
+    )

@@ -1,6 +1,8 @@
-"""Covariances that rounding makes indefinite."""
+"""Covariances that rounding makes indefinite, and those of a filter that has lost its position."""
 
 import numpy as np
+
+from nav.error_model import POS, VEL
 
 
 def position_and_its_error(seed):
@@ -18,3 +20,11 @@ def position_and_its_error(seed):
 def scaled_eigenvalues(P):
     sigma = np.sqrt(np.diag(P))
     return np.linalg.eigvalsh(P / np.outer(sigma, sigma))
+
+
+def lost_position():
+    """A Doppler filter with 10 m, and one that lost its transponder and drifted to 185 m, alike in all else."""
+    sigma = np.r_[np.full(3, 1e-4), np.full(3, 0.05), np.full(3, 10.0), np.full(3, 5e-8), np.full(3, 2e-4)]
+    other = sigma.copy()
+    other[POS : POS + 3], other[VEL : VEL + 3] = 185.0, 0.3
+    return np.stack([np.diag(sigma**2), np.diag(other**2)])

@@ -1,0 +1,94 @@
+"""Whether a GNSS fix is to be believed: streaks of fixes that agree, outages, and filters that were too sure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+
+from nav.earth import displacement_n
+from nav.samples import Array, GnssSample
+
+# The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
+TURN_ERROR = 0.6
+JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
+
+
+class Verdict(Enum):
+    """What to do with a GNSS fix."""
+
+    FUSE = auto()
+    REJECT = auto()  # outside the gate
+    PROBATION = auto()  # not to be used before it has been consistent for a while after an outage
+    RECOVER = auto()  # outside the gate, but consistent for so long that the filter must be wrong
+
+
+@dataclass
+class GnssMonitor:
+    """Decides on each GNSS fix so that a good receiver is never shut out for ever and a bad fix never pulls the filter.
+
+    Successive fixes form a streak while each agrees with the one before and with the velocities in between, which
+    needs no trust in the filter. While the filter is being aided, a fix inside the gate is fused and one outside
+    rejected, and only a streak that stays outside for ``patience_s`` is believed against the filter. After an outage of
+    ``outage_s`` the filter's covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
+    has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
+    ``recovery_s`` the streak is believed.
+    """
+
+    outage_s: float
+    probation_s: float
+    recovery_s: float
+    patience_s: float
+    consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
+    last_fused: float = -math.inf
+    _streak_start: float = math.nan
+    _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
+    _heard: float = math.nan  # when the last of them was
+    _was_aided: bool = False
+    _previous: tuple[GnssSample, Array] | None = None
+
+    def heard(self, t: float) -> None:
+        """The receiver has reported at ``t`` [s], if only that it has no fix."""
+        if t > self._heard:  # not the first
+            self._interval = min(self._interval, t - self._heard)
+        self._heard = t
+
+    def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool) -> Verdict:
+        """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate."""
+        self.heard(fix.t)
+        if not self._continues(fix, v_n, sigma_v):
+            self._streak_start = fix.t
+            self._was_aided = fix.t - self.last_fused <= self._longest_gap()
+        self._previous = (fix, v_n)
+        lasted = fix.t - max(self._streak_start, self.last_fused)
+        wait = self.patience_s if self._was_aided else self.recovery_s
+        if not self._was_aided and lasted < self.probation_s:
+            verdict = Verdict.PROBATION
+        elif inside_gate:
+            verdict = Verdict.FUSE
+        else:
+            verdict = Verdict.RECOVER if lasted >= wait else Verdict.REJECT
+        if verdict in (Verdict.FUSE, Verdict.RECOVER):
+            self.last_fused = fix.t
+            self._was_aided = True
+        return verdict
+
+    def _longest_gap(self) -> float:
+        """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""
+        return max(self.outage_s, 2 * self._interval) if math.isfinite(self._interval) else self.outage_s
+
+    def _continues(self, fix: GnssSample, v_n: Array, sigma_v: Array) -> bool:
+        """Whether ``fix`` is where the fix before it and the mean of both velocities say."""
+        if self._previous is None:
+            return False
+        before, v0_n = self._previous
+        dt = fix.t - before.t
+        if dt > self._longest_gap():
+            return False
+        moved = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
+        jump = moved - 0.5 * dt * (v0_n + v_n)
+        variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
+        variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
+        return float(np.sum(jump * jump / variance)) <= self.consistency_gate
