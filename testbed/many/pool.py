@@ -289,18 +289,23 @@ def _require_scheduler(address: str) -> None:
 @contextmanager
 def _scheduler() -> Iterator[LocalCluster]:
     """A scheduler on the loopback interface without workers."""
+    import dask
     from distributed import LocalCluster
 
-    with LocalCluster(
-        n_workers=0,
-        processes=False,
-        protocol="tcp",
-        host="127.0.0.1",
-        dashboard_address=None,
-        # Without an address it would take port 8787 for its dashboard all the same.
-        scheduler_kwargs={"dashboard_address": "127.0.0.1:0", "allowed_failures": 0},
-        silence_logs=logging.CRITICAL,
-    ) as cluster:
+    with (
+        # Workers that say nothing for minutes have been asleep with the computer: we see for ourselves if one has died.
+        dask.config.set({"distributed.scheduler.worker-ttl": None}),
+        LocalCluster(
+            n_workers=0,
+            processes=False,
+            protocol="tcp",
+            host="127.0.0.1",
+            dashboard_address=None,
+            # Without an address it would take port 8787 for its dashboard all the same.
+            scheduler_kwargs={"dashboard_address": "127.0.0.1:0", "allowed_failures": 0},
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+    ):
         yield cluster
 
 

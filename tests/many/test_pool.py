@@ -52,6 +52,12 @@ def test_results_errors_and_deaths() -> None:
             os.kill(pid, 0)
 
 
+def test_workers_that_slept_are_not_given_up() -> None:
+    """A computer may sleep for hours, or its user stop the program; Dask would give up workers after five minutes."""
+    with pool._scheduler() as cluster:
+        assert cluster.scheduler.worker_ttl is None
+
+
 def test_one_worker_is_this_process() -> None:
     told: list[float] = []
     with pool.opened(9, 1) as crew:
