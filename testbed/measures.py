@@ -62,6 +62,7 @@ def _statistics() -> dict[str, Measure]:
         **dict.fromkeys([f"position_{axis}_{statistic}_m" for axis, statistic in of_axes], position),
         **dict.fromkeys([f"velocity_{axis}_{statistic}_mps" for axis, statistic in of_axes], velocity),
         **dict.fromkeys([f"position_horizontal_{statistic}_m" for statistic in ("rms", "max")], position),
+        "position_horizontal_over_3sigma_max": Measure(floor=1e-3),
         "position_vertical_rms_m": position,
         **dict.fromkeys([f"velocity_{statistic}_mps" for statistic in ("rms", "max")], velocity),
         **dict.fromkeys([f"roll_pitch_{statistic}_deg" for statistic in ("rms", "max")], angle),
@@ -97,6 +98,7 @@ OF_FAULTS = {
     "coverage": Measure(Aim.MORE, floor=0.01),
     "missed": Measure(share=0.0),
     "isolation_correct": Measure(Aim.MORE, share=0.0),
+    "error_over_3sigma": Measure(floor=1e-3),
 }
 # ``flight.*``, of the aircraft,
 OF_FLIGHT = {

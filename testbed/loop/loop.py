@@ -33,6 +33,7 @@ from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
 from testbed.scenario import Scenario
 from testbed.score import metrics
+from testbed.score.doubts import doubts
 
 if TYPE_CHECKING:
     import xarray
@@ -108,7 +109,7 @@ def run(
         results = metrics.compute(flown.dataset) | {f"run.{name}": value for name, value in flown.seconds.items()}
         if setup.out is not None:
             metrics.save(results, setup.out / METRICS)
-    remarks = (*flown.remarks, *metrics.unscored(flown.dataset))
+    remarks = (*flown.remarks, *metrics.unscored(flown.dataset), *doubts(flown.dataset, results))
     return RunResult(flown.dataset, results, setup.out, flown.failure, remarks)
 
 

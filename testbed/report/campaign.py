@@ -52,7 +52,8 @@ OF_FAULTS: Mapping[str, str] = {
     "coverage": "share refused",
     "end_lag_s": "used again after [s]",
     "missed": "missed",
-    "isolation_correct": "isolated",
+    "isolation_correct": "most refused",
+    "error_over_3sigma": "error / claimed 3 σ",
 }
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})
 

@@ -17,7 +17,8 @@ from testbed.report import tables
 from testbed.report.figures import CHAPTERS
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
-from testbed.score.metrics import column, left_out
+from testbed.score.doubts import doubts
+from testbed.score.metrics import column, unscored
 
 if TYPE_CHECKING:
     import xarray
@@ -85,8 +86,7 @@ def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "duration_s": float(run.t[-1]),
         "seed": attributes.get("seed", ""),
         "complete": bool(attributes.get("complete", 1)),
-        "never_aligned": [name for name, e in run.errors.items() if e.aligned_s is None],
-        "left_out": left_out(run.dataset),
+        "remarks": [*unscored(run.dataset), *doubts(run.dataset, metrics)],
         "summary": tables.summary(metrics),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 ROWS: tuple[tuple[str, str], ...] = (
     ("position_horizontal_rms_m", "horizontal position error, RMS [m]"),
     ("position_horizontal_max_m", "horizontal position error, largest [m]"),
+    ("position_horizontal_over_3sigma_max", "horizontal position error, largest over claimed 3 σ"),
     ("position_vertical_rms_m", "vertical position error, RMS [m]"),
     ("velocity_rms_mps", "velocity error, RMS [m/s]"),
     ("roll_pitch_rms_deg", "roll and pitch error, RMS [deg]"),
@@ -39,11 +40,12 @@ RUN_ROWS = (
     ("aligned_s", "aligned at [s]"),
     ("nonfinite_samples", "estimates that are not finite"),
 )
-FAULT_COLUMNS = (
-    ("detection_delay_s", "detected after [s]", "{:.1f}"),
-    ("coverage", "refused", "{:.0%}"),
-    ("end_lag_s", "used again after [s]", "{:.1f}"),
-    ("isolation_correct", "isolated", "{:.0f}"),
+FAULT_COLUMNS: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+    ("detection_delay_s", "detected after [s]", "{:.1f}".format),
+    ("coverage", "refused", lambda share: f"{100 * share:.3g} %"),
+    ("end_lag_s", "used again after [s]", "{:.1f}".format),
+    ("isolation_correct", "most refused", lambda correct: "yes" if correct else "no"),
+    ("error_over_3sigma", "error / claimed 3 σ", "{:.2g}".format),
 )
 PHASES = ("with GNSS", "in the outage")
 NOTHING = "–"
@@ -143,10 +145,9 @@ def _fault_rows(metrics: Mapping[str, float]) -> list[list[str]]:
     scored = [key.split(".") for key in metrics if ".missed." in key]
     rows = []
     for estimator, _, fault in sorted(scored, key=lambda parts: parts[2]):
-        values = [(metrics.get(f"{estimator}.{key}.{fault}"), form) for key, _, form in FAULT_COLUMNS]
-        cells = [NOTHING if value is None else form.format(value) for value, form in values]
+        values = [(metrics.get(f"{estimator}.{key}.{fault}"), shown) for key, _, shown in FAULT_COLUMNS]
+        cells = [NOTHING if value is None else shown(value) for value, shown in values]
         cells[0] = "missed" if metrics[f"{estimator}.missed.{fault}"] else cells[0]
-        cells[-1] = {"1": "yes", "0": "no"}[cells[-1]]
         rows.append([fault, estimator, *cells])
     return rows
 

@@ -20,7 +20,9 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
   ``detection_delay_s``: from the beginning to the first alarm; ``missed``: 1 when there is none in the window;
   ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a whole sample is used
   again;
-  ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window.
+  ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window;
+  ``error_over_3sigma``: largest horizontal error over three times its claimed sigma, from the beginning of the fault to
+  `RECOVERY_WINDOW_S` after its end: above 1 the estimator was led astray and does not know it.
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
   while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
   ``false_alarms_per_h``: the same per hour of such time.
@@ -105,6 +107,13 @@ class Errors:
     def horizontal(self) -> Array:
         """Length of the horizontal position error (N,) [m]."""
         return np.hypot(self.position[:, 0], self.position[:, 1])
+
+    @property
+    def over_3sigma(self) -> Array:
+        """Horizontal position error over three times its claimed sqrt(P_N + P_E) (N,), NaN where none is claimed."""
+        claimed = 3.0 * np.hypot(self.sigma_position[:, 0], self.sigma_position[:, 1])
+        ratio: Array = np.divide(self.horizontal, claimed, out=np.full(len(claimed), np.nan), where=claimed > 0)
+        return ratio
 
     @property
     def tilt(self) -> Array:
@@ -308,7 +317,7 @@ def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[s
     for name in names(dataset):
         e = errors(dataset, name, settling_s)
         if e.aligned_s is None:
-            told.append(f"{name}: its errors are not scored: it never said that it is aligned (Status.ALIGNED)")
+            told.append(f"{name}: its errors are not scored: it was never aligned (its status never said ALIGNED)")
         elif e.t[-1] < e.aligned_s + settling_s:
             told.append(
                 f"{name}: its errors are not scored: they count from {settling_s:g} s after its alignment, "
@@ -393,7 +402,7 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
         result |= _outage_marks(e, windows) | _recovery(e, windows)
     for aid in aids(dataset, name):
         result |= _innovations(dataset, name, aid, e.aligned_s + settling_s)
-    scores, spans = _detection(dataset, name)
+    scores, spans = _detection(dataset, name, e)
     return result | scores | _false_alarms(dataset, name, e, [*windows, *spans])
 
 
@@ -410,7 +419,7 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
             "position_vertical_rms_m": _rms(e.position[mask, 2]),
             "velocity_rms_mps": _rms(speed),
             "velocity_max_mps": float(speed.max()),
-        }
+        } | _over_3sigma(e, mask, "position_horizontal_over_3sigma_max")
     result |= {
         "roll_pitch_rms_deg": _rms(tilt),
         "roll_pitch_max_deg": float(tilt.max()),
@@ -429,6 +438,13 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
         if len(finite):
             result[f"{what}_nees_mean"] = float(finite.mean())
     return {prefix + key: value for key, value in result.items()}
+
+
+def _over_3sigma(e: Errors, mask: Mask, key: str) -> dict[str, float]:
+    """The largest horizontal error over the claimed 3 sigma of these rows; nothing where none is claimed."""
+    values = e.over_3sigma[mask]
+    values = values[np.isfinite(values)]
+    return {key: float(values.max())} if len(values) else {}
 
 
 def _rms(values: Array) -> float:
@@ -515,16 +531,36 @@ def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     )
 
 
-def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """Samples that the gate judged: times (N,) [s], NIS (N,), whether it refused them (N,), components of each.
+
+    ``components`` is 0 for the parity of redundant units, which has no innovation.
+    """
+
+    t: Array
+    nis: Array
+    gated: Mask
+    components: int
+
+
+def judged(dataset: xarray.DataTree, estimator: str, aid: str) -> Judged:
+    """What the gate of one aid judged, whether it let it pass or not."""
     reports = _reports(dataset, estimator, aid)
-    judged = (reports.t >= start) & (reports.used & ~reports.alarm | reports.gated) & np.isfinite(reports.nis)
+    rows = (reports.used & ~reports.alarm | reports.gated) & np.isfinite(reports.nis)
     own = dataset[f"estimators/{estimator}/innovations/{aid}"]
-    if not judged.any() or "innovation" not in own:  # the parity of redundant units has none
+    components = own["innovation"].shape[1] if "innovation" in own else 0
+    return Judged(reports.t[rows], reports.nis[rows], reports.gated[rows], components)
+
+
+def _innovations(dataset: xarray.DataTree, estimator: str, aid: str, start: float) -> dict[str, float]:
+    looks = judged(dataset, estimator, aid)
+    rows = looks.t >= start
+    if not rows.any() or not looks.components:
         return {}
-    m = own["innovation"].shape[1]
     return {
-        f"nis_mean.{aid}": float(reports.nis[judged].mean() / m),
-        f"rejected_fraction.{aid}": float(np.mean(reports.gated[judged])),
+        f"nis_mean.{aid}": float(looks.nis[rows].mean() / looks.components),
+        f"rejected_fraction.{aid}": float(np.mean(looks.gated[rows])),
     }
 
 
@@ -587,6 +623,11 @@ def faults(dataset: xarray.DataTree) -> list[FaultTruth]:
     return [FaultTruth(*row) for row in zip(*own, strict=True)]
 
 
+def fault_window(fault: FaultTruth) -> Window:
+    """From the beginning of a fault to `RECOVERY_WINDOW_S` after its end [s]."""
+    return fault.start, fault.end + RECOVERY_WINDOW_S
+
+
 def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Array, Mask, Mask]]:
     """Times of the samples of each sensor, whether any part of one raised an alarm, whether it was not used whole."""
     found = [_reports(dataset, estimator, aid) for aid in aids(dataset, estimator)]
@@ -601,7 +642,7 @@ def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Arra
     return result
 
 
-def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, float], list[Window]]:
+def _detection(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[dict[str, float], list[Window]]:
     """Scores of all faults, and the spans of time in which an alarm may be theirs."""
     every = faults(dataset)
     looks = _by_sensor(dataset, estimator) if every else {}
@@ -618,7 +659,7 @@ def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, floa
             # What was refused as faulty may be on probation before it is used again.
             score = detection(t, alarm | unused & (t >= fault.end - SAME_TIME_S), window, until)
         if score is None:
-            spans.append((fault.start, fault.end + RECOVERY_WINDOW_S))
+            spans.append(fault_window(fault))
             continue
         ceased = until if np.isnan(score.end_lag) else fault.end + score.end_lag
         spans.append((fault.start, ceased + RECOVERY_WINDOW_S))
@@ -633,6 +674,8 @@ def _detection(dataset: xarray.DataTree, estimator: str) -> tuple[dict[str, floa
             "isolation_correct": score.coverage > most,
         }
         result |= {f"{key}.{fault.name}": value for key, value in scored.items() if np.isfinite(value)}
+        if not e.attitude_only:
+            result |= _over_3sigma(e, e.valid & inside(e.t, [fault_window(fault)]), f"error_over_3sigma.{fault.name}")
     return result, spans
 
 

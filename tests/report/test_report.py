@@ -106,15 +106,19 @@ def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
     page = report.write_report(run, found, tmp_path).read_text()
     rows = re.findall(r"<tr><td>(.*?)</td></tr>", page)
     cells = {row.partition(":")[0]: row.split("</td><td>")[1:] for row in rows if ": " in row}
-    assert cells["jump"] == ["ins", "2.0", "90%", "5.0", "yes"]  # velocity was used all the time, position was not
-    assert cells["rise"] == ["ins", "missed", "0%", "0.0", "no"]
+    ratio = {name: f"{found[f'ins.error_over_3sigma.{name}']:.2g}" for name in ("jump", "rise")}
+    # Velocity was used all the time, position was not.
+    assert cells["jump"] == ["ins", "2.0", "90 %", "5.0", "yes", ratio["jump"]]
+    assert cells["rise"] == ["ins", "missed", "0 %", "0.0", "no", ratio["rise"]]
     assert cells["unseen"][0] == "none looked"
     assert "gnss x step 3 m, 80 to 100 s" in page
     table = tables.fault_table(found)
     out = io.StringIO()
     Console(file=out, width=160).print(table)
-    assert re.search(r"jump\W+ins\W+2\.0\W+90%", out.getvalue())
+    assert re.search(r"jump\W+ins\W+2\.0\W+90 %", out.getvalue())
     assert "detected after [s]" in out.getvalue()
+    Console(file=out, width=160).print(tables.fault_table(found | {"ins.coverage.jump": 0.00222}))
+    assert "0.222 %" in out.getvalue()  # little is not nothing
     assert tables.fault_table({"ins.position_horizontal_rms_m": 1.0}) is None
     figure = consistency.innovations(Run(run), "ins")
     assert figure is not None

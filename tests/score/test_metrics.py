@@ -120,7 +120,7 @@ def test_estimators_that_are_not_scored_are_told_and_why() -> None:
     _, late, other = metrics.unscored(run)  # the first: that the text of a made-up run is no scenario
     assert late.startswith("late: its errors are not scored: they count from 60 s after its alignment, 130.")
     assert late.endswith("and the run ends at 100.0 s")
-    assert other == "other: its errors are not scored: it never said that it is aligned (Status.ALIGNED)"
+    assert other == "other: its errors are not scored: it was never aligned (its status never said ALIGNED)"
 
 
 def test_heading_error_is_the_difference_of_headings_in_level_flight() -> None:

@@ -1,0 +1,74 @@
+"""What a run says at its end of estimators that are not to be trusted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from worlds import synthetic_run
+from worlds.synthetic_run import Errors, circle, scenario
+
+from testbed.record.recorder import Recorder
+from testbed.score import metrics
+from testbed.score.doubts import doubts
+from testbed.sensors.faults import FaultTruth
+
+
+def flown(honest: float = 1.0) -> Any:
+    """A made-up run of 200 s with one fault and two estimators: one claims what is so, the other a part of it."""
+    recorder = Recorder(None, scenario(200.0), 1)
+    recorder.faults([FaultTruth("jump", "gnss", "x", "step", 100.0, 120.0, 3.0, "m")])
+    estimators = {"ins": Errors(aligned_after=0.0), "other": Errors(aligned_after=0.0, truth_over_claim=honest)}
+    synthetic_run.record(recorder, circle(200.0), estimators)
+    recorder.close()
+    return recorder.dataset()
+
+
+def test_an_honest_estimator_is_not_doubted() -> None:
+    run = flown()
+    found = metrics.compute(run)
+    assert 0.3 < found["ins.position_horizontal_over_3sigma_max"] < 1.0
+    assert doubts(run, found) == []
+
+
+def test_who_is_led_astray_is_named() -> None:
+    run = flown(6.0)
+    found = metrics.compute(run)
+    e = metrics.errors(run, "other")
+    rows = (e.t >= 100.0) & (e.t < 130.0)
+    expected = float(np.max(e.horizontal[rows] / (3.0 * np.hypot(*e.sigma_position[rows, :2].T))))
+    assert found["other.error_over_3sigma.jump"] == pytest.approx(expected)
+    assert expected > 2.0
+    assert found["ins.error_over_3sigma.jump"] < 1.0
+    worst = int(np.flatnonzero(rows)[np.argmax(e.over_3sigma[rows])])
+    assert doubts(run, found) == [
+        f"other was led astray and doesn't know it: with jump its position was {e.horizontal[worst]:.3g} m wrong at "
+        f"{e.t[worst]:.0f} s, where it claims {3 * np.hypot(*e.sigma_position[worst, :2]):.3g} m (3 σ)"
+    ]
+
+
+def test_innovations_far_too_large_are_told_but_not_those_of_a_fault() -> None:
+    run = flown()
+    nis = run["estimators/ins/innovations/barometer"]["nis"].values
+    t = run["estimators/ins/innovations/barometer"]["sample_time"].values
+    nis[(t >= 100.0) & (t < 130.0)] *= 100.0
+    assert doubts(run, metrics.compute(run)) == []
+    nis *= 3.0
+    (told,) = doubts(run, metrics.compute(run))
+    settled = nis[(t >= 60.0) & ~((t >= 100.0) & (t < 130.0))]
+    bound = chi2.ppf(0.999, len(settled)) / len(settled)
+    assert told == (
+        f"ins is too sure of barometer: the mean NIS is {settled.mean():.3g} per degree of freedom, where up to "
+        f"{bound:.3g} would fit; its noise is larger, or the model worse, than the filter is told"
+    )
+
+
+def test_a_few_large_innovations_tell_nothing() -> None:
+    """The mean of 4 samples is above 1.5 once in 6 times."""
+    run = flown()
+    nis = run["estimators/ins/innovations/barometer"]["nis"].values
+    nis[:-4] = np.nan
+    nis[-4:] = 2.0
+    assert doubts(run, metrics.compute(run)) == []
