@@ -27,8 +27,8 @@ from worlds.ahrs import (
 )
 from worlds.sections import SECTIONS
 
-from nav import ahrs as module
-from nav.ahrs import BIAS, PHI, STATES, Ahrs, AhrsConfig
+from nav.ahrs import BIAS, PHI, STATES, Ahrs, AhrsConfig, transition
+from nav.ahrs.state import propagate
 from nav.earth import OMEGA_IE
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
@@ -92,12 +92,12 @@ def test_transition_against_finite_differences():
             expected[:, BIAS + axis] += sign * phi(biased, attitude(increments, q_nb)) / (2 * h)
     turned, elapsed, forget = np.zeros((3, 3)), np.zeros(2), np.zeros(3)
     earth_n = np.array([math.cos(LAT), 0.0, -math.sin(LAT)]) * OMEGA_IE
-    module._propagate(
+    propagate(
         q_nb.copy(), np.zeros(3), earth_n, np.zeros((2, 3)), turned, forget, forget, elapsed,
         increments.dtheta, increments.dv, increments.dt,
     )  # fmt: skip
     np.testing.assert_allclose(elapsed, 8.0)
-    Phi = module.transition(turned, earth_n, 8.0)
+    Phi = transition(turned, earth_n, 8.0)
     np.testing.assert_allclose(Phi[:, BIAS:], expected[:, BIAS:], atol=3e-3)
     np.testing.assert_allclose(Phi[:, :BIAS], expected[:, :BIAS], atol=1e-6)
     assert np.abs(expected[:, BIAS:]).max() > 4

@@ -1,44 +1,20 @@
-"""Attitude and heading without position: gyros, levelled by the accelerometers while nothing else accelerates them.
-
-Six error states, attitude error phi and gyro bias error, both estimate - truth in the conventions of `nav`:
-
-    phi' = -[w_ie x] phi + C_nb b_g,    b_g a random walk
-
-Once per ``period_s`` the mean specific force in computed n axes is looked at. Without acceleration its horizontal part
-is tilt, f_N = g phi_E, f_E = -g phi_N, and `nav.motion.LowDynamics` says whether there is none. With an airspeed sensor
-the acceleration in a steady wind is known (`nav.motion.acceleration_n`) and is taken off first, so that slow turns do
-no harm and a loiter can be levelled in too. The correction reaches the attitude in steps of at most ``phi_limit`` per
-period, so that an autopilot on it feels no jump; the filter keeps in mind what is still outstanding. Heading is the
-gyro's alone, unless there is a magnetometer.
-
-Source: Jiang et al. 2021, attitude of a low-grade inertial system without satellite navigation, equations 5 to 11,
-turned from north-up-east to north-east-down.
-"""
+"""The attitude filter: levelling period by period, heading from a magnetometer; see `nav.ahrs`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, TypeAlias
 
 import numpy as np
 
 from nav import aids
-from nav._jit import njit
+from nav.ahrs.config import KINDS, AhrsConfig
+from nav.ahrs.state import BIAS, PHI, STATES, UNKNOWN, State, covariance_step, fresh, propagate
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
-from nav.error_model import PAPERS, ErrorModel, ImuModel
+from nav.error_model import PAPERS, ErrorModel
 from nav.kalman import update
-from nav.motion import LowDynamics, TrueAirspeed, acceleration_n
-from nav.rotation import (
-    quat_from_euler,
-    quat_from_rotvec,
-    quat_multiply,
-    quat_normalise,
-    quat_rotate,
-    rotation_coefficients,
-)
+from nav.motion import TrueAirspeed, acceleration_n
+from nav.rotation import quat_from_euler, quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -52,94 +28,13 @@ from nav.samples import (
     UpdateReport,
 )
 
-PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
-BIAS_STAYS = np.eye(STATES)
-KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
 # What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
 LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
-RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
-UNKNOWN = np.full(3, np.nan)
 NO_ATTITUDE = np.full(4, np.nan)
 NO_COVARIANCE = np.full((9, 9), np.nan)
-DEG = math.pi / 180
-Correction: TypeAlias = Callable[[Array, float], Array]  # as `limited`
-
-
-def limited(phi: Array, limit: float) -> Array:
-    """What of an attitude error ``phi`` (3,) is corrected at once: each axis by its own error, at most ``limit`` [rad].
-
-    Equation 10 (which prints the north axis' error for both level axes).
-    """
-    return np.array([min(max(error, -limit), limit) for error in phi.tolist()])
-
-
-@dataclass(frozen=True)
-class AhrsConfig:
-    """What the filter is told: SI, radians. ``lat`` and ``h`` are of the area of operation, good to 100 km and 1 km.
-
-    Without magnetometer ``heading`` is where the body's nose points when the first increment begins: nothing on board
-    tells it (a gyro of 40 deg/h does not feel the Earth's 15).
-    """
-
-    imu: ImuModel
-    lat: float
-    h: float = 0.0
-    aids: tuple[str, ...] = ()  # of airspeed, barometer, magnetometer
-    period_s: float = 1.0
-    tilt_sigma: float = 5 * DEG  # after levelling
-    heading: float = 0.0
-    heading_sigma: float = 15 * DEG
-    levelling_s: float = 2.0  # time over which the first roll and pitch are found
-
-    force_sigma: float = 0.1  # of the mean horizontal specific force over a period, as a sign of tilt [m/s^2]
-    motion: LowDynamics = field(default_factory=LowDynamics)  # when level, by specific force as it is
-    # and by specific force less the acceleration that airspeed tells: then turns need not be shut out
-    compensated_motion: LowDynamics = field(default_factory=lambda: LowDynamics(1.0, 10 * DEG, 10 * DEG))
-    phi_limit: float = 0.2 * DEG  # largest correction of each level axis per period
-    correction_sigma: float = 1 * DEG  # the attitude is corrected when both level axes are known this well
-    gyro_bias_feedback: bool = False  # estimated biases are taken off the gyros
-
-    airspeed_sigma: float = 1.0  # what gusts, sideslip and angle of attack make of it in a turn [m/s]
-    airspeed_smoothing_s: float = 5.0
-    airspeed_min: float = 10.0  # equivalent; below it the tube tells nothing [m/s]
-    # Of the heading from one sample, as if errors were white [rad]: hard and soft iron of 2 deg that last for 15 s,
-    # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
-    magnetometer_sigma: float = 30 * DEG
-
-    correction: Correction = limited  # what of the estimated attitude error is taken out at the end of a period
-
-    def __post_init__(self) -> None:
-        unknown = set(self.aids) - set(KINDS.values())
-        if unknown:
-            raise ValueError(f"unknown aids {sorted(unknown)}, choose from {sorted(KINDS.values())}")
-
-
-@dataclass
-class _State:
-    """Everything that moves. While levelling, n stands for the body axes at the first increment."""
-
-    levelled: bool
-    period_end: float  # [s]
-    mode_counter: int  # periods of low dynamics without a break
-    correction_counter: int  # corrections among them
-    q_nb: Array
-    x: Array  # (6,) estimated errors still in the attitude and the gyros
-    P: Array  # (6, 6)
-    gyro_bias: Array  # (3,) taken off the gyros
-    air_velocity_n: Array  # (3,) at the start of the period, NaN when unknown
-    field_n: Array  # (3,) sum of magnetic fields while levelling
-    rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
-    turned: Array  # (3, 3) integral of C_nb since the last covariance step
-    angle: Array  # (3,) integral of angular rate over the period, body axes
-    force: Array  # (3,) integral of specific force over the period, n
-    elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
-
-    def copy(self) -> _State:
-        values: list[Any] = [x.copy() if isinstance(x, np.ndarray) else x for x in vars(self).values()]
-        return _State(*values)
 
 
 class Ahrs:
@@ -154,7 +49,7 @@ class Ahrs:
         self.config = config
         self._commanded = (np.empty(0), np.empty(0, bool))  # times, and whether level flight was commanded up to each
         self.t = math.nan
-        self._state: _State | None = None
+        self._state: State | None = None
         self._airspeed = TrueAirspeed(config.h, config.airspeed_smoothing_s)
         self._aids = tuple(kind for kind in config.aids if kind != "magnetometer" or field_n is not None)
         self._field_n = field_n
@@ -191,7 +86,7 @@ class Ahrs:
 
     def start(self, t: float, q_nb: Array) -> None:
         """Begin at a given attitude, known as well as the configuration's sigmas say, instead of levelling."""
-        self._state = state = _fresh(t + self.config.period_s)
+        self._state = state = fresh(t + self.config.period_s)
         state.levelled = True
         state.q_nb = np.array(q_nb, dtype=float)
         state.P = self._initial_covariance()
@@ -219,7 +114,7 @@ class Ahrs:
             return reports
         if self._state is None:
             start = float(imu.t[0] - imu.dt[0])
-            self._state = _fresh(start + self.config.levelling_s)
+            self._state = fresh(start + self.config.levelling_s)
             self._state.air_velocity_n = self._air_velocity_n(self._state, start)
         self._last_bad = max(self._last_bad, self._run(self._state, imu, reports))
         self.t = float(imu.t[-1])
@@ -270,7 +165,7 @@ class Ahrs:
             last_bad = max(last_bad, self._run(state, imu, []))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _run(self, s: _State, imu: ImuSamples, reports: list[UpdateReport]) -> float:
+    def _run(self, s: State, imu: ImuSamples, reports: list[UpdateReport]) -> float:
         """Propagate a state; the time of the last increment that was not usable, -inf when all were.
 
         Periods end at times of their own, whatever the blocks.
@@ -280,7 +175,7 @@ class Ahrs:
         while start < n:
             end = int(np.searchsorted(imu.t, s.period_end - COINCIDENT)) + 1
             rows = slice(start, min(end, n))
-            bad = _propagate(
+            bad = propagate(
                 s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,
                 s.elapsed, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
             )  # fmt: skip
@@ -291,7 +186,7 @@ class Ahrs:
                 self._end_period(s, float(imu.t[end - 1]), reports)
         return last_bad
 
-    def _end_period(self, s: _State, t: float, reports: list[UpdateReport]) -> None:
+    def _end_period(self, s: State, t: float, reports: list[UpdateReport]) -> None:
         """Level by what the period has shown, and begin the next."""
         if s.levelled:
             self._settle(s)
@@ -306,11 +201,11 @@ class Ahrs:
         while s.period_end <= t + COINCIDENT:
             s.period_end += period
 
-    def _air_velocity_n(self, s: _State, t: float) -> Array:
+    def _air_velocity_n(self, s: State, t: float) -> Array:
         speed = self._airspeed.at(t)
         return UNKNOWN if math.isnan(speed) else quat_rotate(s.q_nb, np.array([speed, 0.0, 0.0]))
 
-    def _steady_force(self, s: _State, t: float) -> tuple[Array, bool]:
+    def _steady_force(self, s: State, t: float) -> tuple[Array, bool]:
         """Mean specific force over the period, less the acceleration that airspeed tells, and whether it told any."""
         T = float(s.elapsed[1])
         f_n = s.force / T
@@ -319,7 +214,7 @@ class Ahrs:
             return f_n, False
         return f_n - acceleration, True
 
-    def _find_level(self, s: _State, t: float) -> None:
+    def _find_level(self, s: State, t: float) -> None:
         """Roll and pitch from specific force; heading from the magnetic field or from outside.
 
         Equations 1 to 3 find it by the Earth's rate, which such gyros do not feel.
@@ -348,7 +243,7 @@ class Ahrs:
         sigma[PHI + 2] = config.heading_sigma
         return np.diag(sigma**2)
 
-    def _level(self, s: _State, t: float, reports: list[UpdateReport]) -> None:
+    def _level(self, s: State, t: float, reports: list[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
         config = self.config
         f_n, compensated = self._steady_force(s, t)
@@ -374,7 +269,7 @@ class Ahrs:
         first, stop = np.searchsorted(times, (start + COINCIDENT, end + COINCIDENT))
         return bool(level[first:stop].all())
 
-    def _feed_back(self, s: _State) -> None:
+    def _feed_back(self, s: State) -> None:
         """Move estimated errors into attitude and gyro bias, in small steps (equations 10, 11)."""
         config = self.config
         if max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) >= config.correction_sigma**2:
@@ -407,12 +302,12 @@ class Ahrs:
         z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
         return [_fuse(s, *self.heading_look, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
 
-    def _settle(self, s: _State) -> None:
+    def _settle(self, s: State) -> None:
         """Bring error states and covariance up to the time of the attitude."""
         if s.elapsed[0] > 0:
-            _covariance_step(s.x, s.P, s.turned, s.elapsed, self._earth_n, self._variance_rate)
+            covariance_step(s.x, s.P, s.turned, s.elapsed, self._earth_n, self._variance_rate)
 
-    def _estimate(self, s: _State | None, t: float, last_bad: float) -> Estimate:
+    def _estimate(self, s: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a state of its own.
 
         The attitude is what it is before the corrections still outstanding, so they are part of its error; so is the
@@ -449,28 +344,7 @@ class Ahrs:
         )
 
 
-def _fresh(period_end: float) -> _State:
-    """Nothing is known but when the levelling ends."""
-    return _State(
-        levelled=False,
-        period_end=period_end,
-        mode_counter=0,
-        correction_counter=0,
-        q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
-        x=np.zeros(STATES),
-        P=np.zeros((STATES, STATES)),
-        gyro_bias=np.zeros(3),
-        air_velocity_n=UNKNOWN,
-        field_n=np.zeros(3),
-        rates=np.zeros((2, 3)),
-        turned=np.zeros((3, 3)),
-        angle=np.zeros(3),
-        force=np.zeros(3),
-        elapsed=np.zeros(2),
-    )
-
-
-def _fuse(s: _State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:
+def _fuse(s: State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:
     """Update the error states with ``z`` = H x + noise."""
     nu = z - H @ s.x
     S, nis = update(s.x, s.P, H, R, nu, math.inf)
@@ -486,112 +360,3 @@ def _refused(sample: Sample, reason: str) -> UpdateReport:
 
 def _azimuth(x_n: Array) -> float:
     return math.atan2(x_n[1], x_n[0])
-
-
-def transition(turned: Array, earth_n: Array, T: float) -> Array:
-    """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
-    north, east, down = (earth_n * T).tolist()
-    c_n, c_e, c_d = turned.tolist()
-    return np.array([[1.0, down, -east, *c_n], [-down, 1.0, north, *c_e], [east, -north, 1.0, *c_d]])
-
-
-def _covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
-    """Take error states and covariance over the time in ``elapsed``, and empty the integral.
-
-    Half of the noise before and half after, as in `kalman.predict`.
-    """
-    T = float(elapsed[0])
-    whole = BIAS_STAYS.copy()
-    whole[PHI : PHI + 3] = transition(turned, earth_n, T)
-    half_noise = 0.5 * T * variance_rate
-    variances = P.ravel()[:: STATES + 1]
-    x[:] = whole @ x
-    variances += half_noise
-    P[:] = whole @ P @ whole.T
-    variances += half_noise
-    P += P.T.copy()
-    P *= 0.5
-    turned[:] = 0.0
-    elapsed[0] = 0.0
-
-
-@njit
-def _propagate(
-    q_nb: Array, gyro_bias: Array, earth_n: Array, rates: Array, turned: Array, angle: Array, force: Array,
-    elapsed: Array, dtheta: Array, dv: Array, dt: Array,
-) -> int:  # fmt: skip
-    """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
-
-    q+ = exp(-w_ie dt / 2) q exp(dtheta / 2), and C_nb dv by the attitude half-way through the turn.
-    """
-    bad = -1
-    w, x, y, z = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
-    b0, b1, b2 = gyro_bias[0], gyro_bias[1], gyro_bias[2]
-    e0, e1, e2 = -0.5 * earth_n[0], -0.5 * earth_n[1], -0.5 * earth_n[2]
-    for k in range(len(dt)):
-        T = dt[k]
-        if not T > 0.0:
-            continue
-        p0, p1, p2 = dtheta[k, 0], dtheta[k, 1], dtheta[k, 2]
-        u0, u1, u2 = dv[k, 0], dv[k, 1], dv[k, 2]
-        most, strongest = RATE_LIMIT * T, FORCE_LIMIT * T
-        if (
-            abs(p0) <= most and abs(p1) <= most and abs(p2) <= most
-            and abs(u0) <= strongest and abs(u1) <= strongest and abs(u2) <= strongest
-        ):  # fmt: skip
-            rates[0, 0], rates[0, 1], rates[0, 2] = p0 / T, p1 / T, p2 / T
-            rates[1, 0], rates[1, 1], rates[1, 2] = u0 / T, u1 / T, u2 / T
-        else:
-            bad = k
-            p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T
-            u0, u1, u2 = rates[1, 0] * T, rates[1, 1] * T, rates[1, 2] * T
-        angle[0] += p0
-        angle[1] += p1
-        angle[2] += p2
-        p0, p1, p2 = p0 - b0 * T, p1 - b1 * T, p2 - b2 * T
-
-        # half the turn, twice
-        sinc, versine, _ = rotation_coefficients(0.0625 * (p0 * p0 + p1 * p1 + p2 * p2))
-        dw, k4 = 1 - 0.0625 * (p0 * p0 + p1 * p1 + p2 * p2) * versine, 0.25 * sinc
-        dx, dy, dz = k4 * p0, k4 * p1, k4 * p2
-        w, x, y, z = (
-            w * dw - x * dx - y * dy - z * dz,
-            w * dx + x * dw + y * dz - z * dy,
-            w * dy - x * dz + y * dw + z * dx,
-            w * dz + x * dy - y * dx + z * dw,
-        )
-        c00, c01, c02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-        c10, c11, c12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-        c20, c21, c22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-        w, x, y, z = (
-            w * dw - x * dx - y * dy - z * dz,
-            w * dx + x * dw + y * dz - z * dy,
-            w * dy - x * dz + y * dw + z * dx,
-            w * dz + x * dy - y * dx + z * dw,
-        )
-        dx, dy, dz = e0 * T, e1 * T, e2 * T
-        w, x, y, z = (
-            w - dx * x - dy * y - dz * z,
-            x + dx * w + dy * z - dz * y,
-            y - dx * z + dy * w + dz * x,
-            z + dx * y - dy * x + dz * w,
-        )
-        scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one Newton step to unit norm: it left it by rounding only
-        w, x, y, z = scale * w, scale * x, scale * y, scale * z
-
-        turned[0, 0] += c00 * T
-        turned[0, 1] += c01 * T
-        turned[0, 2] += c02 * T
-        turned[1, 0] += c10 * T
-        turned[1, 1] += c11 * T
-        turned[1, 2] += c12 * T
-        turned[2, 0] += c20 * T
-        turned[2, 1] += c21 * T
-        turned[2, 2] += c22 * T
-        force[0] += c00 * u0 + c01 * u1 + c02 * u2
-        force[1] += c10 * u0 + c11 * u1 + c12 * u2
-        force[2] += c20 * u0 + c21 * u1 + c22 * u2
-        elapsed[0] += T
-        elapsed[1] += T
-    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = w, x, y, z
-    return bad

@@ -1,0 +1,67 @@
+"""What the attitude filter is told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from nav.error_model import ImuModel
+from nav.motion import LowDynamics
+from nav.samples import AirspeedSample, Array, BarometerSample, MagnetometerSample
+
+KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
+DEG = math.pi / 180
+Correction: TypeAlias = Callable[[Array, float], Array]  # as `limited`
+
+
+def limited(phi: Array, limit: float) -> Array:
+    """What of an attitude error ``phi`` (3,) is corrected at once: each axis by its own error, at most ``limit`` [rad].
+
+    Equation 10 (which prints the north axis' error for both level axes).
+    """
+    return np.array([min(max(error, -limit), limit) for error in phi.tolist()])
+
+
+@dataclass(frozen=True)
+class AhrsConfig:
+    """What the filter is told: SI, radians. ``lat`` and ``h`` are of the area of operation, good to 100 km and 1 km.
+
+    Without magnetometer ``heading`` is where the body's nose points when the first increment begins: nothing on board
+    tells it (a gyro of 40 deg/h does not feel the Earth's 15).
+    """
+
+    imu: ImuModel
+    lat: float
+    h: float = 0.0
+    aids: tuple[str, ...] = ()  # of airspeed, barometer, magnetometer
+    period_s: float = 1.0
+    tilt_sigma: float = 5 * DEG  # after levelling
+    heading: float = 0.0
+    heading_sigma: float = 15 * DEG
+    levelling_s: float = 2.0  # time over which the first roll and pitch are found
+
+    force_sigma: float = 0.1  # of the mean horizontal specific force over a period, as a sign of tilt [m/s^2]
+    motion: LowDynamics = field(default_factory=LowDynamics)  # when level, by specific force as it is
+    # and by specific force less the acceleration that airspeed tells: then turns need not be shut out
+    compensated_motion: LowDynamics = field(default_factory=lambda: LowDynamics(1.0, 10 * DEG, 10 * DEG))
+    phi_limit: float = 0.2 * DEG  # largest correction of each level axis per period
+    correction_sigma: float = 1 * DEG  # the attitude is corrected when both level axes are known this well
+    gyro_bias_feedback: bool = False  # estimated biases are taken off the gyros
+
+    airspeed_sigma: float = 1.0  # what gusts, sideslip and angle of attack make of it in a turn [m/s]
+    airspeed_smoothing_s: float = 5.0
+    airspeed_min: float = 10.0  # equivalent; below it the tube tells nothing [m/s]
+    # Of the heading from one sample, as if errors were white [rad]: hard and soft iron of 2 deg that last for 15 s,
+    # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
+    magnetometer_sigma: float = 30 * DEG
+
+    correction: Correction = limited  # what of the estimated attitude error is taken out at the end of a period
+
+    def __post_init__(self) -> None:
+        unknown = set(self.aids) - set(KINDS.values())
+        if unknown:
+            raise ValueError(f"unknown aids {sorted(unknown)}, choose from {sorted(KINDS.values())}")

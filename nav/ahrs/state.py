@@ -1,0 +1,173 @@
+"""What moves in the attitude filter, by increments and by time: attitude, error states, what a period has summed up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from nav._jit import njit
+from nav.rotation import rotation_coefficients
+from nav.samples import Array
+
+PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
+BIAS_STAYS = np.eye(STATES)
+RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
+UNKNOWN = np.full(3, np.nan)
+
+
+@dataclass
+class State:
+    """Everything that moves. While levelling, n stands for the body axes at the first increment."""
+
+    levelled: bool
+    period_end: float  # [s]
+    mode_counter: int  # periods of low dynamics without a break
+    correction_counter: int  # corrections among them
+    q_nb: Array
+    x: Array  # (6,) estimated errors still in the attitude and the gyros
+    P: Array  # (6, 6)
+    gyro_bias: Array  # (3,) taken off the gyros
+    air_velocity_n: Array  # (3,) at the start of the period, NaN when unknown
+    field_n: Array  # (3,) sum of magnetic fields while levelling
+    rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
+    turned: Array  # (3, 3) integral of C_nb since the last covariance step
+    angle: Array  # (3,) integral of angular rate over the period, body axes
+    force: Array  # (3,) integral of specific force over the period, n
+    elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
+
+    def copy(self) -> State:
+        """The same in arrays of its own."""
+        values: list[Any] = [x.copy() if isinstance(x, np.ndarray) else x for x in vars(self).values()]
+        return State(*values)
+
+
+def fresh(period_end: float) -> State:
+    """Nothing is known but when the levelling ends."""
+    return State(
+        levelled=False,
+        period_end=period_end,
+        mode_counter=0,
+        correction_counter=0,
+        q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
+        x=np.zeros(STATES),
+        P=np.zeros((STATES, STATES)),
+        gyro_bias=np.zeros(3),
+        air_velocity_n=UNKNOWN,
+        field_n=np.zeros(3),
+        rates=np.zeros((2, 3)),
+        turned=np.zeros((3, 3)),
+        angle=np.zeros(3),
+        force=np.zeros(3),
+        elapsed=np.zeros(2),
+    )
+
+
+def transition(turned: Array, earth_n: Array, T: float) -> Array:
+    """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
+    north, east, down = (earth_n * T).tolist()
+    c_n, c_e, c_d = turned.tolist()
+    return np.array([[1.0, down, -east, *c_n], [-down, 1.0, north, *c_e], [east, -north, 1.0, *c_d]])
+
+
+def covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
+    """Take error states and covariance over the time in ``elapsed``, and empty the integral.
+
+    Half of the noise before and half after, as in `kalman.predict`.
+    """
+    T = float(elapsed[0])
+    whole = BIAS_STAYS.copy()
+    whole[PHI : PHI + 3] = transition(turned, earth_n, T)
+    half_noise = 0.5 * T * variance_rate
+    variances = P.ravel()[:: STATES + 1]
+    x[:] = whole @ x
+    variances += half_noise
+    P[:] = whole @ P @ whole.T
+    variances += half_noise
+    P += P.T.copy()
+    P *= 0.5
+    turned[:] = 0.0
+    elapsed[0] = 0.0
+
+
+@njit
+def propagate(
+    q_nb: Array, gyro_bias: Array, earth_n: Array, rates: Array, turned: Array, angle: Array, force: Array,
+    elapsed: Array, dtheta: Array, dv: Array, dt: Array,
+) -> int:  # fmt: skip
+    """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
+
+    q+ = exp(-w_ie dt / 2) q exp(dtheta / 2), and C_nb dv by the attitude half-way through the turn.
+    """
+    bad = -1
+    w, x, y, z = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
+    b0, b1, b2 = gyro_bias[0], gyro_bias[1], gyro_bias[2]
+    e0, e1, e2 = -0.5 * earth_n[0], -0.5 * earth_n[1], -0.5 * earth_n[2]
+    for k in range(len(dt)):
+        T = dt[k]
+        if not T > 0.0:
+            continue
+        p0, p1, p2 = dtheta[k, 0], dtheta[k, 1], dtheta[k, 2]
+        u0, u1, u2 = dv[k, 0], dv[k, 1], dv[k, 2]
+        most, strongest = RATE_LIMIT * T, FORCE_LIMIT * T
+        if (
+            abs(p0) <= most and abs(p1) <= most and abs(p2) <= most
+            and abs(u0) <= strongest and abs(u1) <= strongest and abs(u2) <= strongest
+        ):  # fmt: skip
+            rates[0, 0], rates[0, 1], rates[0, 2] = p0 / T, p1 / T, p2 / T
+            rates[1, 0], rates[1, 1], rates[1, 2] = u0 / T, u1 / T, u2 / T
+        else:
+            bad = k
+            p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T
+            u0, u1, u2 = rates[1, 0] * T, rates[1, 1] * T, rates[1, 2] * T
+        angle[0] += p0
+        angle[1] += p1
+        angle[2] += p2
+        p0, p1, p2 = p0 - b0 * T, p1 - b1 * T, p2 - b2 * T
+
+        # half the turn, twice
+        sinc, versine, _ = rotation_coefficients(0.0625 * (p0 * p0 + p1 * p1 + p2 * p2))
+        dw, k4 = 1 - 0.0625 * (p0 * p0 + p1 * p1 + p2 * p2) * versine, 0.25 * sinc
+        dx, dy, dz = k4 * p0, k4 * p1, k4 * p2
+        w, x, y, z = (
+            w * dw - x * dx - y * dy - z * dz,
+            w * dx + x * dw + y * dz - z * dy,
+            w * dy - x * dz + y * dw + z * dx,
+            w * dz + x * dy - y * dx + z * dw,
+        )
+        c00, c01, c02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        c10, c11, c12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        c20, c21, c22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        w, x, y, z = (
+            w * dw - x * dx - y * dy - z * dz,
+            w * dx + x * dw + y * dz - z * dy,
+            w * dy - x * dz + y * dw + z * dx,
+            w * dz + x * dy - y * dx + z * dw,
+        )
+        dx, dy, dz = e0 * T, e1 * T, e2 * T
+        w, x, y, z = (
+            w - dx * x - dy * y - dz * z,
+            x + dx * w + dy * z - dz * y,
+            y - dx * z + dy * w + dz * x,
+            z + dx * y - dy * x + dz * w,
+        )
+        scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one Newton step to unit norm: it left it by rounding only
+        w, x, y, z = scale * w, scale * x, scale * y, scale * z
+
+        turned[0, 0] += c00 * T
+        turned[0, 1] += c01 * T
+        turned[0, 2] += c02 * T
+        turned[1, 0] += c10 * T
+        turned[1, 1] += c11 * T
+        turned[1, 2] += c12 * T
+        turned[2, 0] += c20 * T
+        turned[2, 1] += c21 * T
+        turned[2, 2] += c22 * T
+        force[0] += c00 * u0 + c01 * u1 + c02 * u2
+        force[1] += c10 * u0 + c11 * u1 + c12 * u2
+        force[2] += c20 * u0 + c21 * u1 + c22 * u2
+        elapsed[0] += T
+        elapsed[1] += T
+    q_nb[0], q_nb[1], q_nb[2], q_nb[3] = w, x, y, z
+    return bad
