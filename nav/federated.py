@@ -222,7 +222,7 @@ class Federated:
         state = self._drafted()
         last_bad = self._last_bad
         if state is not None and len(imu):
-            last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS))
+            last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS, settle=True))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
     def _drafted(self) -> State | None:

@@ -151,8 +151,7 @@ class LocalFilter:
             assert at_points is not None
             return self._absorb_points(reference, s, at_points, H, R, threshold)
         return absorb(
-            s.q_nb, s.v_n, s.lla, s.imu, s.x[self.row], s.P[self.row], s.errors, reference.driven,
-            nu, H, R, threshold, self.closed,
+            s.whole, *s.shape, self.row, reference.driven, nu, H, R, threshold, self.closed
         )  # fmt: skip
 
     def _innovate_points(self, P: Array, at_points: Array, H: Array, R: Array) -> tuple[Array, Array, Array, float]:

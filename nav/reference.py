@@ -38,6 +38,7 @@ BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMP
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 NEVER = 1 << 62
 NO_INCREMENTS, NO_TIMES = np.empty((0, 3)), np.empty(0)
+FIXED = 57  # numbers in a `State` of any size
 PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
 
 # Order of the covariance in an estimate; and the blocks that have a place of their own there
@@ -51,8 +52,8 @@ class State:
     """Everything that moves: nominal motion and sensor errors, what the filters hold, and integrals still to be used.
 
     ``x[i, :common]`` is what filter i would add to the nominal state, the estimated error with its sign turned; behind
-    that are the estimated errors of its own aids, whole values. All are views of one array, so that a prediction can
-    `take` the whole at once.
+    that are the estimated errors of its own aids, whole values. All are views of one array, the ``whole``, so that a
+    prediction can `take` it at once, and a kernel is handed one array for ten: each costs as much as a small product.
     """
 
     q_nb: Array
@@ -67,26 +68,45 @@ class State:
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
 
     def __init__(self, common: int, filters: int, n: int) -> None:
-        shapes: dict[str, tuple[int, ...]] = {
-            "q_nb": (4,), "v_n": (3,), "lla": (3,), "imu": (common,), "x": (filters, n), "P": (filters, n, n),
-            "errors": (4, 3), "sums": (3, 3, 3), "elapsed": (2,), "rates": (2, 3),
-        }  # fmt: skip
-        self._shape = common, filters, n
-        self._all = np.zeros(sum(map(math.prod, shapes.values())))
-        end = 0
-        for name, shape in shapes.items():
-            start, end = end, end + math.prod(shape)
-            setattr(self, name, self._all[start:end].reshape(shape))
+        self.shape = common, filters, n
+        self.whole = np.zeros(FIXED + common + filters * n * (n + 1))
+        (
+            self.q_nb, self.v_n, self.lla, self.imu, self.x, self.P, self.errors, self.sums, self.elapsed, self.rates,
+        ) = _parts(self.whole, common, filters, n)  # fmt: skip
 
     def take(self, other: State) -> None:
         """Become the same as ``other``, which has as many filters and states."""
-        self._all[:] = other._all
+        self.whole[:] = other.whole
 
     def copy(self) -> State:
         """The same in arrays of its own."""
-        made = State(*self._shape)
+        made = State(*self.shape)
         made.take(self)
         return made
+
+
+@njit
+def _parts(
+    whole: Array, common: int, filters: int, n: int
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
+    """The parts of the ``whole`` of a `State` as views, in the order of the class; those of fixed size lie first."""
+    x = FIXED + common
+    P = x + filters * n
+    return (
+        whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
+        whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
+        whole[49:51], whole[51:FIXED].reshape(2, 3),
+    )  # fmt: skip
+
+
+@njit
+def _scratch(room: Array, common: int, n: int) -> tuple[Array, Array, Array, Array]:
+    """Where a covariance step works in: two matrices of `transition`, decay and half noise of each state."""
+    matrix = MOTION * common
+    return (
+        room[:matrix].reshape(MOTION, common), room[matrix : 2 * matrix].reshape(MOTION, common),
+        room[2 * matrix : 2 * matrix + n], room[2 * matrix + n :],
+    )  # fmt: skip
 
 
 class Reference:
@@ -128,13 +148,8 @@ class Reference:
             self._decay_rate[i, : model.size] = model.decay_rate
             self._noise[i, : model.size] = model.density**2
         self._variance_rate = self._noise.copy()
-        self._scratch = (
-            np.zeros((MOTION, self.common)),
-            np.zeros((MOTION, self.common)),
-            np.ones(n),
-            np.zeros(n),
-            scratch(n),
-        )
+        self._room, self._work = np.zeros(2 * MOTION * self.common + 2 * n), scratch(n)
+        self._scratch = (*_scratch(self._room, self.common, n), self._work)
         self.share_noise(shares)
         # The longest kernel is loaded here, or compiled, and not when samples wait for it.
         self._propagate(State(self.common, filters, n), NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES)
@@ -162,8 +177,8 @@ class Reference:
         state.P[:] = P
         return state
 
-    def run(self, state: State, imu: ImuSamples, periods: int = 1) -> float:
-        """Propagate by a block of increments, a covariance step every ``periods`` of the usual ones.
+    def run(self, state: State, imu: ImuSamples, periods: int = 1, *, settle: bool = False) -> float:
+        """Propagate by a block of increments, a covariance step every ``periods`` of the usual ones; `settle` after it.
 
         The time of the last increment that was not usable, -inf when all were: it is bridged with the last sound rates.
         """
@@ -174,12 +189,15 @@ class Reference:
             stop = first + max(1, period - int(s.elapsed[1])) if self._pauses else len(imu)
             part = slice(first, stop)
             every = NEVER if self._pauses else period
-            bad = self._propagate(s, every, imu.dtheta[part], imu.dv[part], imu.dt[part])
+            at_once = settle and not self._pauses
+            bad = self._propagate(s, every, imu.dtheta[part], imu.dv[part], imu.dt[part], settle=at_once)
             if bad >= 0:
                 last_bad = float(imu.t[first + bad])
             if self._pauses and s.elapsed[1] >= period:
                 self.settle(s)
             first = stop
+        if settle:
+            self.settle(s)
         return last_bad
 
     def settle(self, state: State) -> None:
@@ -219,8 +237,8 @@ class Reference:
     def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
         """See the kernel."""
         return _propagate(
-            s.q_nb, s.v_n, s.lla, s.imu, s.x, s.P, s.errors, s.sums, s.elapsed, s.rates,
-            self.driven, self._decay_rate, self._variance_rate, *self._scratch, period, dtheta, dv, dt, settle,
+            s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._room, self._work,
+            period, dtheta, dv, dt, settle,
         )  # fmt: skip
 
     def correct(self, state: State, correction: Array) -> None:
@@ -346,18 +364,21 @@ def spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
     return covariance, sigma
 
 
+@njit
 def absorb(
-    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, driven: Indices,
+    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices,
     nu: Array, H: Array, R: Array, threshold: float, close: bool,
 ) -> tuple[Array, float]:  # fmt: skip
-    """One measurement into one filter, ``x`` (n,) and ``P`` (n, n), if its nis is at most ``threshold``; (S, nis).
+    """One measurement into filter ``row`` of a `State` if its nis is at most ``threshold``; (S, nis).
 
     With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
     """
-    S, nis = update(x, P, H, R, nu, threshold)
+    q_nb, v_n, lla, imu, x, P, errors, _, _, _ = _parts(whole, common, filters, n)
+    S, nis = update(x[row], P[row], H, R, nu, threshold)
     if close and nis <= threshold:
-        inject(q_nb, v_n, lla, imu, x)
-        x[: len(imu)] = 0.0
+        inject(q_nb, v_n, lla, imu, x[row])
+        for i in range(common):
+            x[row, i] = 0.0
         sensor_errors(errors, imu, driven)
     return S, nis
 
@@ -453,15 +474,16 @@ def _sigma_step(
 
 @njit
 def _propagate(
-    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    rates: Array, driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array,
-    half_noise: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
+    whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
+    room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
 ) -> int:  # fmt: skip
     """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
 
     A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
     since it is long to compile.
     """
+    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates = _parts(whole, common, filters, n)
+    Phi, FT, decay, half_noise = _scratch(room, common, n)
     bad = -1
     angle, push, before = np.empty(3), np.empty(3), np.empty(4)
     for k in range(len(dt) + 1):

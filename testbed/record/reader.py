@@ -97,27 +97,31 @@ def _plain(value: Any) -> Any:
 def _read_group(group: h5py.Group, path: str, found: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
     import h5py
 
-    time_name = next((name for name in ("time", "sample_time") if name in group), None)
+    members = dict(group.items())
+    time_name = next((name for name in ("time", "sample_time") if name in members), None)
     if time_name is not None:
         written = np.flatnonzero(np.isfinite(group[time_name][()]))
         rows = int(written[-1]) + 1 if len(written) else 0
+        datasets = {name: item for name, item in members.items() if isinstance(item, h5py.Dataset)}
+        places = {h5py.h5o.get_info(item.id).addr: name for name, item in datasets.items()}
         found[path] = {
-            name: _read_column(item, rows)
-            for name, item in group.items()
-            if isinstance(item, h5py.Dataset) and "long_name" in item.attrs
+            name: _read_column(item, rows, places) for name, item in datasets.items() if "long_name" in item.attrs
         }
-    for name, item in group.items():
+    for name, item in members.items():
         if isinstance(item, h5py.Group):
             _read_group(item, f"{path}/{name}".lstrip("/"), found)
 
 
-def _read_column(dataset: h5py.Dataset, rows: int) -> tuple[Variable, Data]:
+def _read_column(dataset: h5py.Dataset, rows: int, places: Mapping[int, str]) -> tuple[Variable, Data]:
+    """One column; ``places`` are the names in its group by address: to ask HDF5 for a name makes it search the file."""
+    from h5py import h5o
+
     attributes = {
         name: _plain(dataset.attrs[name])
         for name in ("units", "long_name", "flag_values", "flag_masks", "flag_meanings")
         if name in dataset.attrs
     }
-    dims = tuple(Path(dataset.dims[k][0].name).name for k in range(1, dataset.ndim))
+    dims = tuple(places[h5o.get_info(dataset.dims[k][0].id).addr] for k in range(1, dataset.ndim))
     values = dataset[:rows]
     if values.dtype.kind == "S":
         values = values.view(f"S{values.shape[1]}")[:, 0]
@@ -139,16 +143,15 @@ def tree(
     nodes = {"/": xarray.Dataset(attrs=dict(attributes))}
     for path, group in columns.items():
         time_name = "sample_time" if "sample_time" in group else "time"
-        nodes[path] = xarray.Dataset(
-            {
-                name: labelled(
-                    (time_name, *variable.dims),
-                    np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
-                    variable.labels,
-                )
-                for name, (variable, values) in group.items()
-            }
-        ).set_coords(time_name)
-        labels = {str(dim): labelled([str(dim)], np.array(AXES[str(dim)])) for dim in nodes[path].dims if dim in AXES}
-        nodes[path] = nodes[path].assign_coords(labels)
+        variables = {
+            name: labelled(
+                (time_name, *variable.dims),
+                np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
+                variable.labels,
+            )
+            for name, (variable, values) in group.items()
+        }
+        dims = dict.fromkeys(dim for variable, _ in group.values() for dim in variable.dims)
+        labels = {dim: labelled([dim], np.array(AXES[dim])) for dim in dims if dim in AXES}
+        nodes[path] = xarray.Dataset(variables, {time_name: variables.pop(time_name), **labels})
     return xarray.DataTree.from_dict(nodes)
