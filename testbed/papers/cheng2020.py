@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -182,119 +182,155 @@ def _jobs() -> list[Job]:
 def _conclude(results: Sequence[Any]) -> list[Claim]:
     n = len(SEEDS)
     roads, noises, straights, table = results[: n + 1], results[n + 1 : -n - 1], results[-n - 1 : -1], results[-1]
-
-    left, claimed = np.array(straights).T
-
-    def of(name: str, key: str) -> list[float]:
-        return [one[name][key] for one in roads if name in one]
-
-    def improved(key: str) -> list[float]:
-        return of("improved", key)
-
-    def any_seed(quantity: str, unit: str, paper: str, key: str, wanted: float) -> Claim:
-        """The worst seed; where the filter that need not learn is not within ``wanted`` either, next to that filter."""
-        least = max(of("told", key))
-        bound, because = wanted, ""
-        if least > wanted:
-            bound, because = NO_WORSE * least, f"with the variances told instead of learned it is {least:.3g}"
-        return Claim(
-            f"{quantity}, any seed below {wanted:g}", unit, paper, improved(key), bound, worst=True, impossible=because
-        )
-
-    def off(*pairs: tuple[Sequence[float], float]) -> list[float]:
-        """By how much [%] ours are off what is printed."""
-        return [100 * abs(one / printed - 1) for ours, printed in pairs for one in ours]
-
-    velocity, position, both = table["velocity"], table["position"], table["both"]
-    in_radians = table["radians"]
-
     return [
-        Claim(
-            "heading on straights from 300 s, largest", "deg", "0.1", improved("heading_straight"), 0.1, worst=True
-        ),
-        any_seed("heading on straights from 300 s, largest", "deg", "0.1", "heading_straight", 0.08),
-        Claim("heading in turns and 10 s after, largest", "deg", "0.1", improved("heading_turn"), 0.3, worst=True),
-        Claim(
-            "the same without the turn rule", "deg", "large oscillation", of("ungated", "heading_turn"),
-            DRIFT_DEG / 2, at_least=True, worst=True,
-        ),
-        Claim(
-            "heading after 300 s of straight, without course, RMS over the seeds", "deg", "constant offset",
-            [_rms(left)], 1.0, at_least=True,
-        ),
-        Claim(
-            "its own 1 sigma then, of the initial one", "1", "offset whatever the initial error", claimed, 0.9,
-            at_least=True, worst=True,
-            impossible="nothing there shows the heading (Table 1: phi_U 0): what was wrong stays, and drifts",
-        ),
-        Claim(
-            "level before the first turn, largest", "deg", "0.01", improved("level_before"), 0.3,
-            impossible="at one heading a tilt can't be told from the accelerometer's bias (Table 1: nabla 0)",
-        ),
-        Claim("level after the first turn, RMS", "deg", "0.01", improved("level_rms"), 0.02, worst=True),
-        Claim("level after the first turn, 99.7 % of the time", "deg", "0.01", improved("level_nearly_all"), 0.02),
-        any_seed("level after the first turn, 99.7 % of the time", "deg", "0.01", "level_nearly_all", 0.02),
-        Claim("velocity, each axis, 99.7 % of the time", "m/s", "0.02", improved("velocity"), 0.02, worst=True),
-        Claim(
-            "position, each axis, RMS", "m", "1", improved("position_rms"), 0.6, target=0.6,
-        ),
-        any_seed("position, each axis, RMS", "m", "1", "position_rms", 0.6),
-        Claim("position, each axis, largest", "m", "1", improved("position_largest"), 1.5),
-        Claim(
-            "courses used in a turn or below 1 m/s", "", "0", improved("course_amiss"), 0, worst=True,
-        ),
-        Claim("courses used on straights, of 3 h", "", "all", [max(improved("course_looks"))], 5000, at_least=True),
-        Claim(
-            "smallest learned variance, of the nominal", "1", "may be negative (Eq 29)", improved("least_R"), 0.25,
-            at_least=True, worst=True,
-        ),
-        *(
-            Claim(
-                f"{what} variance x 4: learned within, after 200 looks", "1", "", [one[aid] for one in noises], 0.25
-            )
-            for what, aid in (("position", "gnss_position"), ("velocity", "gnss_velocity"))
-        ),
-        Claim(
-            "Table 1, velocity: phi, eps, dV off the print by", "%", "9.86, 9.80, 1",
-            off((velocity["phi"], 9.86), (velocity["eps"], 9.80), (velocity["dv"], 1.0)), 0.1, worst=True,
-        ),
-        Claim("Table 1, velocity: phi_U, nabla", "", "0", [velocity["unseen"]], 1e-9),
-        Claim(
-            "Table 1, velocity: eps_U", "", "5.66e-4", [velocity["eps_down"]], 1.01 * table["g_earth_rate"],
-            impossible="it is g w_ie cos 45 deg = 5.06e-4",
-        ),
-        Claim(
-            "Table 1, position: dV_N, dL, dlambda, phi_E, eps_N off the print by", "%", "1, 1, 1, 9.86, 9.81",
-            off(
-                (position["dv"][:1], 1.0), (position["dp"], 1.0), (position["phi"][1:], 9.86),
-                (position["eps"][:1], 9.81),
-            ), 0.1, worst=True,
-        ),
-        Claim(
-            "Table 1, position: dV_E, phi_N, eps_E off 1, 9.86, 9.81 by", "%", "3.14e-14, 8.43e-11, 1.79e-3",
-            off((position["dv"][1:], 1.0), (position["phi"][:1], 9.86), (position["eps"][1:], 9.81)), 0.1, worst=True,
-            impossible="at rest one level axis shows as the other does; with the fix left in radians along one of them,"
-            f" dV_E is {in_radians[0]:.1e} and one eps {in_radians[1]:.1e} (11 % less than printed, as eps_U)",
-        ),
-        Claim("Table 1, position: phi_U, nabla", "", "0", [position["unseen"]], 1e-9),
-        Claim(
-            "Table 1, position: eps_U", "", "9.03e-9", [position["eps_down"]], 0.99 * table["g_earth_rate"],
-            at_least=True, impossible="it is g w_ie cos 45 deg = 5.06e-4, one derivative later than by velocity",
-        ),
-        Claim(
-            "Table 1, velocity and position: phi, eps, dV, dL, dlambda off the print by", "%", "9.86, 9.80, 1, 1, 1",
-            off((both["phi"], 9.86), (both["eps"], 9.80), (both["dv"], 1.0), (both["dp"], 1.0)), 0.1, worst=True,
-        ),
-        Claim("Table 1, velocity and position: phi_U, nabla", "", "0", [both["unseen"]], 1e-9),
-        Claim(
-            "Table 1, velocity and position: eps_U", "", "5.66e-4", [both["eps_down"]],
-            1.01 * table["g_earth_rate"], impossible="as by velocity alone",
-        ),
-        Claim(
-            "ranks with velocity, position, heading, a turn: off by", "", "7, 9, 10, 12",
-            [abs(ours - printed) for ours, printed in zip(table["ranks"], (7, 9, 10, 12), strict=True)], 0, worst=True,
-        ),
-    ]  # fmt: skip
+        *_heading_claims(roads, straights),
+        *_level_claims(roads),
+        *_position_claims(roads),
+        *_course_claims(roads),
+        *_noise_claims(roads, noises),
+        *_velocity_table_claims(table),
+        *_position_table_claims(table),
+        *_both_table_claims(table),
+    ]
+
+
+def _of(roads: Sequence[Any], name: str, key: str) -> list[float]:
+    return [one[name][key] for one in roads if name in one]
+
+
+def _any_seed(roads: Sequence[Any], what: tuple[str, str, str], key: str, wanted: float) -> Claim:
+    """The worst seed; where the filter that need not learn is not within ``wanted`` either, next to that filter.
+
+    ``what`` are the quantity, its unit, and the paper's figure.
+    """
+    quantity, unit, paper = what
+    least = max(_of(roads, "told", key))
+    bound, because = wanted, ""
+    if least > wanted:
+        bound, because = NO_WORSE * least, f"with the variances told instead of learned it is {least:.3g}"
+    ours = _of(roads, "improved", key)
+    return Claim(f"{quantity}, any seed below {wanted:g}", unit, paper, ours, bound, worst=True, impossible=because)
+
+
+def _heading_claims(roads: Sequence[Any], straights: Sequence[tuple[float, float]]) -> Iterator[Claim]:
+    """With course and its turn rule, without the rule, and without course."""
+    left, claimed = np.array(straights).T
+    on_straights = "heading on straights from 300 s, largest"
+    straight, turn = _of(roads, "improved", "heading_straight"), _of(roads, "improved", "heading_turn")
+    yield Claim(on_straights, "deg", "0.1", straight, 0.1, worst=True)
+    yield _any_seed(roads, (on_straights, "deg", "0.1"), "heading_straight", 0.08)
+    yield Claim("heading in turns and 10 s after, largest", "deg", "0.1", turn, 0.3, worst=True)
+    yield Claim(
+        "the same without the turn rule", "deg", "large oscillation", _of(roads, "ungated", "heading_turn"),
+        DRIFT_DEG / 2, at_least=True, worst=True,
+    )  # fmt: skip
+    yield Claim(
+        "heading after 300 s of straight, without course, RMS over the seeds", "deg", "constant offset",
+        [_rms(left)], 1.0, at_least=True,
+    )  # fmt: skip
+    yield Claim(
+        "its own 1 sigma then, of the initial one", "1", "offset whatever the initial error", claimed, 0.9,
+        at_least=True, worst=True,
+        impossible="nothing there shows the heading (Table 1: phi_U 0): what was wrong stays, and drifts",
+    )  # fmt: skip
+
+
+def _level_claims(roads: Sequence[Any]) -> Iterator[Claim]:
+    """Before the first turn, and after it."""
+    before, rms, nearly_all = (_of(roads, "improved", key) for key in ("level_before", "level_rms", "level_nearly_all"))
+    yield Claim(
+        "level before the first turn, largest", "deg", "0.01", before, 0.3,
+        impossible="at one heading a tilt can't be told from the accelerometer's bias (Table 1: nabla 0)",
+    )  # fmt: skip
+    yield Claim("level after the first turn, RMS", "deg", "0.01", rms, 0.02, worst=True)
+    most_of_the_time = "level after the first turn, 99.7 % of the time"
+    yield Claim(most_of_the_time, "deg", "0.01", nearly_all, 0.02)
+    yield _any_seed(roads, (most_of_the_time, "deg", "0.01"), "level_nearly_all", 0.02)
+
+
+def _position_claims(roads: Sequence[Any]) -> Iterator[Claim]:
+    """Velocity and position."""
+    velocity, rms, largest = (_of(roads, "improved", key) for key in ("velocity", "position_rms", "position_largest"))
+    yield Claim("velocity, each axis, 99.7 % of the time", "m/s", "0.02", velocity, 0.02, worst=True)
+    yield Claim("position, each axis, RMS", "m", "1", rms, 0.6, target=0.6)
+    yield _any_seed(roads, ("position, each axis, RMS", "m", "1"), "position_rms", 0.6)
+    yield Claim("position, each axis, largest", "m", "1", largest, 1.5)
+
+
+def _course_claims(roads: Sequence[Any]) -> Iterator[Claim]:
+    """Whether course is used when it should be, and only then."""
+    amiss, looks = _of(roads, "improved", "course_amiss"), _of(roads, "improved", "course_looks")
+    yield Claim("courses used in a turn or below 1 m/s", "", "0", amiss, 0, worst=True)
+    yield Claim("courses used on straights, of 3 h", "", "all", [max(looks)], 5000, at_least=True)
+
+
+def _noise_claims(roads: Sequence[Any], noises: Sequence[Any]) -> Iterator[Claim]:
+    """The variances that are learned."""
+    yield Claim(
+        "smallest learned variance, of the nominal", "1", "may be negative (Eq 29)",
+        _of(roads, "improved", "least_R"), 0.25, at_least=True, worst=True,
+    )  # fmt: skip
+    for what, aid in (("position", "gnss_position"), ("velocity", "gnss_velocity")):
+        off = [one[aid] for one in noises]
+        yield Claim(f"{what} variance x 4: learned within, after 200 looks", "1", "", off, 0.25)
+
+
+def _off(*pairs: tuple[Sequence[float], float]) -> list[float]:
+    """By how much [%] ours are off what is printed."""
+    return [100 * abs(one / printed - 1) for ours, printed in pairs for one in ours]
+
+
+def _velocity_table_claims(table: Any) -> Iterator[Claim]:
+    """Table 1, the column of measured velocity."""
+    velocity = table["velocity"]
+    yield Claim(
+        "Table 1, velocity: phi, eps, dV off the print by", "%", "9.86, 9.80, 1",
+        _off((velocity["phi"], 9.86), (velocity["eps"], 9.80), (velocity["dv"], 1.0)), 0.1, worst=True,
+    )  # fmt: skip
+    yield Claim("Table 1, velocity: phi_U, nabla", "", "0", [velocity["unseen"]], 1e-9)
+    yield Claim(
+        "Table 1, velocity: eps_U", "", "5.66e-4", [velocity["eps_down"]], 1.01 * table["g_earth_rate"],
+        impossible="it is g w_ie cos 45 deg = 5.06e-4",
+    )  # fmt: skip
+
+
+def _position_table_claims(table: Any) -> Iterator[Claim]:
+    """Table 1, the column of measured position."""
+    position, in_radians = table["position"], table["radians"]
+    yield Claim(
+        "Table 1, position: dV_N, dL, dlambda, phi_E, eps_N off the print by", "%", "1, 1, 1, 9.86, 9.81",
+        _off(
+            (position["dv"][:1], 1.0), (position["dp"], 1.0), (position["phi"][1:], 9.86),
+            (position["eps"][:1], 9.81),
+        ), 0.1, worst=True,
+    )  # fmt: skip
+    yield Claim(
+        "Table 1, position: dV_E, phi_N, eps_E off 1, 9.86, 9.81 by", "%", "3.14e-14, 8.43e-11, 1.79e-3",
+        _off((position["dv"][1:], 1.0), (position["phi"][:1], 9.86), (position["eps"][1:], 9.81)), 0.1, worst=True,
+        impossible="at rest one level axis shows as the other does; with the fix left in radians along one of them,"
+        f" dV_E is {in_radians[0]:.1e} and one eps {in_radians[1]:.1e} (11 % less than printed, as eps_U)",
+    )  # fmt: skip
+    yield Claim("Table 1, position: phi_U, nabla", "", "0", [position["unseen"]], 1e-9)
+    yield Claim(
+        "Table 1, position: eps_U", "", "9.03e-9", [position["eps_down"]], 0.99 * table["g_earth_rate"],
+        at_least=True, impossible="it is g w_ie cos 45 deg = 5.06e-4, one derivative later than by velocity",
+    )  # fmt: skip
+
+
+def _both_table_claims(table: Any) -> Iterator[Claim]:
+    """Table 1, the column of both, and the ranks."""
+    both = table["both"]
+    yield Claim(
+        "Table 1, velocity and position: phi, eps, dV, dL, dlambda off the print by", "%", "9.86, 9.80, 1, 1, 1",
+        _off((both["phi"], 9.86), (both["eps"], 9.80), (both["dv"], 1.0), (both["dp"], 1.0)), 0.1, worst=True,
+    )  # fmt: skip
+    yield Claim("Table 1, velocity and position: phi_U, nabla", "", "0", [both["unseen"]], 1e-9)
+    yield Claim(
+        "Table 1, velocity and position: eps_U", "", "5.66e-4", [both["eps_down"]], 1.01 * table["g_earth_rate"],
+        impossible="as by velocity alone",
+    )  # fmt: skip
+    off = [abs(ours - printed) for ours, printed in zip(table["ranks"], (7, 9, 10, 12), strict=True)]
+    yield Claim("ranks with velocity, position, heading, a turn: off by", "", "7, 9, 10, 12", off, 0, worst=True)
 
 
 def _draw(results: Sequence[Any], out: Path) -> None:

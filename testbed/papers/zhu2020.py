@@ -7,7 +7,7 @@ estimate - truth once a second, position and velocity NED, attitude phi.
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -27,6 +27,7 @@ from testbed.feeds.known import handed_over
 from testbed.feeds.simulated import motion
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.papers.misprints import inflation_by_newton, inflation_upside_down, weights_eq13
+from testbed.report.style import COLOURS, SHADE
 from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score.metrics import attitude_error
@@ -51,6 +52,7 @@ OUTAGE = (1500.0, 2500.0)
 CONVERGED_S = 600.0  # the paper doesn't say when
 COMMON = 15  # states that the local filters share
 P_N, P_E, V_N, V_E, HEADING = 0, 1, 3, 4, 8  # columns of errors
+HORIZONTAL = (P_N, P_E)
 LIMIT = chi_square_threshold(0.01, 2)
 CASES = 4000
 WEIGHTS = (weights_by_covariance, weights_eq13)
@@ -181,94 +183,133 @@ def conclude(results: Sequence[Any]) -> list[Claim]:
     """Every claim beside the paper's."""
     seeds = len(results) // len(RUNS)
     of = {run: results[k * seeds : (k + 1) * seeds] for k, run in enumerate(RUNS)}
-    solved = results[len(RUNS) * seeds :]
-    claims = []
-    for run in ("30 s", "1 Hz"):
-        every = f"log every {run}" if run == "30 s" else "log at 1 Hz"
-        for what, column, paper, bound in (
-            ("v_E", V_E, 0.0874 / 0.2154, 0.45),
-            ("v_N", V_N, 0.1804 / 0.2948, 0.65),
-            ("latitude", P_N, 7.191 / 19.30, 0.4),
-            ("longitude", P_E, 6.330 / 19.84, 0.4),
-        ):
-            ratios = [_std(one["frkf"], column) / _std(one["tfkf"], column) for one in of[run]]
-            name = f"{every}: std of {what}, robust over traditional"
-            claims.append(Claim(name, "", f"{paper:.2f}", ratios, bound, target=paper))
-        speed, paper_speed = (0.1, "0.087, 0.180") if run == "30 s" else (0.03, "—")
-        for what, unit, columns, paper_std, bound in (
-            ("v_E or v_N", "m/s", (V_E, V_N), paper_speed, speed),
-            ("latitude or longitude", "m", (P_N, P_E), "7.2, 6.3" if run == "30 s" else "—", 6.0),
-        ):
-            largest = [max(_std(one["frkf"], column) for column in columns) for one in of[run]]
-            claims.append(
-                Claim(f"{every}: std of {what}, worst seed", unit, paper_std, largest, bound, worst=True, target=bound)
-            )
+    return [
+        *_spread_claims("30 s", "log every 30 s", of["30 s"]),
+        *_spread_claims("1 Hz", "log at 1 Hz", of["1 Hz"]),
+        *_converged_claims(of["30 s"]),
+        *_step_claims(of["1 Hz"]),
+        *_outage_claims(of["outage"]),
+        *_clean_claims(of["clean"]),
+        *_solver_claims(results[len(RUNS) * seeds :]),
+    ]
 
-    def late(column: Sequence[int]) -> list[float]:
-        return [_largest(one["frkf"], column, CONVERGED_S, 3600) for one in of["30 s"]]
 
-    def degrees(columns: Sequence[int]) -> list[float]:
-        return [float(np.degrees(value)) for value in late(columns)]
+def _spread_claims(run: str, every: str, flown: Sequence[Mapping[str, Flown]]) -> Iterator[Claim]:
+    """Standard deviations of the robust filter, beside the traditional one's and by themselves."""
+    for what, column, paper, bound in (
+        ("v_E", V_E, 0.0874 / 0.2154, 0.45),
+        ("v_N", V_N, 0.1804 / 0.2948, 0.65),
+        ("latitude", P_N, 7.191 / 19.30, 0.4),
+        ("longitude", P_E, 6.330 / 19.84, 0.4),
+    ):
+        ratios = [_std(one["frkf"], column) / _std(one["tfkf"], column) for one in flown]
+        name = f"{every}: std of {what}, robust over traditional"
+        yield Claim(name, "", f"{paper:.2f}", ratios, bound, target=paper)
+    speed, paper_speed = (0.1, "0.087, 0.180") if run == "30 s" else (0.03, "—")
+    for what, unit, columns, paper_std, bound in (
+        ("v_E or v_N", "m/s", (V_E, V_N), paper_speed, speed),
+        ("latitude or longitude", "m", (P_N, P_E), "7.2, 6.3" if run == "30 s" else "—", 6.0),
+    ):
+        largest = [max(_std(one["frkf"], column) for column in columns) for one in flown]
+        name = f"{every}: std of {what}, worst seed"
+        yield Claim(name, unit, paper_std, largest, bound, worst=True, target=bound)
 
-    def lost(name: str, columns: Sequence[int], start: float = OUTAGE[0]) -> list[float]:
-        return [_largest(one[name], columns, start, OUTAGE[1]) for one in of["outage"]]
+
+def _converged_claims(flown: Sequence[Mapping[str, Flown]]) -> Iterator[Claim]:
+    """Largest errors of the robust filter from `CONVERGED_S` on, the log every 30 s."""
+    for what, unit, columns, limit in (
+        ("pitch and roll", "deg", (6, 7), 0.01),
+        ("heading", "deg", (HEADING,), 0.2),
+        ("v_E", "m/s", (V_E,), 0.2),
+        ("v_N", "m/s", (V_N,), 0.3),
+        ("latitude", "m", (P_N,), 21.0),
+        ("longitude", "m", (P_E,), 16.0),
+    ):
+        late = [_largest(one["frkf"], columns, CONVERGED_S, 3600) for one in flown]
+        ours = [float(np.degrees(value)) for value in late] if unit == "deg" else late
+        yield Claim(f"after convergence, largest error of {what}", unit, f"< {limit:g}", ours, limit)
+
+
+def _step_claims(flown: Sequence[Mapping[str, Flown]]) -> Iterator[Claim]:
+    """By how much a wrong fix moves either filter, the log at 1 Hz."""
 
     def steps(name: str) -> list[float]:
-        return [float(one[name].step.max()) for one in of["1 Hz"]]
+        return [float(one[name].step.max()) for one in flown]
 
-    def weight(flown: Flown, weights: str) -> float:
-        return float(getattr(flown, weights)[round(OUTAGE[1] / BLOCK_S) - 1])
+    yield Claim("largest step at a wrong fix, any state, worst seed", "sigma", "—", steps("frkf"), 1.0, worst=True)
+    yield Claim("the same, traditional", "sigma", "jumps", steps("tfkf"), 1.0, at_least=True, worst=True)
 
-    after, gap, horizontal = "after convergence, largest error of", "1000 s of outage, largest error", (P_N, P_E)
-    worst = "worst seed"
-    printed_weights = [weight(one[NO_RESET], "by_eq13") for one in of["outage"]]
-    weights = [weight(one[NO_RESET], "by_trace") for one in of["outage"]]
-    share = "weight of the transponder's filter at the end of it"
-    return [
-        *claims,
-        Claim(f"{after} pitch and roll", "deg", "< 0.01", degrees((6, 7)), 0.01),
-        Claim(f"{after} heading", "deg", "< 0.2", degrees((HEADING,)), 0.2),
-        Claim(f"{after} v_E", "m/s", "< 0.2", late((V_E,)), 0.2),
-        Claim(f"{after} v_N", "m/s", "< 0.3", late((V_N,)), 0.3),
-        Claim(f"{after} latitude", "m", "< 21", late((P_N,)), 21.0),
-        Claim(f"{after} longitude", "m", "< 16", late((P_E,)), 16.0),
-        Claim("largest step at a wrong fix, any state, worst seed", "sigma", "—", steps("frkf"), 1.0, worst=True),
-        Claim("the same, traditional", "sigma", "jumps", steps("tfkf"), 1.0, at_least=True, worst=True),
-        Claim(f"{gap} of latitude, {worst}", "m", "17.6", lost("frkf", (P_N,)), 20.0, worst=True, target=17.57),
-        Claim(f"{gap} of longitude, {worst}", "m", "18.7", lost("frkf", (P_E,)), 20.0, worst=True, target=18.68),
-        Claim(f"{gap} of latitude, no reset", "m", "17.6", lost(NO_RESET, (P_N,)), 20.0, target=17.57),
-        Claim(f"{gap} of longitude, no reset", "m", "18.7", lost(NO_RESET, (P_E,)), 20.0, target=18.68),
-        Claim(f"{gap} of the log's filter alone", "m", "81.5", lost("rkf_dvl", horizontal), 81.53),
-        Claim(
-            "error of the transponder's filter alone at the end of it", "m", "225",
-            lost("rkf_ast", horizontal, OUTAGE[1]), 100.0, at_least=True,
-        ),
-        Claim(f"{share}, by the traces", "", "—", weights, 0.05),
-        Claim(
-            f"{share}, by equation 13", "", "→ 0", printed_weights, 0.15, at_least=True,
-            impossible="it adds (rad/s)^-4 to m^-4: the gyro biases alone decide, and a lost position doesn't count",
-        ),
-        Claim(
-            f"{gap} with the weights of equation 13", "m", "18.7", lost(EQ13, horizontal), 20.0, at_least=True,
-            impossible="a filter that is lost keeps such a weight",
-        ),
-        Claim(
-            "sound Gaussian data: RMS of position, loss by inflation", "%", "—",
-            [_loss(one["frkf"], one["tfkf"], horizontal) for one in of["clean"]], 2.0,
-        ),
-        Claim(
-            "sound Gaussian data: RMS of velocity, loss by inflation", "%", "—",
-            [_loss(one["frkf"], one["tfkf"], (V_N, V_E)) for one in of["clean"]], 2.0,
-        ),
-        Claim(f"iterations for lambda, most of {CASES}", "", "—", [one["newton"] for one in solved], 17.0),
-        Claim("the same on the reciprocal", "", "—", [one["reciprocal"] for one in solved], 5.0),
-        Claim("distance after inflation, off its limit by", "", "—", [one["off"] for one in solved], 1e-5),
-        Claim(
-            "equation 12 as printed: outliers whose lambda it finds within 1 %", "%", "all",
-            [one["near"] for one in solved], 5.0,
-            impossible="its fraction is upside down: steps too small for a gross error, too large for a slight one",
-        ),
-    ]  # fmt: skip
+
+def _outage_claims(flown: Sequence[Mapping[str, Flown]]) -> Iterator[Claim]:
+    """1000 s without a fix: largest errors, and what the lost filter still counts for."""
+
+    def lost(name: str, columns: Sequence[int], start: float = OUTAGE[0]) -> list[float]:
+        return [_largest(one[name], columns, start, OUTAGE[1]) for one in flown]
+
+    at_the_end = round(OUTAGE[1] / BLOCK_S) - 1
+    by_trace, by_eq13 = (
+        [float(one[NO_RESET].by_trace[at_the_end]) for one in flown],
+        [float(one[NO_RESET].by_eq13[at_the_end]) for one in flown],
+    )
+    gap, share = "1000 s of outage, largest error", "weight of the transponder's filter at the end of it"
+    for name, which, worst in (("frkf", "worst seed", True), (NO_RESET, "no reset", False)):
+        for what, column, paper in (("latitude", P_N, 17.57), ("longitude", P_E, 18.68)):
+            found = lost(name, (column,))
+            quantity = f"{gap} of {what}, {which}"
+            yield Claim(quantity, "m", f"{paper:.1f}", found, 20.0, worst=worst, target=paper)
+    yield Claim(f"{gap} of the log's filter alone", "m", "81.5", lost("rkf_dvl", HORIZONTAL), 81.53)
+    yield Claim(
+        "error of the transponder's filter alone at the end of it", "m", "225",
+        lost("rkf_ast", HORIZONTAL, OUTAGE[1]), 100.0, at_least=True,
+    )  # fmt: skip
+    yield Claim(f"{share}, by the traces", "", "—", by_trace, 0.05)
+    yield Claim(
+        f"{share}, by equation 13", "", "→ 0", by_eq13, 0.15, at_least=True,
+        impossible="it adds (rad/s)^-4 to m^-4: the gyro biases alone decide, and a lost position doesn't count",
+    )  # fmt: skip
+    yield Claim(
+        f"{gap} with the weights of equation 13", "m", "18.7", lost(EQ13, HORIZONTAL), 20.0, at_least=True,
+        impossible="a filter that is lost keeps such a weight",
+    )  # fmt: skip
+
+
+def _clean_claims(flown: Sequence[Mapping[str, Flown]]) -> Iterator[Claim]:
+    """What inflation costs where nothing is wrong."""
+    for what, columns in (("position", HORIZONTAL), ("velocity", (V_N, V_E))):
+        loss = [_loss(one["frkf"], one["tfkf"], columns) for one in flown]
+        yield Claim(f"sound Gaussian data: RMS of {what}, loss by inflation", "%", "—", loss, 2.0)
+
+
+def _solver_claims(solved: Sequence[Mapping[str, float]]) -> Iterator[Claim]:
+    """Equation 12: put right, on the reciprocal, and as printed."""
+
+    def of(key: str) -> list[float]:
+        return [one[key] for one in solved]
+
+    yield Claim(f"iterations for lambda, most of {CASES}", "", "—", of("newton"), 17.0)
+    yield Claim("the same on the reciprocal", "", "—", of("reciprocal"), 5.0)
+    yield Claim("distance after inflation, off its limit by", "", "—", of("off"), 1e-5)
+    yield Claim(
+        "equation 12 as printed: outliers whose lambda it finds within 1 %", "%", "all", of("near"), 5.0,
+        impossible="its fraction is upside down: steps too small for a gross error, too large for a slight one",
+    )  # fmt: skip
+
+
+# --- figure
+
+ROWS = (
+    (P_N, "latitude error [m]"),
+    (P_E, "longitude error [m]"),
+    (V_N, "v$_N$ error [m/s]"),
+    (V_E, "v$_E$ error [m/s]"),
+)
+SHOWN = np.arange(0, 3601, 10)  # [s]
+ALONE = (
+    ("rkf_ast", "transponder alone", COLOURS[1]),
+    ("rkf_dvl", "log alone", COLOURS[2]),
+    ("frkf", "federated", COLOURS[0]),
+    (NO_RESET, "federated, no reset", COLOURS[3]),
+)
 
 
 def draw(results: Sequence[Any], out: Path) -> None:
@@ -276,69 +317,57 @@ def draw(results: Sequence[Any], out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from testbed.report.style import COLOURS, SHADE
-
     seeds = len(results) // len(RUNS)
     first = {run: results[k * seeds] for k, run in enumerate(RUNS)}
     figure = Figure(figsize=(11.0, 7.6), dpi=78, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(4, 2, height_ratios=(1, 1, 1, 1))
-    blue, orange, green, pink = COLOURS[:4]
-    river, outage = first["30 s"], first["outage"]
-    shown = np.arange(0, 3601, 10)
-    rows = (
-        (P_N, "latitude error [m]"),
-        (P_E, "longitude error [m]"),
-        (V_N, "v$_N$ error [m/s]"),
-        (V_E, "v$_E$ error [m/s]"),
-    )
-    for ax, (column, label) in zip(panels[:, 0], rows, strict=True):
-        for name, text, colour in (("tfkf", "traditional", orange), ("frkf", "robust", blue)):
-            ax.plot(shown, river[name].error[shown, column], color=colour, lw=0.9, label=text)
-        ax.plot(
-            OUTLIERS,
-            np.full(len(OUTLIERS), 0.97),
-            "v",
-            color="black",
-            ms=3.5,
-            transform=ax.get_xaxis_transform(),
-            label="fix 500 m wrong",
-        )
-        ax.set_ylabel(label)
-        ax.set_ylim(*((-15, 60) if column in (P_N, P_E) else (-0.15, 0.2)))
-    panels[0, 0].set_title("Fixes 500 m wrong every 150 s, log every 30 s", fontsize=10)
-    panels[0, 0].legend(loc="upper right", bbox_to_anchor=(1, 0.97), ncols=3, fontsize=8, frameon=False)
-    alone = (
-        ("rkf_ast", "transponder alone", orange),
-        ("rkf_dvl", "log alone", green),
-        ("frkf", "federated", blue),
-        (NO_RESET, "federated, no reset", pink),
-    )
-    for ax, (column, label) in zip(panels[:2, 1], rows, strict=False):
-        for name, text, colour in alone:
-            ax.plot(shown, outage[name].error[shown, column], color=colour, lw=1.1, label=text)
-        ax.set_ylabel(label)
-        ax.set_ylim(-100, 60)
-    panels[0, 1].set_title("No fix from 1500 s to 2500 s", fontsize=10)
-    panels[0, 1].legend(loc="lower left", fontsize=7.5, frameon=False)
-    t = BLOCK_S * (1 + np.arange(len(outage[NO_RESET].by_trace)))
-    panels[2, 1].plot(t, outage[NO_RESET].by_trace, color=blue, lw=1.3, label="by the traces of position and velocity")
-    panels[2, 1].plot(t, outage[NO_RESET].by_eq13, color="black", lw=1.3, ls="--", label="by equation 13 as printed")
-    panels[2, 1].set_ylabel("weight of transponder")
-    panels[2, 1].set_ylim(0, 1)
-    panels[2, 1].legend(loc="upper left", fontsize=8, frameon=False)
-    for ax in panels[:3, 1]:
-        ax.axvspan(*OUTAGE, color=SHADE, lw=0, zorder=0)
+    _draw_river(panels[:, 0], first["30 s"])
+    _draw_outage(panels[:3, 1], first["outage"])
     for ax in (*panels[:, 0], *panels[:3, 1]):
         ax.set_xlim(0, 3600)
         ax.set_xlabel("time [s]" if ax in (panels[3, 0], panels[2, 1]) else "")
-    _bars(panels[3, 1], outage, alone)
+    _draw_bars(panels[3, 1], first["outage"])
     for ax in panels.flat:
         ax.grid(alpha=0.35, lw=0.6)
         ax.spines[["top", "right"]].set_visible(False)
     image = io.BytesIO()
     figure.savefig(image, format="png")
     write_result(out / "zhu2020.png", image.getvalue())
+
+
+def _draw_river(panels: Sequence[Axes], river: Mapping[str, Flown]) -> None:
+    """Errors of both filters, and when the fixes are wrong."""
+    for ax, (column, label) in zip(panels, ROWS, strict=True):
+        for name, text, colour in (("tfkf", "traditional", COLOURS[1]), ("frkf", "robust", COLOURS[0])):
+            ax.plot(SHOWN, river[name].error[SHOWN, column], color=colour, lw=0.9, label=text)
+        top = ax.get_xaxis_transform()
+        flags = np.full(len(OUTLIERS), 0.97)
+        ax.plot(OUTLIERS, flags, "v", color="black", ms=3.5, transform=top, label="fix 500 m wrong")
+        ax.set_ylabel(label)
+        ax.set_ylim(*((-15, 60) if column in (P_N, P_E) else (-0.15, 0.2)))
+    panels[0].set_title("Fixes 500 m wrong every 150 s, log every 30 s", fontsize=10)
+    panels[0].legend(loc="upper right", bbox_to_anchor=(1, 0.97), ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_outage(panels: Sequence[Axes], outage: Mapping[str, Flown]) -> None:
+    """Errors of each filter alone and of both, and what the lost one counts for."""
+    for ax, (column, label) in zip(panels[:2], ROWS, strict=False):
+        for name, text, colour in ALONE:
+            ax.plot(SHOWN, outage[name].error[SHOWN, column], color=colour, lw=1.1, label=text)
+        ax.set_ylabel(label)
+        ax.set_ylim(-100, 60)
+    panels[0].set_title("No fix from 1500 s to 2500 s", fontsize=10)
+    panels[0].legend(loc="lower left", fontsize=7.5, frameon=False)
+    weights, ax = outage[NO_RESET], panels[2]
+    t = BLOCK_S * (1 + np.arange(len(weights.by_trace)))
+    ax.plot(t, weights.by_trace, color=COLOURS[0], lw=1.3, label="by the traces of position and velocity")
+    ax.plot(t, weights.by_eq13, color="black", lw=1.3, ls="--", label="by equation 13 as printed")
+    ax.set_ylabel("weight of transponder")
+    ax.set_ylim(0, 1)
+    ax.legend(loc="upper left", fontsize=8, frameon=False)
+    for ax in panels:
+        ax.axvspan(*OUTAGE, color=SHADE, lw=0, zorder=0)
 
 
 PAPER_TABLE_3 = {
@@ -348,9 +377,9 @@ PAPER_TABLE_3 = {
 }  # latitude, longitude [m]
 
 
-def _bars(ax: Axes, outage: Mapping[str, Flown], shown: Sequence[tuple[str, str, str]]) -> None:
+def _draw_bars(ax: Axes, outage: Mapping[str, Flown]) -> None:
     """Largest errors of the outage, latitude and longitude, beside those of Table 3."""
-    for k, (name, _, colour) in enumerate(shown):
+    for k, (name, _, colour) in enumerate(ALONE):
         for i, column in enumerate((P_N, P_E)):
             x, value = k + 0.36 * i - 0.18, _largest(outage[name], (column,), *OUTAGE)
             ax.bar(x, value, 0.32, color=colour)
@@ -361,7 +390,7 @@ def _bars(ax: Axes, outage: Mapping[str, Flown], shown: Sequence[tuple[str, str,
                 )
     ax.set_yscale("log")
     ax.set_ylim(1, 1000)
-    ax.set_xticks(range(len(shown)), [text for _, text, _ in shown], fontsize=8)
+    ax.set_xticks(range(len(ALONE)), [text for _, text, _ in ALONE], fontsize=8)
     ax.set_ylabel("largest error [m]")
     ax.legend(loc="upper right", fontsize=8, frameon=False)
 
