@@ -1,6 +1,6 @@
 """Navigation from sensors alone: strapdown, error-state filters, aiding, detection.
 
-This page is the constitution of the house; `testbed` follows it too.
+These conventions hold everywhere in the project, in `testbed` too.
 
 Frames
     ``i`` inertial, ``e`` ECEF (WGS84), ``n`` local north-east-down at the current position,

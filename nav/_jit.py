@@ -73,7 +73,7 @@ def njit(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def embedded(function: Callable[P, R]) -> Callable[P, R]:
-    """As `njit`, and repeated in the machine code of every kernel that calls it: where handing over arrays would show.
+    """As `njit`, and repeated in the machine code of every kernel that calls it, where handing over arrays takes long.
 
     For a function that is called from Python as well, or from several kernels.
     """

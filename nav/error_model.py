@@ -22,8 +22,9 @@ derivatives of the radii and of gravity are left out: they are a thousand times 
 
 A paper whose filter has fewer states, or has them in another order, is a list of axes of blocks (`PAPERS`): where they
 lie, `ErrorModel.places`, picks its rows and columns out of any matrix of the model, and its F by
-F[np.ix_(places, places)] (`nav.observability.continuous`). What is left out counts as known: 13 states on the road and
-on the river know height and vertical velocity, 6 of attitude alone know that the body rests, so that w_in = w_ie.
+F[np.ix_(places, places)] (`nav.observability.continuous`). What is left out is taken for known without error: height
+and vertical velocity by the 13 states on the road and on the river; by the 6 of attitude alone the velocity, which is
+zero, so that w_in = w_ie.
 
 Source: Groves, Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems, 2nd ed., section 14.2.4,
 with position in metres; Titterton and Weston, 2nd ed., chapter 12. Verified in the tests by finite differences.

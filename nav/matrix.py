@@ -1,8 +1,8 @@
 """Products of small matrices for kernels, eight columns at a time in the processor's vector registers.
 
 The compiler makes vectors of loops over long arrays, but none of those over the fifteen columns of a covariance, so
-that the innermost loop is written here in its own language. Each element is summed one term after the other, as
-written: the result does not depend on how wide the registers are.
+that the innermost loop is written here in the language of the compiler (LLVM). Each element is summed one term after
+the other, as written: the result does not depend on how wide the registers are.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class LowDynamics:
-    """Whether the body is as good as unaccelerated: three tests on means over a second, and the autopilot's word.
+    """Whether the body is hardly accelerated: three tests on means over a second, and what the autopilot commands.
 
     ``acceleration_limit`` [m/s^2] on what specific force shows beyond gravity, ``yaw_rate_limit`` and
     ``roll_rate_limit`` [rad/s] on the rates about body z and x. The ``norm`` test takes ``| |f| - g |``, which no

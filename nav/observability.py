@@ -13,7 +13,7 @@ With Q = U S V', the singular value of the right vector in which a state dominat
 (`Observability.degree`, relative to that of a reference state if one is given).
 
 Singular values depend on units. `in_units` changes them, once and in the open: with the state in its prior 1-sigma,
-the measurement in its noise and time in the length of a look, a value of 1 is an error that just shows.
+the measurement in its noise and time in the interval between measurements, a value of 1 is an error that just shows.
 
 Sources: Goshen-Meskin and Bar-Itzhack, IEEE Trans. AES 28 (1992) 1056; Cheng et al. 2020, Eq 15-21, which print the
 discrete Phi where the continuous F belongs: e^Phi is no transition.
@@ -193,37 +193,37 @@ def along(names: list[str], segments: Sequence[Segment], start_s: float, toleran
     return Visibility(names, *map(np.array, (edges, rank, degree, share, alone)))
 
 
-def looked_at(
+def visibility(
     names: list[str],
     t: Array,
     F: Array | Sequence[Array],
-    looks: Sequence[tuple[Array, Array]],
+    measurements: Sequence[tuple[Array, Array]],
     prior: Array,
-    look_s: float,
+    time_s: float,
 ) -> Visibility:
     """Which states can be seen, and when, in N segments with edges ``t`` (N + 1,) [s].
 
-    Each has its ``F`` (n, n) and its look: H (m, n) and the 1-sigma of its noise (m,), m zero where nothing was looked
-    at. ``prior`` (n,) is the 1-sigma of the states, none of them zero; all set the units together with ``look_s`` [s],
-    the time that a derivative is given to show. A direction counts as seen when its singular value is more than 1: when
-    an error as large as the prior moves the measurements by their noise. Each segment counts as one look; like looks
-    add up with the root of their number.
+    Each has its ``F`` (n, n) and one of the ``measurements``: H (m, n) and the 1-sigma of its noise (m,), m zero where
+    nothing was measured. ``prior`` (n,) is the 1-sigma of the states, none of them zero; together with ``time_s`` [s],
+    the time that a derivative is given to show, they set the units. A direction counts as seen when its singular value
+    is more than 1: when an error as large as the prior moves the measurements by their noise. Each segment counts as
+    one measurement; n equal ones are worth the root of n of them.
     """
     segments = [
-        in_units(Segment(F_k, H, duration), prior, noise, look_s)
-        for F_k, (H, noise), duration in zip(F, looks, np.diff(t).tolist(), strict=True)
+        in_units(Segment(F_k, H, duration), prior, noise, time_s)
+        for F_k, (H, noise), duration in zip(F, measurements, np.diff(t).tolist(), strict=True)
     ]
     return replace(along(names, segments, 0.0), t=t)
 
 
 def flown(
     model: ErrorModel, t: Array, q_nb: Array, v_n: Array, lla: Array, f_b: Array, omega_b: Array,
-    looks: Sequence[tuple[Array, Array]], prior: Array, look_s: float,
+    measurements: Sequence[tuple[Array, Array]], prior: Array, time_s: float,
 ) -> Visibility:  # fmt: skip
-    """Which states of ``model`` can be seen, and when, along a flown trajectory: see `looked_at`.
+    """Which states of ``model`` can be seen, and when, along a flown trajectory: see `visibility`.
 
     The arrays of motion are those of the segments' middles: attitude (N, 4), velocity (N, 3), place (N, 3), specific
     force and rate in b (N, 3).
     """
     F = [continuous(model, *here) for here in zip(q_nb, v_n, lla, f_b, omega_b, strict=True)]
-    return looked_at(state_names(model), t, F, looks, prior, look_s)
+    return visibility(state_names(model), t, F, measurements, prior, time_s)

@@ -10,7 +10,7 @@ where it was. Where the autopilot flies on an estimate, differences grow: most m
 worst of an estimator by 2.7 %, the worst of the flight by 6 %. So the tolerance is 5 %, and 10 % of the flight's, while
 filters that are wrong by a sign, by a latency or by a milli-g differ by more. Floors are for what is next to zero.
 Metrics that count events, or say when one was, jump by whole events if one sample lies at the edge of a gate: a few
-events, or looks of a sensor at 5 Hz, are no difference.
+events, or samples of a sensor at 5 Hz, are no difference.
 """
 
 from __future__ import annotations

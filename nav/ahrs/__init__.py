@@ -4,7 +4,7 @@ Six error states, attitude error phi and gyro bias error, both estimate - truth 
 
     phi' = -[w_ie x] phi + C_nb b_g,    b_g a random walk
 
-Once per ``period_s`` the mean specific force in computed n axes is looked at. Without acceleration its horizontal part
+Once per ``period_s`` the mean specific force in computed n axes is examined. Without acceleration its horizontal part
 is tilt, f_N = g phi_E, f_E = -g phi_N, and `nav.motion.LowDynamics` says whether there is none. With an airspeed sensor
 the acceleration in a steady wind is known (`nav.motion.acceleration_n`) and is taken off first, so that slow turns do
 no harm and a loiter can be levelled in too. The correction reaches the attitude in steps of at most ``phi_limit`` per

@@ -66,7 +66,7 @@ class Ahrs:
         if field_n is not None:
             H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
         H[0, PHI + 2] = -1.0
-        self.heading_look = H, np.array([config.magnetometer_sigma**2])  # H (1, 6) and R (1,) of a heading
+        self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, 6) and R (1,) of a heading
         self._last_bad = -math.inf
 
     @property
@@ -253,10 +253,10 @@ class Ahrs:
             s.mode_counter = s.correction_counter = 0
             return
         s.mode_counter += 1
-        reports.append(_fuse(s, *self.level_look(omega_b, compensated), f_n[:2], t, "accelerometer", LEVEL))
+        reports.append(_fuse(s, *self.level_measurement(omega_b, compensated), f_n[:2], t, "accelerometer", LEVEL))
         self._feed_back(s)
 
-    def level_look(self, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
+    def level_measurement(self, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
         """H (2, 6) and R (2,) of a levelling, at the rate ``omega_b``, with the acceleration taken off or without."""
         variance = self.config.force_sigma**2
         if compensated:
@@ -300,7 +300,7 @@ class Ahrs:
             return []
         self._settle(s)
         z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
-        return [_fuse(s, *self.heading_look, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
+        return [_fuse(s, *self.heading_measurement, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
 
     def _settle(self, s: State) -> None:
         """Bring error states and covariance up to the time of the attitude."""

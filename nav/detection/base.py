@@ -27,7 +27,7 @@ class Event(Enum):
 
 
 class Decision(NamedTuple):
-    """A detector's word on one sample."""
+    """What a detector says of one sample."""
 
     alarm: bool  # the sensor is taken for faulty
     statistic: float  # NaN or infinite when the sample can't be judged: no number, or S not positive definite

@@ -30,8 +30,8 @@ quantities with a hat are those of the strapdown:
     phi' = -[w_in_hat x] phi + J_r^-1(phi) C_nb_hat db_g + J_l^-1(phi) dw_in
     dv'  = (I - E^-1) C_nb_hat f_hat - E^-1 C_nb_hat db_a + (linear terms of `error_model`)
 
-Of it `predict` takes what is left over the transition, so for small errors it is the linear step. Every point's own
-strapdown is not needed; the tests compare with that.
+`predict` takes of it what the transition leaves out, so for small errors it is the linear step. No point needs a
+strapdown of its own (the tests compare with points that have one).
 """
 
 from nav.unscented.measurement import correct, innovate, update

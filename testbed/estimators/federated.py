@@ -48,11 +48,12 @@ from testbed.estimators.section import (
 from testbed.schema import IDENTIFIER, Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 
-SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6  # per look, of detectors of one look and of many
+# Per sample, of detectors that judge by one sample, and of those that gather many.
+SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6
 
 
 class DetectorSection(Section):
-    """What judges the samples of a local filter; ``false_alarm`` is the probability per look (`nav.detection`)."""
+    """What judges the samples of a local filter; ``false_alarm`` is the probability per sample (`nav.detection`)."""
 
     kind: Literal["chi_square", "eraim", "sprt", "glr", "none"] = Field(
         default="chi_square", description="how the samples are judged"
@@ -61,7 +62,7 @@ class DetectorSection(Section):
         default=None,
         gt=0,
         lt=0.5,
-        description="probability per sample without a fault; none: 1e-3 of one look, 1e-6 of gathered evidence",
+        description="probability per sample without a fault; none: 1e-3, and 1e-6 for sprt and glr",
     )
     mean: Literal["plain", "window", "exponential"] = Field(
         default="exponential", description="sprt: of what it has gathered"
@@ -104,11 +105,11 @@ class PolicySection(Section):
     """
 
     kind: Literal["inflate", "sage_husa"] = Field(description="weaken what is suspect, or learn the noise")
-    false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="inflate: of the limit, probability per look")
+    false_alarm: float = Field(default=0.01, gt=0, lt=0.5, description="inflate: of the limit, probability per sample")
     reject_above: float | None = Field(
         default=None, gt=0, description="inflate: squared distance to leave out; none: never"
     )
-    b: float = Field(default=0.97, ge=0.5, lt=1, description="sage_husa: forgetting factor per look")
+    b: float = Field(default=0.97, ge=0.5, lt=1, description="sage_husa: forgetting factor per sample")
 
     @model_validator(mode="after")
     def _own_keys(self) -> Self:
@@ -263,7 +264,10 @@ def lane(section: FederatedSection, rig: Rig, config: Config) -> Lane:
 
 
 def _detector(section: DetectorSection) -> Detector:
-    """A detector as the scenario says. Evidence over looks is correlated: its alarms must be rarer."""
+    """A detector as the scenario says.
+
+    Evidence that is gathered over samples is correlated from one to the next: a false alarm lasts, and must be rarer.
+    """
     match section.kind:
         case "chi_square":
             return ChiSquare(section.false_alarm or SNAPSHOT_FALSE_ALARM)

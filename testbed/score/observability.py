@@ -1,9 +1,9 @@
 """Which states of each estimator can be seen, and when, along the way that a recorded run took.
 
-The filters are built from the run's scenario as they were for it. Truth gives the motion; the record says which looks
-each of them used (`UpdateReport`), so that whatever kept one away, an outage, a fault, the range of a transponder or
-an isolation, keeps it away here: it shows nothing. See `nav.observability.looked_at`, whose prior is the estimator's
-own 1-sigma once aligned.
+The filters are built from the run's scenario as they were for it. Truth gives the motion; the record says which
+measurements each of them used (`UpdateReport`): what was not used, in an outage, out of a transponder's range, or as
+its sensor was faulty or isolated, shows nothing here either. See `nav.observability.visibility`, whose prior is the
+estimator's own 1-sigma once aligned.
 
 A federated filter is judged as one filter with the common states and the aids of all its locals: by what can be seen
 at all. What one local filter sees of its own is less.
@@ -25,7 +25,7 @@ from nav.error_model import MOTION
 from nav.federated import Federated
 from nav.ins import Ins
 from nav.local_filter import LocalFilter
-from nav.observability import Visibility, flown, looked_at
+from nav.observability import Visibility, flown, visibility
 from nav.reference import Reference
 from nav.rotation import dcm_from_quat
 from nav.samples import (
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 SEGMENTS = 60  # of a run at most
 SHORTEST_S = 5.0  # of a segment
-LOOK_S = 5.0  # given to a derivative to show
+TIME_S = 5.0  # given to a derivative to show
 KNOWN = 1e-9  # sigma of what is told to have no error, of its unit
 
 
@@ -114,10 +114,10 @@ def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
 
 
 def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, int], sensor: str = "") -> Array:
-    """The largest weight (N, m) of each axis of a look in each segment, 0 without any; of one ``sensor`` of several.
+    """The largest weight (N, m) of each axis of a measurement in each segment, 0 without; of one ``sensor`` of several.
 
-    Where a look was used in part, the record says how many axes were left out but not which: they are taken for those
-    that were the furthest from what was expected.
+    Where a measurement was used in part, the record says how many axes were left out but not which: they are taken for
+    those that were the furthest from what was expected.
     """
     aid, m = part
     best = np.zeros((len(edges) - 1, m))
@@ -143,14 +143,14 @@ def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, in
 def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visibility:
     level, heading = (_used(dataset, name, way.t, part) for part in ((LEVEL, 2), (MAGNETIC_HEADING, 1)))
     compensated = "airspeed" in ahrs.config.aids
-    F, looks = np.zeros((len(level), STATES, STATES)), []
+    F, measurements = np.zeros((len(level), STATES, STATES)), []
     for k, q_nb in enumerate(way.q_nb):
         F[k, :3] = transition(dcm_from_quat(q_nb), earth_rate_n(float(way.lla[k, 0])), 1.0) - np.eye(3, STATES)
-        levelling = (*ahrs.level_look(way.omega_b[k], compensated), level[k])
-        looks.append(_stacked([levelling, (*ahrs.heading_look, heading[k])], STATES))
+        levelling = (*ahrs.level_measurement(way.omega_b[k], compensated), level[k])
+        measurements.append(_stacked([levelling, (*ahrs.heading_measurement, heading[k])], STATES))
     names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
     prior = np.concatenate([way.sigma[:3], np.full(3, ahrs.config.imu.gyro_bias_sigma)])
-    return looked_at(names, way.t, F, looks, np.maximum(prior, KNOWN), LOOK_S)
+    return visibility(names, way.t, F, measurements, np.maximum(prior, KNOWN), TIME_S)
 
 
 def _of_filter(
@@ -169,7 +169,7 @@ def _of_filter(
     }
     # A record cut short may have reports on samples that it lacks: then nobody knows how accurate they were.
     parts = [part for part in parts if accuracy.get(part[0], ()) is not None]
-    looks = []
+    all_used = []
     for k in range(len(way.middle)):
         lat, lon, h = way.lla[k].tolist()
         initial = InitialState(float(way.middle[k]), lat, lon, h, way.v_n[k], way.q_nb[k], np.eye(MOTION))
@@ -179,14 +179,13 @@ def _of_filter(
         for sensor, aid, part, used in parts:
             if used[k].any():
                 sample = _sample(aid, initial, reference, float(way.airspeed[k]), accuracy.get(sensor))
-                look = inner.measure(reference, state, aid, part, sample)
-                if look is not None:  # there is no course at rest
-                    found.append((look.H, look.R, used[k]))
-        looks.append(_stacked(found, inner.model.size))
+                measurement = inner.measure(reference, state, aid, part, sample)
+                if measurement is not None:  # there is no course at rest
+                    found.append((measurement.H, measurement.R, used[k]))
+        all_used.append(_stacked(found, inner.model.size))
     prior = np.concatenate([way.sigma, inner.model.sigma[MOTION:]])
-    return flown(
-        inner.model, way.t, way.q_nb, way.v_n, way.lla, way.f_b, way.omega_b, looks, np.maximum(prior, KNOWN), LOOK_S
-    )
+    motion = way.t, way.q_nb, way.v_n, way.lla, way.f_b, way.omega_b
+    return flown(inner.model, *motion, all_used, np.maximum(prior, KNOWN), TIME_S)
 
 
 def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array] | None:
@@ -199,10 +198,10 @@ def _accuracy(dataset: xarray.DataTree, receiver: str) -> tuple[Array, Array] | 
     return np.nanmedian(position, axis=0), np.nanmedian(velocity, axis=0)
 
 
-def _stacked(looks: Sequence[tuple[Array, Array, Array]], n: int) -> tuple[Array, Array]:
-    """H (m, n) and 1-sigma of the noise (m,) of those axes of all ``looks`` (H, R, weight) that were used."""
-    H = np.vstack([np.zeros((0, n)), *(H for H, _, _ in looks)])
-    R, weight = (np.concatenate([[], *values]) for values in ([R for _, R, _ in looks], [w for *_, w in looks]))
+def _stacked(parts: Sequence[tuple[Array, Array, Array]], n: int) -> tuple[Array, Array]:
+    """H (m, n) and 1-sigma of the noise (m,) of those axes of several measurements (H, R, weight) that were used."""
+    H = np.vstack([np.zeros((0, n)), *(H for H, _, _ in parts)])
+    R, weight = (np.concatenate([[], *values]) for values in ([R for _, R, _ in parts], [w for *_, w in parts]))
     used = weight > 0
     return H[used], np.sqrt(np.maximum(R[used], KNOWN**2) / weight[used])
 
