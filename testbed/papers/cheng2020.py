@@ -31,7 +31,7 @@ SETTLED_S = 300.0  # from here on the paper's figures are to hold
 DRIFT_DEG = 3.0  # of the scenario's turns
 KAPPA = math.radians(2.0)
 AFTER_TURN_S = 10
-NOISIER_S, LEARNED_S = 400, 200  # when the receiver gets worse, and how many looks there are to find out
+NOISIER_S, LEARNED_S = 400, 200  # when the receiver gets worse, and how many samples there are to find out
 NEARLY_ALL = 0.9973  # of a normal error that lies within three sigma
 NO_WORSE = 1.05  # than the filter that is told the variances, at most
 
@@ -86,7 +86,7 @@ def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any
 
 
 def noisier(seed: int) -> dict[str, float]:
-    """By how much the learned variance is off, some looks after the receiver's became four times as large."""
+    """By how much the learned variance is off, some samples after the receiver's became four times as large."""
     end = NOISIER_S + LEARNED_S
     dataset = run(selected(["improved"], [f"duration_s={end + 1}", f"fault=[{_MORE_NOISE}]"]), seed=seed).dataset
     off = {}
@@ -259,9 +259,9 @@ def _position_claims(roads: Sequence[Any]) -> Iterator[Claim]:
 
 def _course_claims(roads: Sequence[Any]) -> Iterator[Claim]:
     """Whether course is used when it should be, and only then."""
-    amiss, looks = _of(roads, "improved", "course_amiss"), _of(roads, "improved", "course_looks")
+    amiss, samples = _of(roads, "improved", "course_amiss"), _of(roads, "improved", "course_looks")
     yield Claim("courses used in a turn or below 1 m/s", "", "0", amiss, 0, worst=True)
-    yield Claim("courses used on straights, of 3 h", "", "all", [max(looks)], 5000, at_least=True)
+    yield Claim("courses used on straights, of 3 h", "", "all", [max(samples)], 5000, at_least=True)
 
 
 def _noise_claims(roads: Sequence[Any], noises: Sequence[Any]) -> Iterator[Claim]:
@@ -272,7 +272,7 @@ def _noise_claims(roads: Sequence[Any], noises: Sequence[Any]) -> Iterator[Claim
     )  # fmt: skip
     for what, aid in (("position", "gnss_position"), ("velocity", "gnss_velocity")):
         off = [one[aid] for one in noises]
-        yield Claim(f"{what} variance x 4: learned within, after 200 looks", "1", "", off, 0.25)
+        yield Claim(f"{what} variance x 4: learned within, after 200 samples", "1", "", off, 0.25)
 
 
 def _off(*pairs: tuple[Sequence[float], float]) -> list[float]:

@@ -43,7 +43,7 @@ NAME = "cui2022"
 SEEDS, FEW_SEEDS = 20, 10  # of flights, with and without faults; of those that carry more than one estimator
 HEALTHY = ("fault=[]",)
 CARRIED = {(): ("with_star", "without_star", "glr"), HEALTHY: ("with_star", "glr")}  # by overrides
-FALSE_ALARM = 1e-5  # per look: table 1
+FALSE_ALARM = 1e-5  # per measurement: table 1
 AFTER_S = 60.0
 REPLAYS = 1000
 SMALL_STEP = (300.0, 330.0)  # that of GPS velocity: 0.3 m/s, one sigma
@@ -92,14 +92,14 @@ def fly(seed: int, overrides: tuple[str, ...], names: tuple[str, ...], series: b
         result["kept"] = _kept(tree)
     if series:
         result["faults"] = [(f.sensor, f.start, f.end) for f in metrics.faults(tree)]
-        result["looks"] = {part: _looks(tree, "with_star", part)[:2] for part in PARTS}
+        result["measurements"] = {part: _measurements(tree, "with_star", part)[:2] for part in PARTS}
         result["glr_statistic"] = replayed[0], *replayed[2:]
     return result
 
 
 @dataclass(frozen=True)
-class Told:
-    """A measurement policy that leaves out what it was told is wrong: (axis, from, to) of one part of the looks."""
+class KnownFaults:
+    """A measurement policy that leaves out what it was told is wrong: (axis, from, to) of one kind of measurement."""
 
     wrong: tuple[tuple[int, float, float], ...]
 
@@ -133,7 +133,7 @@ def floor(seed: int) -> dict[str, dict[str, list[float]]]:
     for fault in scenario(NAME).fault:
         part, axis = CHANNELS[fault.channel]  # type: ignore[union-attr, index]
         wrong.setdefault(part, []).append((axis, *fault.window))
-    told = {part: Told(tuple(windows)) for part, windows in wrong.items()}
+    told = {part: KnownFaults(tuple(windows)) for part, windows in wrong.items()}
     t = np.arange(0.0, chosen.duration_s + 0.5)
     largest = {}
     for when, policies in (("six faults", told), ("no fault", None)):
@@ -173,24 +173,24 @@ def _errors(tree: xarray.DataTree, name: str) -> tuple[Array, dict[str, Array]]:
     return e.t, {"position": e.position, "velocity": e.velocity, "attitude": attitude}
 
 
-def _looks(tree: xarray.DataTree, name: str, part: str) -> tuple[Array, Array, Array, Array]:
-    """Of the looks of one part the times, the chi-square statistics, the weights and the outcomes, each (N,)."""
+def _measurements(tree: xarray.DataTree, name: str, part: str) -> tuple[Array, Array, Array, Array]:
+    """Of the measurements of one part the times, the chi-square statistics, the weights and the outcomes, each (N,)."""
     own = f"estimators/{name}/innovations/{part}"
     t, nis, weight, outcome = (column(tree, f"{own}/{key}") for key in ("sample_time", "nis", "weight", "outcome"))
     return t, nis, weight, outcome
 
 
 def _refused(tree: xarray.DataTree, name: str) -> tuple[int, int, int]:
-    """(looks with an axis refused, looks while an axis was isolated, all looks) of a run."""
-    looks = [_looks(tree, name, part)[2:] for part in metrics.aids(tree, name)]
-    refused, isolated = (sum(int(np.sum(m)) for m in which) for which in
-                         ([w < 1 for w, _ in looks], [o == Outcome.ISOLATED for _, o in looks]))  # fmt: skip
-    return refused, isolated, sum(len(w) for w, _ in looks)
+    """How many measurements of a run had an axis refused, how many an axis isolated, and how many there were."""
+    measurements = [_measurements(tree, name, part)[2:] for part in metrics.aids(tree, name)]
+    refused = sum(int(np.sum(weight < 1)) for weight, _ in measurements)
+    isolated = sum(int(np.sum(outcome == Outcome.ISOLATED)) for _, outcome in measurements)
+    return refused, isolated, sum(len(w) for w, _ in measurements)
 
 
 def _kept(tree: xarray.DataTree) -> float:
     """Share of the two sound axes of GPS position that were used while the third was refused."""
-    t, _, weight, _ = _looks(tree, "with_star", "gnss_position")
+    t, _, weight, _ = _measurements(tree, "with_star", "gnss_position")
     windows = [(f.start, f.end) for f in metrics.faults(tree) if f.channel in ("east", "north", "down")]
     return float(np.mean(weight[metrics.inside(t, windows) & (weight < 1)])) * 3 / 2
 
@@ -218,7 +218,7 @@ def _scored(t: Array, alarm: metrics.Mask, window: metrics.Window) -> tuple[floa
 
 
 def replay(kind: Callable[[float], Detector], count: int) -> list[float]:
-    """Delays of a detector on white residuals of three axes, 60 sound looks and 30 with one sigma more on one axis."""
+    """Delays of a detector on white residuals of three axes, 60 sound samples and 30 with one sigma more on one."""
     random = np.random.default_rng(2022)
     t, window = np.arange(90.0), (60.0, 90.0)
     delays = []
@@ -276,8 +276,8 @@ def _detection_claims(faulty: Sequence[Result]) -> list[Claim]:
     latitude, ramp = (
         _scores(faulty, "with_star", f"detection_delay_s.{fault}") for fault in ("latitude", "north_velocity")
     )
-    slow = "the drift is below 3 sigma of GPS for 6 s: one look in nine shows it after 7 s, and 86 % after 9 s"
-    steep = "it passes 5 sigma after 3 s: 54 % of looks show it then, and 96 % after 4 s"
+    slow = "the drift is below 3 sigma of GPS for 6 s: one measurement in nine shows it after 7 s, and 86 % after 9 s"
+    steep = "it passes 5 sigma after 3 s: 54 % of measurements show it then, and 96 % after 4 s"
     drifts = [
         Claim("detection delay, latitude drift", "s", "no delay", latitude, 10.0, worst=True, impossible=slow),
         Claim("detection delay, north velocity ramp, median", "s", "no delay", ramp, 4.0, impossible=steep),
@@ -299,8 +299,8 @@ def _detection_claims(faulty: Sequence[Result]) -> list[Claim]:
 
 def _small_step_claims(snapshot: Sequence[float], gathered: Sequence[float], faulty: Sequence[Result]) -> list[Claim]:
     what = "0.3 m/s east velocity step found"
-    because = "a look of one sigma passes the limit of 1e-5 once in 9000: 0.3 % of the 30 s steps are ever seen"
-    evidence = "its 30 looks hold 15 nats of evidence at most, less what the filter learns of the step, against 15.9"
+    because = "a measurement of one sigma passes the limit of 1e-5 once in 9000: 0.3 % of the 30 s steps are ever seen"
+    evidence = "its 30 samples hold 15 nats of evidence at most, less what the filter learns of the step, against 15.9"
     delays = [d for d in gathered if np.isfinite(d)]
     in_flight = [1.0 - r["glr"]["scores"]["missed.east_velocity"] for r in faulty if "glr" in r]
     on_residuals = [float(np.isfinite(r["glr_on_residuals"][0])) for r in faulty]
@@ -371,17 +371,17 @@ def _any_flight_claim(label: str, what: str, when: str, ours: Array, least: Arra
 
 
 def _false_alarm_claims(healthy: Sequence[Result]) -> list[Claim]:
-    refused, isolated, looks = np.array([r["with_star"]["refused"] for r in healthy]).T
-    expected = FALSE_ALARM * looks.sum()
+    refused, isolated, measurements = np.array([r["with_star"]["refused"] for r in healthy]).T
+    expected = FALSE_ALARM * measurements.sum()
     by_glr = np.array([r["glr"]["refused"] for r in healthy if "glr" in r])
     return [
-        Claim("looks while a sensor was isolated in 1200 s without fault", "", "none", isolated.tolist(), 0.0,
+        Claim("measurements while a sensor was isolated in 1200 s without fault", "", "none", isolated.tolist(), 0.0,
               worst=True),
-        Claim("looks refused in 1200 s without fault", "", "none", refused.tolist(), 0.0),
-        Claim(f"looks refused in {len(healthy)} flights without fault", "", "none", [float(refused.sum())],
+        Claim("measurements refused in 1200 s without fault", "", "none", refused.tolist(), 0.0),
+        Claim(f"measurements refused in {len(healthy)} flights without fault", "", "none", [float(refused.sum())],
               float(poisson.ppf(0.95, expected)),
-              impossible=f"table 1 allows 1e-5 of the {looks.sum()} looks: {expected:.2f} are expected"),
-        Claim(f"flights of {len(by_glr)} in which GLR refused a look without fault", "", "–",
+              impossible=f"table 1 allows 1e-5 of the {measurements.sum()} measurements: {expected:.2f} are expected"),
+        Claim(f"flights of {len(by_glr)} in which GLR refused a measurement without fault", "", "–",
               [float(np.sum(by_glr[:, 0] > 0))], float(poisson.ppf(0.95, FALSE_ALARM * by_glr[:, 2].sum()))),
     ]  # fmt: skip
 
@@ -392,7 +392,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
     from matplotlib.figure import Figure
     from PIL import Image
 
-    first = next(r for r in results if isinstance(r, dict) and "looks" in r)
+    first = next(r for r in results if isinstance(r, dict) and "measurements" in r)
     figure = Figure(figsize=(10.5, 7.4), dpi=90, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(4, 2, sharex=True)
@@ -419,7 +419,7 @@ def draw(results: Sequence[Any], out: Path) -> None:
         "star_attitude": "star_tracker",
     }
     for ax, (part, label) in zip(axes[:, 1], PARTS.items(), strict=True):
-        t, nis = first["looks"][part]
+        t, nis = first["measurements"][part]
         ax.semilogy(t, np.maximum(nis, 0.01), ".", ms=1.8, color=COLOURS[0], label="ERAIM")
         ax.axhline(chi_square_threshold(FALSE_ALARM, 3), color=COLOURS[1], lw=1)
         if part == "gnss_velocity":

@@ -34,7 +34,7 @@ from testbed.scenario import Scenario
 from testbed.score import metrics
 from testbed.sensors.noise import stream
 
-P = 1e-3  # false alarms and missed ones, per look
+P = 1e-3  # false alarms and missed ones, per sample
 STEP, GAP, RAMP = (40.0, 60.0), (60.0, 90.0), (90.0, 130.0)
 SIZE = 5.0  # of the step [sigma]
 SLOPES = (0.02, 0.1)  # of the ramp [sigma/s]: as printed, and as fits the paper's figures
@@ -72,7 +72,7 @@ def _mean(rate: int) -> Mean:
 
 
 def _printed(mean: Mean, reset: Reset = Reset.NONE) -> Detector:
-    """The recursive evidence, with a mean that includes the look, and Wald's limit."""
+    """The recursive evidence, with a mean that includes the sample, and Wald's limit."""
     return Sprt(P, mean, reset, InclusiveEvidence())
 
 
@@ -96,11 +96,11 @@ TABLE_2 = {"hard": (0.0, 1.2, 1.2, 1.2, math.nan), "soft": (20.4, 9.2, 7.8, 1.5,
 class Hard(NamedTuple):
     """One seed up to the ramp: alarms before the step, on it, after it."""
 
-    false_alarms: float  # share of the looks before the step
+    false_alarms: float  # share of the samples before the step
     delay: float  # [s]
     coverage: float
     end_lag: float  # [s]
-    gap: float  # share of the healthy looks between the faults
+    gap: float  # share of the healthy samples between the faults
     lowest: float  # statistic there
 
 
@@ -118,13 +118,13 @@ class Soft(NamedTuple):
 
 
 def residuals(rate: int, seed: int, duration: float = SCORED_S) -> tuple[Array, Array]:
-    """(times, residuals without the ramp) of one run: unit normals and the step, both (looks,)."""
+    """(times, residuals without the ramp) of one run: unit normals and the step, both (samples,)."""
     t = np.arange(1, round(duration * rate) + 1) / rate
     return t, stream(seed, "zhou2025", f"{rate} Hz").standard_normal(len(t)) + SIZE * during(t, STEP)
 
 
 def ramp(t: Array, slope: float) -> Array:
-    """The soft fault at the times ``t`` (looks,) [sigma]."""
+    """The soft fault at the times ``t`` (samples,) [sigma]."""
     return np.where(during(t, RAMP), slope * (t - RAMP[0]), 0.0)
 
 
@@ -135,7 +135,7 @@ def during(t: Array, span: tuple[float, float]) -> metrics.Mask:
 
 
 def watch(detector: Detector, t: Array, r: Array) -> tuple[metrics.Mask, Array, Array]:
-    """(alarms, statistics, thresholds), each (looks,), of one detector on residuals ``r`` (looks,) of unit sigma."""
+    """(alarms, statistics, thresholds), each (samples,), of a detector on residuals ``r`` (samples,) of unit sigma."""
     S = np.eye(1)
     decisions = [detector.step(r[k : k + 1], S, float(t[k])) for k in range(len(t))]
     return (
@@ -276,14 +276,14 @@ def conclude(results: Sequence[Any]) -> list[Claim]:
 
 
 def _hard_claims(found: Found) -> Iterator[Claim]:
-    target = {1: 1.0, 5: 0.2, 10: 0.2}  # one look at 1 Hz
+    target = {1: 1.0, 5: 0.2, 10: 0.2}  # one sample at 1 Hz
     for rate in RATES:
         for name, paper in ((COMPLETE, "1.2"), (GLR, "1.2 (complete reset)")):
             what = f"hard fault at {rate} Hz, {name}"
             yield Claim(f"{what}: delay", "s", paper, found.hard(name, "delay", rate), 1.2, target=target[rate])
             yield Claim(f"{what}: end lag", "s", "0", found.hard(name, "end_lag", rate), 0.2)
-    # Eq 20's mean after n healthy looks and k of size a is near a k / (s n), which makes a^2 k^2 / (2 s n) of evidence.
-    # What noise makes before, as the mean includes the look: 1/(s k) - 1/(2 k) at look k.
+    # Eq 20's mean after n healthy samples and k of size a is near a k / (s n), and the evidence a^2 k^2 / (2 s n).
+    # What noise makes before, as the mean includes the sample: 1/(s k) - 1/(2 k) at sample k.
     n, s = STEP[0] * MAIN_RATE, 0.9
     missing = math.log((1 - P) / P) - (1 / s - 0.5) * (math.log(n) + np.euler_gamma)
     slowest = math.ceil(math.sqrt(2 * s * n * missing) / SIZE) / MAIN_RATE
@@ -310,7 +310,7 @@ def _soft_claims(found: Found) -> Iterator[Claim]:
     evidence = MAIN_RATE * high**2 * 1.5**3 / 6
     yield Claim(
         f"ramp 0.1 sigma/s, {GLR}: delay", "s", "1.5 (complete reset)", found.soft(GLR, "delay", high), 10.5,
-        impossible=f"the looks of 1.5 s hold {evidence:.2f} nats of evidence, and the false alarms ask for {ONSET:g}",
+        impossible=f"the samples of 1.5 s hold {evidence:.2f} nats of evidence, and the false alarms ask for {ONSET:g}",
     )  # fmt: skip
 
     def sooner(name: str, than: str, field: str = "delay") -> list[float]:
@@ -353,7 +353,7 @@ def _false_alarm_claims(found: Found) -> Iterator[Claim]:
     for rate in RATES:
         for name in MAIN:
             share = found.hard(name, "false_alarms", rate)
-            # Chi-square has P by design: away from the main rate, what chance makes of it in all looks.
+            # Chi-square has P by design: away from the main rate, what chance makes of it in all samples.
             by_chance = rate != MAIN_RATE and name == CHI2
             room = 3 * math.sqrt(P / (STEP[0] * rate * BATCH * BATCHES)) if by_chance else 0.0
             yield Claim(

@@ -208,8 +208,9 @@ def test_claims_can_fail(flights: list[Any]) -> None:
         "detection delay, longitude step", "detection delay, height step", "the right sensor isolated",
         "largest error after 60 s, down velocity, six faults", "sound axes",
         "share of flights within every figure of the paper",
-        "largest error after 60 s, velocity, any axis, any flight, six faults", "looks while a sensor was isolated",
-        "looks refused in 1200 s without fault", "0.3 m/s east velocity step found by ERAIM, share of 50",
+        "largest error after 60 s, velocity, any axis, any flight, six faults",
+        "measurements while a sensor was isolated",
+        "measurements refused in 1200 s without fault", "0.3 m/s east velocity step found by ERAIM, share of 50",
     ):  # fmt: skip
         assert any(name.startswith(start) for name in lost), start
     assert "0.3 m/s east velocity step found by ERAIM, share of flights" in lost
@@ -242,7 +243,7 @@ def test_the_reason_is_what_the_optimal_filter_could_not_do(flights: list[Any]) 
 def test_the_optimal_filter_is_told_of_the_faults_alone(flights: list[Any]) -> None:
     """It loses what the axes at fault would have told, and no more."""
     nothing = np.zeros(3)
-    told = cui2022.Told(((1, 20.0, 50.0), (0, 100.0, 140.0)))
+    told = cui2022.KnownFaults(((1, 20.0, 50.0), (0, 100.0, 140.0)))
     used = [np.isfinite(told.adapt(nothing, np.eye(3), np.ones(3), t)).tolist() for t in (19.0, 20.0, 49.0, 50.0, 110)]
     assert used == [[True] * 3, [True, False, True], [True, False, True], [True] * 3, [False, True, True]]
     with_faults, without = flights[2]["six faults"], flights[2]["no fault"]
@@ -260,15 +261,15 @@ def test_the_figure_is_drawn(flights: list[Any], tmp_path: Path) -> None:
 
 
 def test_a_step_of_one_sigma_is_beyond_a_snapshot() -> None:
-    """Non-central chi-square of one sigma: 1.1e-4 per look at 1e-5, 0.3 % of steps of 30 looks; the GLR finds most."""
-    per_look = float(ncx2.sf(25.902, 3, 1.0))
-    assert 1 - (1 - per_look) ** 30 == pytest.approx(0.0034, abs=1e-4)
+    """Non-central chi-square of one sigma: 1.1e-4 per measurement at 1e-5, 0.3 % of steps of 30; the GLR finds most."""
+    each = float(ncx2.sf(25.902, 3, 1.0))
+    assert 1 - (1 - each) ** 30 == pytest.approx(0.0034, abs=1e-4)
     assert np.isfinite(cui2022.replay(Eraim, 300)).sum() <= 6
     assert np.isfinite(cui2022.replay(Glr, 300)).mean() > 0.5
 
 
 def test_the_drifts_show_when_noise_lets_them() -> None:
-    """Why "no delay" can't be: what one look of 20 m and of 0.3 m/s shows of 1.48 tau^2 m and of 0.5 tau m/s."""
+    """Why "no delay" can't be: what one measurement of 20 m and of 0.3 m/s shows of 1.48 tau^2 m and of 0.5 tau m/s."""
 
     def seen(sigmas: float) -> float:
         return float(ncx2.sf(25.902, 3, sigmas**2))

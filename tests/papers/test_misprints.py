@@ -59,7 +59,7 @@ def test_the_distance_lets_the_reset_fire_inside_a_fault():
 
 
 def test_the_fading_mean_never_forgets():
-    """200 looks later an old fault is a third of the mean."""
+    """200 samples later an old fault is a third of the mean."""
     one = np.ones((2, 1))
     printed, forgetting = FadingMean(0.9), exponential(0.95)
     for k in range(300):
@@ -80,13 +80,13 @@ def test_the_fading_mean_checks_its_factor(s):
 
 def test_quadratic_evidence_of_the_fading_mean_has_the_stated_rate():
     rng = np.random.default_rng(7)
-    m, p, runs, looks = 2, 0.05, 2000, 15
-    L = [np.linalg.cholesky(positive(rng, m)) for _ in range(looks)]
+    m, p, runs, samples = 2, 0.05, 2000, 15
+    L = [np.linalg.cholesky(positive(rng, m)) for _ in range(samples)]
     S = [a @ a.T for a in L]
     alarms = 0
     for _ in range(runs):
         detector = Sprt(p, FadingMean(0.85))
-        for k in range(looks):
+        for k in range(samples):
             decision = detector.step(L[k] @ rng.normal(size=m), S[k], float(k))
         alarms += decision.alarm
     assert decision.threshold == pytest.approx(0.5 * stats.chi2.isf(p, m))
@@ -109,10 +109,10 @@ def test_walds_limit_is_too_low_for_vectors():
     limits = [Sprt(1e-3, plain()).evidence.threshold(1e-3, m) for m in (1, 2, 3, 6)]
     np.testing.assert_allclose(limits, [5.41, 6.91, 8.13, 11.23], atol=0.006)
     rng = np.random.default_rng(10)
-    looks = 4000
+    samples = 4000
     share = np.mean([Sprt(1e-3, plain(), evidence=CountedEvidence()).step(rng.normal(size=6), np.eye(6), 0.0).alarm
-                     for _ in range(looks)])  # fmt: skip
-    assert within_binomial(looks * share, looks, 3.2e-2)  # instead of 1e-3
+                     for _ in range(samples)])  # fmt: skip
+    assert within_binomial(samples * share, samples, 3.2e-2)  # instead of 1e-3
 
 
 def test_the_count_makes_the_exponential_mean_deaf():
@@ -128,7 +128,7 @@ def test_the_count_makes_the_exponential_mean_deaf():
 def test_weights_by_the_sum_double_healthy_R():
     N = weights_by_sum(np.zeros(2), np.full(2, 8.0))
     np.testing.assert_array_equal(Weight(N[0]).adapt(np.zeros(3), np.eye(3), np.ones(3), 0.0), 2.0)
-    # two filters that are reset to their fusion at each look: the sigma claimed is 30 % above that of the right R
+    # two filters that are reset to their fusion at each sample: the sigma claimed is 30 % above that of the right R
     Q, R = 1.0, 1.0
 
     def steady(factor):

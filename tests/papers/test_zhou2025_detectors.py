@@ -18,7 +18,7 @@ P = 1e-3
 STEP, GAP, RAMP = (40.0, 60.0), (60.0, 90.0), (90.0, 130.0)
 PROTOTYPE_SEEDS = 1500
 
-# The prototype had one limit for all looks: that of a full window.
+# The prototype had one limit for all samples: that of a full window.
 BUILD = {
     "chi-square": lambda rate: ChiSquare(P),
     "fading eq20": lambda rate: Sprt(P, FadingMean(0.9), evidence=CountedEvidence()),
@@ -49,7 +49,7 @@ PROTOTYPE = {
 
 
 def residuals(rate, slope, seeds):
-    """(times, residuals (seeds, looks, 1)) of one run per seed."""
+    """(times, residuals (seeds, samples, 1)) of one run per seed."""
     t = np.arange(1, 216 * rate + 1) / rate
     fault = np.where((t >= STEP[0]) & (t < STEP[1]), 5.0, 0.0)
     fault += np.where((t >= RAMP[0]) & (t < RAMP[1]), slope * (t - RAMP[0]), 0.0)
@@ -58,7 +58,7 @@ def residuals(rate, slope, seeds):
 
 
 def replay(build, rate, t, x):
-    """(alarms, statistics), each (seeds, looks)."""
+    """(alarms, statistics), each (seeds, samples)."""
     S = np.eye(1)
     alarms, statistics = np.zeros(x.shape[:2], dtype=bool), np.zeros(x.shape[:2])
     for i in range(len(x)):
@@ -228,7 +228,7 @@ def test_onset_and_end_of_the_step():
 
 
 def test_vector_faults_are_seen_at_once():
-    """Three axes at 5 sigma: chi-square in the same look, the likelihood ratio as well, complete reset within 1.2 s."""
+    """Three axes at 5 sigma: chi-square and likelihood ratio in the same sample, complete reset within 1.2 s."""
     rng = np.random.default_rng(1)
     S, x = np.eye(3), rng.standard_normal((20, 100, 3))
     x[:, 50:] += 5.0
