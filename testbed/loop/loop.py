@@ -42,6 +42,7 @@ BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
 PACED_S = 0.1  # and when it keeps to the clock
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REHEARSAL_S = 5.0  # that an estimator aligns in
+COLLECT_AFTER = 200_000  # objects kept
 LARGEST_SEED = 2**63 - 1
 
 
@@ -139,9 +140,12 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
     """From the first tick to the end. Raises Restarted when that was asked for."""
     with ExitStack() as ending:
         passage = _Passage(scenario, setup, director, ending)
-        # Samples come by the million, and the collector would walk all that was there before again and again.
+        # Samples come by the million and leave no cycles: the collector, called at every 700th that is kept, would walk
+        # those that wait for the record again and again, and all that was there before.
         gc.freeze()
         ending.callback(gc.unfreeze)
+        ending.callback(gc.set_threshold, *gc.get_threshold())
+        gc.set_threshold(COLLECT_AFTER)
         while passage.tick < passage.ticks and director.ready(passage.tick) and passage.advance():
             pass
         remarks = passage.conclude()
