@@ -258,6 +258,7 @@ def test_a_full_disk_is_a_message(testbed: Testbed, monkeypatch: pytest.MonkeyPa
     assert (ended.code, ended.err) == (2, "testbed: [Errno 28] No space left on device: 'run.nc'\n")
 
 
+@pytest.mark.ci
 def test_no_traceback_reaches_the_shell(tmp_path: Path) -> None:
     ended = python("-m", "testbed", "run", "uturn", cwd=tmp_path)
     assert (ended.returncode, ended.stdout) == (2, "")
@@ -293,6 +294,7 @@ def test_run_passes_everything_on(testbed: Testbed, monkeypatch: pytest.MonkeyPa
         assert asked["realtime"] == 1.0
 
 
+@pytest.mark.ci
 def test_a_record_is_run_again(testbed: Testbed, tmp_path: Path) -> None:
     testbed("run", "static_bench", *QUICK, "--out", "first", "--seed", "7")
     ended = testbed("run", "first/run.nc", "--no-report")
@@ -322,6 +324,7 @@ def _spoilt(folder: Path, **attributes: str) -> Path:
     return path
 
 
+@pytest.mark.ci
 def test_what_is_wrong_with_running_a_record_again(testbed: Testbed, tmp_path: Path) -> None:
     testbed("run", "static_bench", *QUICK, "--out", "first")
     for arguments, says in (
@@ -346,6 +349,7 @@ def test_what_is_wrong_with_running_a_record_again(testbed: Testbed, tmp_path: P
     assert (tmp_path / "runs/mine_again/run.nc").exists()
 
 
+@pytest.mark.ci
 def test_a_lost_flight_fails_and_keeps_its_record(
     testbed: Testbed, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -387,6 +391,7 @@ def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
     assert rows >= 30 * percent > 0  # at 10 Hz over 300 s
 
 
+@pytest.mark.ci
 def test_export_and_report_of_a_run(testbed: Testbed, tmp_path: Path) -> None:
     testbed("run", "static_bench", *QUICK, "--out", "out")
     for form, made in (("csv", "run_csv"), ("mat", "run.mat")):

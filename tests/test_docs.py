@@ -129,6 +129,7 @@ def test_there_is_nothing_that_is_not_looked_at() -> None:
         assert any(not_run(line) and " ".join(line).startswith(start) for line in LINES), start
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_page_works(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

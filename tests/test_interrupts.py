@@ -40,6 +40,7 @@ def group(mark: str) -> list[str]:
     return found
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize(

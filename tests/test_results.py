@@ -94,6 +94,7 @@ def test_a_writer_that_died_is_no_obstacle(tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.ci
 def test_a_run_spares_own_files_and_knows_its_earlier_ones(tmp_path: Path) -> None:
     scenario = Scenario.load("static_bench", ["duration_s=2"])
     (tmp_path / "run.nc").write_text("mine")

@@ -33,6 +33,7 @@ def test_loads_and_says_what_it_shows(name: str) -> None:
     assert scenario.expect, "a scenario without [expect] can't fail"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_all_that_is_recorded_has_a_known_unit(name: str) -> None:
     whole = Scenario.load(name)

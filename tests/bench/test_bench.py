@@ -118,6 +118,7 @@ def test_processor_time_counts_the_processes_that_were_started() -> None:
     assert ratios((2.0, 9.0), (1.0, 3.0)) == (2.0, 3.0)
 
 
+@pytest.mark.ci
 def test_the_command_lists_its_measurements_and_refuses_others() -> None:
     asked = subprocess.run([sys.executable, HERE, "--only", "nonsense"], capture_output=True, text=True)
     assert asked.returncode == 2

@@ -105,6 +105,7 @@ def station(
     station.connection.close()
 
 
+@pytest.mark.ci
 def test_connect_sequence(station: Station) -> None:
     first = station.wait("HEARTBEAT", START_S, system_status=mav.MAV_STATE_ACTIVE)
     px4 = first.autopilot == mav.MAV_AUTOPILOT_PX4

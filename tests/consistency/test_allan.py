@@ -65,6 +65,7 @@ def test_two_hours_at_rest_give_back_the_datasheet(grade):
     np.testing.assert_allclose(instability, instability_datasheet, rtol=0.20)
 
 
+@pytest.mark.ci
 def test_perfect_unit_has_no_allan_deviation():
     rates = at_rest(ImuConfig(grade="perfect", rate_hz=RATE_HZ), 0, 600)
     assert max(allan_variance(axis, 1.0) for triad in rates for axis in triad) < 1e-24  # rounding of the motion

@@ -130,6 +130,7 @@ def test_faults_of_every_sensor() -> None:
         assert set(right.values()) == {1.0}, right
 
 
+@pytest.mark.ci
 def test_two_minutes_of_healthy_flight() -> None:
     """A shortened version of what the slow tests fly."""
     found, isolated = fly(Scenario.load("loiter_fault_tolerant", [*HEALTHY, "duration_s=120"]), 1)

@@ -71,6 +71,7 @@ def test_white_and_correlated_errors_are_recovered(grade):
         assert reported == pytest.approx(1.0, rel=0.05)
 
 
+@pytest.mark.ci
 def test_reported_accuracy_covers_a_short_stay():
     """The quick form: fast correlation, so that the stay holds many."""
     config = GnssConfig(rate_hz=RATE_HZ, correlation_time_s=20.0, velocity_correlation_time_s=20.0)

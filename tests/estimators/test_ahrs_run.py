@@ -275,6 +275,7 @@ def test_a_station_sees_the_attitude_and_no_position(flown: Any) -> None:
     assert all(abs(m.value) < 2.0 for m in heard["NAMED_VALUE_FLOAT"] if m.name == "err_tilt" and m.time_boot_ms > 6e4)
 
 
+@pytest.mark.ci
 def test_export(flown: Any, tmp_path: Path) -> None:
     folder = export(flown[2] / "run.nc", "csv", tmp_path / "csv")
     own = pandas.read_csv(folder / "estimators.ahrs.csv")

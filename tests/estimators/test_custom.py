@@ -200,6 +200,7 @@ def overrides(keys: dict[str, object]) -> list[str]:
     return [keypath.override(f"estimator[0].{key}", value) for key, value in keys.items()]
 
 
+@pytest.mark.ci
 def test_complementary() -> None:
     result, _ = example("complementary.py", "Complementary", estimates="attitude", time_constant_s=20.0)
     print(result.metrics)
@@ -214,6 +215,7 @@ def test_published() -> None:
     assert result.metrics["own.roll_pitch_rms_deg"] < 8.0
 
 
+@pytest.mark.ci
 def test_external() -> None:
     command = [sys.executable, str(EXAMPLES / "external_filter.py")]
     result, _ = example("external.py", "External", command=command)

@@ -75,6 +75,7 @@ def test_drift_and_scale_factors_are_states_when_asked_for() -> None:
         assert after > 0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("engine", ["linear", "unscented"])
 def test_scale_factors_are_found_in_flight(engine: str) -> None:
     """Against what the unit makes of true increments, without its biases and noise."""
@@ -143,6 +144,7 @@ RIVER = [
 ]
 
 
+@pytest.mark.ci
 def test_fixes_and_body_velocities_are_of_the_centre_of_gravity_wherever_the_imu_sits() -> None:
     """With the IMU 10 m ahead and 3 m above, of a ship that turns, rolls and pitches, all is as without."""
 
@@ -182,6 +184,7 @@ def failing(estimator: str) -> Scenario:
     return Scenario.load("u_turn", [*THREE_IMUS, f"fault=[{fault}]", f"estimator=[{estimator}]"])
 
 
+@pytest.mark.ci
 def test_a_failed_unit_of_three_is_voted_out_and_comes_back() -> None:
     aids = "aids=['gnss', 'magnetometer']"
     both = f"{{name='voted', spare_imus=['spare', 'third'], {aids}}}, {{name='alone', {aids}}}"
@@ -224,6 +227,7 @@ def test_units_that_cannot_be_voted_on_are_refused() -> None:
             )
 
 
+@pytest.mark.ci
 def test_a_start_is_handed_over_with_its_errors() -> None:
     handover = "handover={level_deg=0.5, heading_deg=2, velocity_mps=0.3, position_m=8}"
     drawn = []
@@ -246,6 +250,7 @@ def still() -> Kinematic:
     return Kinematic(KinematicStart(lat_deg=34.0, lon_deg=108.0, alt_m=300.0, heading_deg=40.0), 200.0)
 
 
+@pytest.mark.ci
 def test_body_velocity_stars_and_position_fixes_aid() -> None:
     sensors = [
         "sensors.imu.grade='navigation'",

@@ -170,6 +170,7 @@ def test_frames_leave_the_inner_loops_their_margin() -> None:
 # --- nothing to fly on
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -211,6 +212,7 @@ def test_gyros_may_be_silent_for_a_moment(lasting: float, survives: bool) -> Non
     assert np.isfinite(column(result.dataset, "truth/controls")).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("spares", ["'imu_b','imu_c'", ""])
 def test_nonsense_from_a_gyro_reaches_nobody(spares: str) -> None:
     fault = "fault=[{sensor='imu',channel='gyro_y',kind='garbage',window=[15,40]}]"

@@ -112,6 +112,7 @@ class Typist:
         os.write(self._ours, letters.encode())
 
 
+@pytest.mark.ci
 def test_a_live_run_is_directed_by_keys(terminal: tuple[int, int], tmp_path: Path) -> None:
     before = termios.tcgetattr(terminal[1])
     typist = Typist(terminal, tmp_path)
@@ -134,6 +135,7 @@ def test_a_live_run_is_directed_by_keys(terminal: tuple[int, int], tmp_path: Pat
     assert 1 < dataset["truth/time"].values[-1] < 250
 
 
+@pytest.mark.ci
 def test_a_terminated_run_leaves_the_terminal_and_the_record(terminal: tuple[int, int], tmp_path: Path) -> None:
     before = termios.tcgetattr(terminal[1])
     typist = Typist(terminal, tmp_path)

@@ -346,6 +346,7 @@ def test_an_unsound_sample_of_every_sensor_is_reported_and_not_fused(monkeypatch
     assert all(np.isfinite(value) for value in result.metrics.values())
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("imu_hz", [25, 40])
 def test_slow_imu_gives_the_same_bits_live_and_batch(imu_hz: int) -> None:
     scenario = Scenario.load("u_turn", ["duration_s=20", "sensors.gnss.denied=[]", f"sensors.imu.rate_hz={imu_hz}"])

@@ -99,6 +99,7 @@ def at(t: float, asked: Sequence[Request]) -> list[tuple[float, Request]]:
 # --- what may be asked
 
 
+@pytest.mark.ci
 def test_every_failure_of_every_unit_begins_and_ends() -> None:
     """Each becomes one fault of each instance, and OK leaves the sensors as if nothing had been."""
     pair = scenario(12, *TWICE)
@@ -139,6 +140,7 @@ def during(kind: str, unit: str) -> tuple[Any, Any]:
     return failed.sel(window), healthy_run(8)[f"sensors/{sensor}"].to_dataset().sel(window)
 
 
+@pytest.mark.ci
 def test_failures_are_what_their_names_say() -> None:
     failed, healthy = during("off", "barometer")
     assert failed.sizes["time"] == 0
@@ -213,6 +215,7 @@ def test_settings_are_known_by_names_that_fit_the_wire_and_start_as_the_scenario
     assert "SIM_WIND_SPD" not in settings(scenario(5, profile))
 
 
+@pytest.mark.ci
 def test_every_setting_does_something_and_what_it_says() -> None:
     """But the speed, which changes no bit: see below."""
     short = scenario(9, "sensors.second_imu={kind='imu', grade='mems-industrial', rate_hz=200}")
@@ -300,6 +303,7 @@ SESSION: Sequence[tuple[float, Callable[[Scenario], Sequence[Request]]]] = (
 )
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("period_s", "realtime"), [(0.04, 50.0), (0.135, 200.0), (0.3, None)])
 def test_a_session_is_repeated_bit_for_bit(period_s: float, realtime: float | None, tmp_path: Path) -> None:
     turbulent = Scenario.load("u_turn", ["duration_s=26", "expect={}"])
@@ -319,6 +323,7 @@ def test_a_session_is_repeated_bit_for_bit(period_s: float, realtime: float | No
     assert not same(run(again, seed=6, replay=replay).dataset, kept)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("realtime", [None, 4.0])
 def test_what_was_asked_is_in_the_file_at_once(realtime: float | None, tmp_path: Path) -> None:
     found: list[int] = []
@@ -389,6 +394,7 @@ def test_nonsense_from_a_link_is_refused_and_leaves_no_trace() -> None:
 # --- when it goes on
 
 
+@pytest.mark.ci
 def test_a_paused_run_stands_still_goes_on_by_steps_and_loses_no_bit() -> None:
     short = scenario(6)
 
@@ -439,6 +445,7 @@ def test_a_pause_ends_by_resume_and_by_end() -> None:
         assert bool(result.remarks and result.remarks[0].startswith("ended on request")) != finished
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("asked", [Speed(4.0), Change("SIM_SPEEDUP", 4.0), Faster(0.004)])
 def test_the_speed_changes_on_the_way_and_is_no_part_of_the_record(asked: Request) -> None:
     short = scenario(6)
@@ -470,6 +477,7 @@ def test_a_run_as_fast_as_it_can_is_slowed_down_on_request() -> None:
     assert len(rows) == 226
 
 
+@pytest.mark.ci
 def test_a_restart_begins_anew_in_the_same_folder(tmp_path: Path) -> None:
     short = scenario(7)
     station = Station([(2.0, Change("SIM_GPS1_JAM", 1.0)), (4.0, Restart())])

@@ -220,6 +220,7 @@ def command(*arguments: str) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
+@pytest.mark.ci
 def test_varied_values_and_files(at_rest: Path, tmp_path: Path, threads: str) -> None:
     out = tmp_path / "out"
     vary = ("--vary", "sensors.gnss.rate_hz=1,5", "--vary", "sensors.gnss.denied=[[68, 72]],[]")
@@ -280,6 +281,7 @@ def test_interrupted_campaign_carries_on(
     assert len(more.outcomes) == 5
 
 
+@pytest.mark.ci
 def test_failing_run_is_reported_and_stops_no_other(
     at_rest: Path, tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -385,6 +387,7 @@ def wait_for(address: str) -> None:
         client.wait_for_workers(2, timeout=30)
 
 
+@pytest.mark.ci
 def test_the_code_that_decides_numbers_is_all_of_it_but_presentation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -416,6 +419,7 @@ def test_a_million_runs_are_made_as_they_are_flown(
     assert flown.seeds == []
 
 
+@pytest.mark.ci
 def test_a_wrong_scheduler_is_told_before_anything_is_made(at_rest: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="nothing answers there"):
         campaign(at_rest, 1_000_000_000, workers=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
@@ -480,6 +484,7 @@ def test_scheduler_address_that_is_none(at_rest: Path, tmp_path: Path, address: 
         campaign(at_rest, 1, workers=address, out=tmp_path / "out")
 
 
+@pytest.mark.ci
 def test_scheduler_that_does_not_answer(at_rest: Path, tmp_path: Path) -> None:
     started = time.monotonic()
     with pytest.raises(UserError, match="nothing answers there"):

@@ -161,6 +161,7 @@ def test_nothing_to_check_is_a_mistake(tmp_path: Path) -> None:
 # --- one scenario
 
 
+@pytest.mark.ci
 def test_a_pass_leaves_nothing_and_a_failure_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     loaded = Scenario.load(scenario(tmp_path, "mine"))
     passed = check.fly(Task("mine", loaded, tmp_path / "mine", None))
@@ -207,6 +208,7 @@ def test_a_lost_flight_fails_though_all_bounds_are_kept(tmp_path: Path, monkeypa
     assert outcome.failed
 
 
+@pytest.mark.ci
 def test_a_loop_that_never_closes_fails_though_all_bounds_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -236,6 +238,7 @@ def test_a_report_that_fails_hides_no_metrics(tmp_path: Path, monkeypatch: pytes
 # --- all of them
 
 
+@pytest.mark.ci
 def test_check_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.chdir(tmp_path)
     run = partial(command, monkeypatch=monkeypatch, capsys=capsys)
@@ -289,6 +292,7 @@ def fly_or_crash(task: Task, tell: Any) -> Outcome:
     return Outcome(task, wall_s=os.getpid())
 
 
+@pytest.mark.ci
 def test_a_crash_costs_one_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The one that flies longest crashes; the same worker's place is taken by another."""
     names = ["crash", "good", "also", "more"]
@@ -303,6 +307,7 @@ def test_a_crash_costs_one_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["crash"]
 
 
+@pytest.mark.ci
 def test_check_in_a_test(tmp_path: Path) -> None:
     result = testbed.check(scenario(tmp_path, "mine"), out=tmp_path / "runs")
     assert result.passed, result
@@ -312,6 +317,7 @@ def test_check_in_a_test(tmp_path: Path) -> None:
     assert re.search(r"(?m)^bad: FAILED in .*\n  ins.aligned_s is \S+, not ≤ 0: exceeded$", str(result))
 
 
+@pytest.mark.ci
 def test_an_interrupt_leaves_no_process_and_no_file(tmp_path: Path) -> None:
     names = [scenario(tmp_path, name, HOUR).name for name in ("one", "two", "three")]
     command = [sys.executable, "-m", "testbed", "check", *names]

@@ -113,6 +113,7 @@ def recompiled(module: ModuleType, kernel: str, **globals: Any) -> Any:
     return numba.njit(FunctionType(code, vars(module) | globals))
 
 
+@pytest.mark.ci
 def test_unbroken_it_passes(verdict: Callable[[], check.Outcome]) -> None:
     outcome = verdict()
     assert not outcome.failed, outcome
@@ -151,6 +152,7 @@ def catches(outcome: check.Outcome, metric: str) -> None:
     assert metric in {row.metric for row in worst}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("apply", "metric"), BREAKS)
 def test_broken_it_fails(
     verdict: Callable[[], check.Outcome], monkeypatch: pytest.MonkeyPatch, apply: Break, metric: str

@@ -26,6 +26,7 @@ def square(task: int, tell: Tell) -> tuple[int, int]:
     return task * task, os.getpid()
 
 
+@pytest.mark.ci
 def test_results_errors_and_deaths() -> None:
     given: list[int] = []
     got: list[int] = []
@@ -89,6 +90,7 @@ def gone(pid: int) -> bool:
         return True
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_who_started_them(tmp_path: Path, number: int) -> None:
     """From a script without a main guard; even when it has no time to end them."""
@@ -110,6 +112,7 @@ def test_workers_end_with_who_started_them(tmp_path: Path, number: int) -> None:
         time.sleep(0.1)
 
 
+@pytest.mark.ci
 def test_a_worker_that_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pool, "PRELOAD", "no_such_module")
     with pool.opened(2, 2) as crew, pytest.raises(pool.UserError, match=r"ended before it had begun: .*no_such_module"):

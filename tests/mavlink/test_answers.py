@@ -455,6 +455,7 @@ def test_pause_restart_and_end(meet):
 # Rates
 
 
+@pytest.mark.ci
 def test_rates_are_the_stations_own(meet, port):
     peer, other = meet(), Peer(None, mavutil.mavlink_connection(f"udpout:127.0.0.1:{port}", dialect="all"))
     other.publisher = peer.publisher
@@ -479,6 +480,7 @@ def test_rates_are_the_stations_own(meet, port):
     other.close()
 
 
+@pytest.mark.ci
 def test_data_streams(meet):
     peer = meet()
     peer.mav.request_data_stream_send(1, 1, mav.MAV_DATA_STREAM_ALL, 4, 1)
@@ -602,6 +604,7 @@ def test_unknown_identity_is_named():
 # Several of everything
 
 
+@pytest.mark.ci
 def test_two_stations_a_late_one_and_one_that_vanishes(meet, port, monkeypatch):
     peer = meet()
     peer.fly(range(1, 30))
@@ -751,6 +754,7 @@ def test_heart_beats_while_the_run_is_paused(meet, monkeypatch):
     assert 4 <= beats <= 5
 
 
+@pytest.mark.ci
 def test_log_does_not_depend_on_who_asks(tmp_path, port):
     def flown(name, urls):
         publisher = MavlinkPublisher([f"tlog:{tmp_path / name}", *urls], SCENARIO)

@@ -74,6 +74,7 @@ def same(decoded, expected):
     return decoded == expected or (math.isnan(decoded) and math.isnan(expected))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=settings.default.max_examples // 6)  # of each message
 @given(data=st.data())
@@ -241,6 +242,7 @@ def broken_run(deal, status, fix):
     return truth, estimate(deal, status), {s.sensor: s for s in samples}, imu, others, reports
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("vehicles", [False, True])
 @example(state=np.full(397, math.nan), before=np.full(397, math.nan), status=Status.ALIGNED, fix=FixType.FIX_3D)
 @example(state=np.full(397, math.inf), before=np.full(397, -math.inf), status=Status.ALIGNED, fix=FixType.NO_FIX)

@@ -166,6 +166,7 @@ def fire(publisher, station, rounds, rng):
     return worst
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("key", [None, "secret"])
 @pytest.mark.parametrize("vehicles", [False, True])
 def test_hostile_station(key, vehicles):

@@ -139,6 +139,7 @@ def test_nothing_is_claimed_before_alignment(watched, messages):
     assert messages["HEARTBEAT"][-1].system_status == mav.MAV_STATE_ACTIVE
 
 
+@pytest.mark.ci
 def test_station_breaks_the_receiver_and_heals_it(tmp_path, monkeypatch):
     """Within two seconds of the run its health says so, and the record has both requests."""
     monkeypatch.setenv("MAVLINK20", "1")
@@ -182,6 +183,7 @@ def test_station_breaks_the_receiver_and_heals_it(tmp_path, monkeypatch):
     assert dataset["requests"]["kind"].values.astype(str).tolist() == ["inject", "clear"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("listening", [False, True])
 def test_only_what_may_ask_keeps_the_run_from_flying_ahead(listening, monkeypatch, tmp_path):
     ahead = []

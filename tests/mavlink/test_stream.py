@@ -148,6 +148,7 @@ def test_station_on_tcp(unused_port, ours, theirs):
     check_attitude_and_position(heard, 50)
 
 
+@pytest.mark.ci
 @pytest.mark.usefixtures("mavlink2")
 def test_mavlogdump_reads_the_log(tmp_path):
     path = tmp_path / "run.tlog"
@@ -470,6 +471,7 @@ def test_other_estimators(tmp_path):
     assert "AHRS3" not in heard
 
 
+@pytest.mark.ci
 def test_odometry_covariance(tmp_path):
     """Against a cloud of estimates drawn from the covariance, in the house's sign of the attitude error."""
     rng = np.random.default_rng(5)
@@ -548,6 +550,7 @@ def last(heard, name, field):
     return getattr(heard[name][-1], field)
 
 
+@pytest.mark.ci
 def test_silent_sensors_lose_their_health_within_two_seconds_and_get_it_back(tmp_path):
     bits = {
         "gnss": mav.MAV_SYS_STATUS_SENSOR_GPS,
@@ -586,6 +589,7 @@ def test_slow_sensor_is_not_silent(tmp_path):
     assert all(message.onboard_control_sensors_health & bit for message in status)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE])
 def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     def reports(t):

@@ -88,6 +88,7 @@ def log(*frames: bytes, every_s: float = 1.0) -> bytes:
     return b"".join(struct.pack(">Q", round(1e6 * (1e9 + i * every_s))) + frame for i, frame in enumerate(frames))
 
 
+@pytest.mark.ci
 def test_the_end_of_a_log_is_the_end_of_the_run(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     picture = shown(flown / "run.tlog")
     dataset = record.load(flown / "run.nc")
@@ -347,6 +348,7 @@ def test_texts_without_an_end_stay_short() -> None:
     assert len(said) <= 10 + LONGEST_TEXT
 
 
+@pytest.mark.ci
 def test_live_until_interrupted() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))

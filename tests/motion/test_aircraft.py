@@ -42,6 +42,7 @@ def climbing(aircraft: Aircraft, airspeed: float, alt: float, seconds: float, ra
         aircraft.run(10, array("d"))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("airspeed", AIRSPEEDS)
 @pytest.mark.parametrize("alt", [50.0, 800.0])
 def test_trims(aircraft: Aircraft, airspeed: float, alt: float) -> None:
@@ -70,6 +71,7 @@ def test_mass_and_inertia_are_the_published_ones(aircraft: Aircraft) -> None:
     assert np.array(inertia) * 1.3558179 == pytest.approx([JX, JY, JZ], rel=1e-3)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("airspeed", AIRSPEEDS)
 def test_modes_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
     found = {mode.name: mode for mode in modes(airspeed, 0.0)}
@@ -93,12 +95,14 @@ def test_modes_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
     assert 0.05 < found["Dutch roll"].damping < 0.7
 
 
+@pytest.mark.ci
 def test_modes_table_is_complete() -> None:
     table = modes_table([25.0]).splitlines()
     assert len(table) == 2 + 5
     assert all(row.count("|") == 7 for row in table)
 
 
+@pytest.mark.ci
 def test_short_period_and_phugoid_are_seen_in_flight(aircraft: Aircraft) -> None:
     """The linearisation against a flight of the bare airframe: kicked in pitch, hands off."""
     aircraft = Aircraft("loiter", 200.0)
@@ -121,6 +125,7 @@ def test_short_period_and_phugoid_are_seen_in_flight(aircraft: Aircraft) -> None
     assert np.diff(crossings).mean() == pytest.approx(phugoid.period, rel=0.1)
 
 
+@pytest.mark.ci
 def test_thrust_falls_with_airspeed(aircraft: Aircraft) -> None:
     """At the same throttle, in the same air."""
     thrusts = []
@@ -138,6 +143,7 @@ def test_thrust_falls_with_airspeed(aircraft: Aircraft) -> None:
     assert 10 < thrusts[-1] < thrusts[0] < 60
 
 
+@pytest.mark.ci
 def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
     """Full throttle at low altitude: power and fuel flow of the published table within a fifth."""
     fdm = aircraft.fdm
@@ -239,6 +245,7 @@ def test_the_wing_stalls_where_its_envelope_says() -> None:
     assert WING.airspeed.stall_mps == pytest.approx(stall, rel=0.02)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("airspeed", [12.5, 18.0, 25.0])
 def test_modes_of_the_wing_are_stable_and_where_textbooks_put_them(airspeed: float) -> None:
     found = {mode.name: mode for mode in modes(airspeed, 0.0, "flying_wing")}
@@ -256,6 +263,7 @@ def test_modes_of_the_wing_are_stable_and_where_textbooks_put_them(airspeed: flo
     assert 0.2 < found["Dutch roll"].damping < 0.7
 
 
+@pytest.mark.ci
 def test_the_wing_climbs_as_the_plan_check_believes(wing: Aircraft) -> None:
     for airspeed, alt in [(12.5, 100.0), (18.0, 100.0), (25.0, 100.0), (27.0, 2500.0)]:
         for rate in (WING.climb_limit(airspeed, alt), -WING.descent_limit(airspeed, alt)):
@@ -267,6 +275,7 @@ def test_the_wing_climbs_as_the_plan_check_believes(wing: Aircraft) -> None:
             assert throttle < 0.97
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("airspeed", "gusts"), [(12.5, "light"), (15.0, "moderate"), (18.0, "moderate"), (25.0, "moderate")]
 )

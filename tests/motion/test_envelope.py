@@ -76,6 +76,7 @@ def test_a_folder_that_is_no_aircraft_is_told(mine: Path, lacking: str) -> None:
         aircraft.load(str(mine))
 
 
+@pytest.mark.ci
 def test_a_model_that_jsbsim_cannot_fly_is_told(mine: Path) -> None:
     model = mine / "mine.xml"
     text = model.read_text("utf-8")

@@ -94,6 +94,7 @@ def about(centre: tuple[float, float], radius: float, **more: Any) -> dict[str, 
 # --- tracking
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("airspeed", "radius"), [(21.0, 150.0), (25.0, 120.0), (25.0, 400.0), (33.0, 400.0)])
 def test_loiter_in_calm_air(airspeed: float, radius: float) -> None:
     block = fly(flight([about((34.0, 108.0), radius, duration_s=240)], airspeed_mps=airspeed))
@@ -103,6 +104,7 @@ def test_loiter_in_calm_air(airspeed: float, radius: float) -> None:
     assert rms(radii(block, 34.0, 108.0)[settled] - radius) < 0.02 * radius
 
 
+@pytest.mark.ci
 def test_a_plan_of_every_kind_in_calm_air() -> None:
     plan = [
         {"leg": "straight", "length_m": 500},
@@ -127,6 +129,7 @@ def test_a_plan_of_every_kind_in_calm_air() -> None:
     assert np.abs(block.controls[:, :3]).max() < 0.95
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("lat", "lon", "heading"),
     [(0.0, 0.0, 0.0), (-34.0, 179.999, 90.0), (-34.0, -179.999, 270.0), (84.0, 12.0, 200.0), (-84.0, -120.0, 359.0)],
@@ -189,6 +192,7 @@ def test_an_hour_of_wind_and_moderate_turbulence() -> None:
 # --- truth columns
 
 
+@pytest.mark.ci
 def test_columns_are_consistent_with_each_other() -> None:
     block = fly(flight(MANOEUVRES, wind=GUSTY), 120.0)
     attitude = Rotation.from_quat(np.roll(block.q_nb, -1, axis=1))
@@ -266,6 +270,7 @@ def test_the_same_bits_however_it_is_advanced(rate_hz: float) -> None:
         assert bits(join(blocks)) == bits(whole)
 
 
+@pytest.mark.ci
 def test_seeds_make_the_turbulence_and_flights_do_not_share_it() -> None:
     first, second, other = (flight(MANOEUVRES, seed, wind=GUSTY) for seed in (3, 3, 4))
     mixed = [(first.advance(100), second.advance(100), other.advance(100)) for _ in range(10)]
@@ -274,6 +279,7 @@ def test_seeds_make_the_turbulence_and_flights_do_not_share_it() -> None:
     assert rms(blocks[0].wind_n - blocks[2].wind_n) > 0.5
 
 
+@pytest.mark.ci
 def test_turbulence_of_its_own_seed() -> None:
     wind = {**GUSTY, "turbulence_seed": 3}
     fixed, same, own = (flight(MANOEUVRES, seed, wind=w).advance(200) for seed, w in ((1, wind), (2, wind), (3, GUSTY)))
@@ -301,6 +307,7 @@ def test_nothing_is_printed(capfd: pytest.CaptureFixture[str]) -> None:
 # --- wind
 
 
+@pytest.mark.ci
 def test_wind_from_a_profile() -> None:
     profile = [[700.0, 0.0, 2.0], [900.0, 90.0, 6.0]]
     plan = [{"leg": "climb", "to_m": 950}]

@@ -93,6 +93,7 @@ def distances(track: np.ndarray, lat: float, lon: float) -> np.ndarray:
 PLACES = [(34.0, 108.0), (-51.0, 179.995), (84.0, -20.0), (0.0, 0.0), (-84.0, -179.999)]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("lat", "lon"), PLACES)
 @pytest.mark.parametrize("wind", [(0.0, 0.0), (-6.0, 5.0)])
 @pytest.mark.parametrize("direction", ["left", "right"])

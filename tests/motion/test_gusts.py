@@ -43,6 +43,7 @@ def test_strength_has_no_jump() -> None:
         assert np.abs(np.diff(sigmas)).max() < 0.06
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("level", "alt"), [("light", 250.0), ("light", 800.0), ("moderate", 450.0)])
 def test_jsbsim_makes_gusts_of_this_strength(level: str, alt: float) -> None:
     """Both axes of ten minutes at 27 m/s: some sixty lengths of gusts each, so a fifth is within 3 sigma."""

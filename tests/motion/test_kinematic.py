@@ -210,6 +210,7 @@ def test_position_is_the_integral_of_velocity(name: str) -> None:
     assert np.abs(apart).max() < 1e-6
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", MOTIONS)
 def test_body_rate_is_that_of_the_attitude_and_sums_to_the_increments(name: str) -> None:
     block = rows(name)

@@ -297,6 +297,7 @@ def test_u_flight_takes_nothing_for_tilt_in_the_turn(u_flights):
     assert min(accepted(reports, 270, 600)) > 280
 
 
+@pytest.mark.ci
 def test_recovery_from_three_degrees():
     # wholly about one axis is the slowest case: the correction is limited axis by axis
     truth = level_flight()

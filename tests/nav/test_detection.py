@@ -191,6 +191,7 @@ def test_window_is_of_time():
     assert mean.n == 1
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", MEANS)
 def test_quadratic_evidence_has_the_stated_rate(name):
     rng = np.random.default_rng(7)

@@ -230,6 +230,7 @@ def test_what_makes_no_sense_is_refused(wrong, message):
 # --- in flight
 
 
+@pytest.mark.ci
 def test_one_local_filter_is_the_ins():
     """Corrected every second instead of at once: only linearisation differs."""
     truth, increments, one, _, others = world()
@@ -258,6 +259,7 @@ def test_full_reset_reproduces_one_filter_with_every_aid():
             assert ratio < 0.02
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "options",
     [
@@ -285,6 +287,7 @@ def test_every_way_of_fusing_is_sound(options):
     assert estimates[-1].extra["barometer_bias"][0][0] == pytest.approx(40.0, abs=2.0)
 
 
+@pytest.mark.ci
 def test_claims_without_resets():
     """Shared noise claims a little more than the centralised sigma; unshared noise claims less than can be."""
     _, increments, one, two, others = world()
@@ -529,6 +532,7 @@ def alone(recall_s):
     return Config(CONSUMER, locals_, recall_s=recall_s)
 
 
+@pytest.mark.ci
 def test_a_filter_alone_in_knowing_the_position_recalls_it():
     """The others' solution has lost the position for long, what the filter itself knew before the fault has not."""
     truth, increments, one, _, others = world(180)
@@ -544,6 +548,7 @@ def test_a_filter_alone_in_knowing_the_position_recalls_it():
     assert (np.abs(error(estimates[-1], truth)) < 4 * np.sqrt(np.diag(estimates[-1].covariance))).all()
 
 
+@pytest.mark.ci
 def test_a_recall_takes_back_all_that_was_told_since():
     """Whatever the fixes of the last seconds before the isolation said: a trace of a metre, or none."""
     truth, increments, one, _, others = world(120)
@@ -622,6 +627,7 @@ def test_a_condemned_axis_does_not_weaken_the_sound_ones():
     assert federated.events[0].isolated == (True, False, False)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("detector", ["chi_square", "eraim", "glr"])
 def test_a_detector_judges_by_the_noise_that_was_learned(detector):
     """A receiver twice as bad as it says, which would be isolated for that."""
@@ -643,6 +649,7 @@ def test_a_detector_judges_by_the_noise_that_was_learned(detector):
     assert np.mean(refused) < 0.01
 
 
+@pytest.mark.ci
 def test_an_axis_left_out_teaches_nothing_and_the_others_go_on():
     _, increments, one, two, others = world(120)
     bad = [dataclasses.replace(f, h=f.h + 640.0) if f.t >= 60 else f for f in one]

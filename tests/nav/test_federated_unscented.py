@@ -43,6 +43,7 @@ def cut(increments, end):
     return ImuSamples(increments.t[rows], increments.dt[rows], increments.dtheta[rows], increments.dv[rows])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("structure", ["no_reset", "full_reset"])
 def test_small_errors_give_the_linear_federation(structure):
     """All filters by sigma points, or the first of them only, which then has linear ones beside it."""
@@ -106,6 +107,7 @@ def from_bad_headings(engine, structure, sigma_deg=60.0, seeds=8):
     return np.array(headings), np.mean(nees, axis=0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("structure", ["no_reset", "full_reset", "partial"])
 def test_headings_far_off_are_found_and_nothing_is_claimed_too_much(structure):
     """Start 60 deg wrong, 1 sigma, of which each filter is told 85: a linear federation is lost, and sure of itself."""
@@ -143,6 +145,7 @@ def _cross_matrix(v):
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("structure", "recall_s"), [("no_reset", None), ("full_reset", None), ("no_reset", 10.0)])
 def test_a_spoofed_receiver_is_isolated_and_readmitted(structure, recall_s):
     """As with linear filters: isolation starts the filters again, or takes one back, and readmission judges by all."""
@@ -159,6 +162,7 @@ def test_a_spoofed_receiver_is_isolated_and_readmitted(structure, recall_s):
     assert (np.abs(error(estimates[-1], truth)) < 4 * np.sqrt(np.diag(estimates[-1].covariance))).all()
 
 
+@pytest.mark.ci
 def test_blocks_of_any_size_give_the_same_bits():
     _, increments, one, two, others = world()
     few = cut(increments, 15)

@@ -142,6 +142,7 @@ def test_a_sample_without_a_time_waits_for_nobody():
     assert sum(r.weight for r in reports if r.t > 11) > 800
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("ticks", [5, 8])  # 40 and 25 Hz
 @pytest.mark.parametrize("lag_s", [0.0, 0.2])
 def test_the_same_bits_between_increments_whether_or_not_the_next_is_there(ticks, lag_s):
@@ -200,6 +201,7 @@ def everything(truth, rng):
     return increments_, samples + barometer(truth, rng) + magnetometer(truth, rng) + airspeed(truth, rng)
 
 
+@pytest.mark.ci
 def test_the_same_bits_however_the_data_are_pushed():
     truth = flight(30)
     increments_, samples = everything(truth, np.random.default_rng(3))
@@ -219,6 +221,7 @@ def test_the_same_bits_however_the_data_are_pushed():
         np.testing.assert_array_equal(other, results[0])
 
 
+@pytest.mark.ci
 def test_estimates_on_the_way_know_only_what_had_arrived():
     truth = flight(30)
     increments_, samples = everything(truth, np.random.default_rng(3))
@@ -237,6 +240,7 @@ def test_estimates_on_the_way_know_only_what_had_arrived():
     np.testing.assert_array_equal(tracks[2], tracks[0])
 
 
+@pytest.mark.ci
 def test_asking_changes_nothing():
     truth = flight(30)
     increments_, samples = everything(truth, np.random.default_rng(3))
@@ -255,6 +259,7 @@ def test_asking_changes_nothing():
     assert final[0].lat == final[1].lat
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("offset_s", [0.0, 0.0021])
 def test_latency_and_fixes_between_increments_cost_no_accuracy(offset_s):
     """At 29 m/s 0.2 s is 6 m and 2 ms are 6 cm; with exact sensors not a centimetre may be left of either."""

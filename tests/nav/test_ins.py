@@ -53,6 +53,7 @@ def everything(truth, rng, **of_gnss):
     return increments, samples, barometer(truth, rng, 40.0) + magnetometer(truth, rng) + airspeed(truth, rng)
 
 
+@pytest.mark.ci
 def test_no_noise_no_error():
     """Every aid exact, at 10 Hz: what is left is rounding, linearisation and the covariance period."""
     truth = flight(60)
@@ -78,6 +79,7 @@ def test_no_noise_no_error():
     assert set(extra) == {"barometer_bias", "wind", "magnetometer_bias"}
 
 
+@pytest.mark.ci
 def test_dead_reckoning_without_aids():
     truth = flight(120)
     rng = np.random.default_rng(1)
@@ -110,6 +112,7 @@ def test_all_aids_converge():
         assert np.mean([r.weight for r in chosen]) > 0.99
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("period", [4, 10])
 def test_covariance_period_loses_nothing(period):
     truth = flight(60)
@@ -164,6 +167,7 @@ def test_outage_and_reacquisition():
     assert not any(40 <= r.t < 90 for r in reports)
 
 
+@pytest.mark.ci
 def test_a_bad_first_fix_after_an_outage_is_not_swallowed():
     def samples(fixes):
         return [moved(f, 60.0) if 90 <= f.t < 90.6 else f for f in outage(fixes, 40, 90)]
@@ -175,6 +179,7 @@ def test_a_bad_first_fix_after_an_outage_is_not_swallowed():
     assert max(e for t, e in errors.items() if t > 100) < 3.0
 
 
+@pytest.mark.ci
 def test_a_filter_too_sure_of_itself_gives_in_to_consistent_gnss():
     """The filter believes in gyros and accelerometers a thousand times better than they are, and drifts off."""
     vain = dataclasses.replace(
@@ -201,6 +206,7 @@ def test_a_filter_too_sure_of_itself_gives_in_to_consistent_gnss():
     assert max(e for t, e in errors.items() if 97 < t < 100) < 5.0
 
 
+@pytest.mark.ci
 def test_a_lasting_jump_is_believed_only_after_patience():
     def jumped(fixes):
         return [moved(f, 100.0) if f.t >= 60 else f for f in fixes]
@@ -212,6 +218,7 @@ def test_a_lasting_jump_is_believed_only_after_patience():
     assert len(fused) > 150
 
 
+@pytest.mark.ci
 def test_correlated_gnss_errors_do_not_make_it_sure_of_itself():
     """White 0.9 m and a Markov error of 1.2 m reported as 1.5 m: without the states it would claim half a metre."""
     truth = flight(120)
@@ -276,6 +283,7 @@ def test_broken_samples_are_reported_and_not_fused():
     assert after.lat == before.lat
 
 
+@pytest.mark.ci
 def test_broken_increments_are_bridged():
     truth = flight(60)
     increments, fixes, others = everything(truth, np.random.default_rng(7))
@@ -337,6 +345,7 @@ def test_aids_go_by_the_names_of_their_sensors():
     assert not ins.accepts(BarometerSample(0.0, 0.0, 95_000.0, "other"))
 
 
+@pytest.mark.ci
 def test_the_reference_field_is_looked_up_rarely():
     calls = []
 

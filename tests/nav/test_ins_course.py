@@ -92,6 +92,7 @@ def test_residual_is_what_an_update_leaves():
     assert np.isnan(left[1])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("scaling", [None, Scaling()])
 def test_noise_is_learned_inside_the_filter(scaling):
     """A receiver that says 1 m and 0.1 m/s and is twice as bad."""
@@ -129,6 +130,7 @@ def learning(times, outage=(0.0, 0.0)):
     return policies, feed(FusionHorizon(ins), increments, fixes)[1]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("times", [1, 2, 4])
 def test_the_gate_judges_by_what_was_learned(times):
     """Otherwise it turns sound looks of a noisier receiver away, and what passes never teaches how noisy it is."""
@@ -184,6 +186,7 @@ def test_sigma_points_do_not_depend_on_the_blocks():
     np.testing.assert_array_equal(pieces.covariance, whole.covariance)
 
 
+@pytest.mark.ci
 def test_sigma_points_find_a_heading_that_is_far_off():
     """A start 150 deg wrong and told so: after six seconds the linear filter is still lost, and sure of it."""
     truth = flight(60)

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import nav
 
 SCRIPT = """
@@ -15,6 +17,7 @@ print(sum(earth.radii.stats.cache_hits.values()), sum(earth.radii.stats.cache_mi
 """
 
 
+@pytest.mark.ci
 def test_a_change_of_any_source_compiles_anew(tmp_path):
     """`radii` contains `radii_of` of its own file; a change of another file of `nav` may be one of what it contains."""
     source = Path(nav.__file__).parent
@@ -37,6 +40,7 @@ def test_a_change_of_any_source_compiles_anew(tmp_path):
     assert hits_and_misses() == ["1", "0"]
 
 
+@pytest.mark.ci
 def test_nowhere_to_keep_kernels_is_said_once_and_they_are_compiled_all_the_same(tmp_path):
     """A read-only installation and no home, as in a container; also for the processes that such a one starts."""
     package = tmp_path / "nav"

@@ -52,6 +52,7 @@ def test_the_vector_test_takes_its_own_tilt_for_acceleration(tilt_deg, passes):
     assert NORM.judge(f_n, STILL, G).low
 
 
+@pytest.mark.ci
 def test_rolling_in_is_seen_first_and_the_yaw_rate_holds_through_the_turn():
     truth = level_flight()
     increments = imu(truth, 0, gust=0.0)

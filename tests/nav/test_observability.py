@@ -141,6 +141,7 @@ def test_units_are_a_change_of_variables():
 IMU = ImuModel(1e-4, 1e-3, 2e-4, 0.02)
 
 
+@pytest.mark.ci
 def test_continuous_is_the_rate_of_the_transition():
     model = ErrorModel(
         ImuModel(1e-4, 1e-3, 1e-4, 0.05, 1e-6, 1e-5, 1e-5, 1e-3, 300.0, 200.0, 1e-3, 1e-3),

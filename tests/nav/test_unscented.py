@@ -58,6 +58,7 @@ def test_factor():
     np.testing.assert_allclose((root.T @ root - P) / np.outer(scale, scale), 0.0, atol=1e-6)
 
 
+@pytest.mark.ci
 def test_points_are_the_columns_of_the_factor():
     n = 17
     rng = np.random.default_rng(1)
@@ -70,6 +71,7 @@ def test_points_are_the_columns_of_the_factor():
     np.testing.assert_allclose(np.delete(found, slice(6, 9), 1), np.delete(expected, slice(6, 9), 1), atol=1e-12)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize(("m", "k"), [(1, 15), (3, 15), (6, 15), (6, 3), (9, 3), (20, 3)])
 def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
@@ -96,6 +98,7 @@ def test_linear_measurement_is_the_kalman_filter(m, k, alpha):
     assert (P == P.T).all()
 
 
+@pytest.mark.ci
 def test_a_dead_state_changes_nothing():
     """15 states and six rows have loops of their own size: with a sixteenth, always zero, it is the other ones."""
     rng = np.random.default_rng(11)
@@ -232,6 +235,7 @@ def test_curved_measurement_is_the_weighted_sum():
     np.testing.assert_allclose(np.delete(moved, [6, 7, 8]), -np.delete(K @ nu, [6, 7, 8]), atol=1e-9)
 
 
+@pytest.mark.ci
 def test_update_refuses_beyond_the_threshold():
     q, v, lla, x = estimate(15)
     P = np.eye(15)
@@ -405,6 +409,7 @@ def test_small_misalignment_is_the_linear_filter():
     np.testing.assert_allclose(sigma_points, linear, atol=5e-6)
 
 
+@pytest.mark.ci
 def test_converges_from_a_bad_alignment():
     """8 deg of level and 60 deg of heading error (1 sigma), GNSS each second in flight: twelve runs with either engine.
 

@@ -146,6 +146,7 @@ def walk(policy, R_true, looks, seed, outlier=None, m=2):
     return used
 
 
+@pytest.mark.ci
 def test_sage_husa_finds_a_fourfold_variance():
     """Within 25 % after 200 looks: two axes, one of them as told, and in the mean over runs without bias."""
     found = np.array([walk(SageHusa(b=0.99), np.array([4.0, 1.0]), 200, seed) for seed in range(60)])

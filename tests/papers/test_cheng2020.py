@@ -41,6 +41,7 @@ def first_turn() -> dict[str, Any]:
     return cheng2020.road(cheng2020.SEEDS[1], 360, ("improved", "ungated"))
 
 
+@pytest.mark.ci
 def test_a_turn_disturbs_only_who_takes_course_for_heading_in_it(first_turn: dict[str, Any]) -> None:
     improved, ungated = first_turn["improved"], first_turn["ungated"]
     assert len(first_turn["turns"]) == 1
@@ -54,6 +55,7 @@ def test_a_turn_disturbs_only_who_takes_course_for_heading_in_it(first_turn: dic
     assert improved["least_R"] > 0.25
 
 
+@pytest.mark.ci
 def test_more_noise_is_found() -> None:
     assert cheng2020.noisier(2)["gnss_position"] < 0.25
 
@@ -73,6 +75,7 @@ def test_table_1() -> None:
     assert table["radians"] == pytest.approx([1 / (6.388838e6 * 0.7071068 * 6.367382e6), 1.599e-3], rel=1e-3)
 
 
+@pytest.mark.ci
 def test_table_1_has_a_row_for_each_column(first_turn: dict[str, Any]) -> None:
     claims = [one for one in cheng2020.PAPER.conclude(results(first_turn)) if one.quantity.startswith("Table 1")]
     for column in ("velocity", "position", "velocity and position"):
@@ -98,6 +101,7 @@ def verdicts(found: list[Any]) -> dict[str, str]:
     return {claim.quantity: claim.verdict for claim in cheng2020.PAPER.conclude(found)}
 
 
+@pytest.mark.ci
 def test_claims_can_fail(first_turn: dict[str, Any]) -> None:
     sound = verdicts(results(first_turn))
     bad: dict[str, Any] = copy.deepcopy(first_turn)

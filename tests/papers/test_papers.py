@@ -63,6 +63,7 @@ def toy(drawn: list[Path]) -> Paper:
     )
 
 
+@pytest.mark.ci
 def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
     drawn: list[Path] = []
     told: list[float] = []
@@ -78,6 +79,7 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
     assert [row["verdict"] for row in record] == ["met", "missed"]
 
 
+@pytest.mark.ci
 def test_an_unknown_paper_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="newton1687: there is no such paper"):
         papers.find(["newton1687"])

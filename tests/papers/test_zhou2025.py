@@ -89,6 +89,7 @@ def test_a_replay_scores_each_seed_by_itself() -> None:
     assert min(h.end_lag for h in fading["hard"]) > 4 > 1 > max(h.end_lag for h in both["hard"])
 
 
+@pytest.mark.ci
 def test_the_improved_fusion_does_not_follow_the_faults() -> None:
     """One run as the campaign's; over all seeds the ratios are the claims."""
     found = zhou2025.fly(PRINTED, 1)

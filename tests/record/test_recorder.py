@@ -166,6 +166,7 @@ def test_memory_file_and_plain_xarray_agree(run_file: Path) -> None:
         assert plain["estimators/ins"]["v_n"].sel(ned="east").attrs["units"] == "m/s"
 
 
+@pytest.mark.ci
 def test_reading_does_not_load_dask(run_file: Path) -> None:
     """Its arrays would be half of what a short run loads, and none of them is there."""
     script = (
@@ -175,6 +176,7 @@ def test_reading_does_not_load_dask(run_file: Path) -> None:
     assert subprocess.run([sys.executable, "-c", script, str(run_file)], timeout=120).returncode == 0
 
 
+@pytest.mark.ci
 def test_chunking_changes_no_byte(tmp_path: Path, run_file: Path) -> None:
     for chunk in (7, 33, 4096):
         path = tmp_path / f"{chunk}.nc"
@@ -188,6 +190,7 @@ def test_same_run_gives_the_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "a.nc").read_bytes() == (tmp_path / "b.nc").read_bytes()
 
 
+@pytest.mark.ci
 def test_every_flush_can_be_read_and_flushing_changes_nothing(tmp_path: Path, run_file: Path) -> None:
     path = tmp_path / "run.nc"
     recorder = Recorder(path, scenario(), 3)
@@ -246,6 +249,7 @@ def test_a_report_without_innovation_keeps_its_place(tmp_path: Path) -> None:
     np.testing.assert_array_equal(position["S"][1], fused.S)
 
 
+@pytest.mark.ci
 def test_a_record_tended_in_spare_moments_is_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of a new file are made between blocks, while rows, columns and groups go on coming."""
     monkeypatch.setattr(record, "FLUSH_WALL_S", 0.0)
@@ -359,6 +363,7 @@ def kill_and_read(folder: Path, number: int, delay: float) -> float:
     return float(t[-1])
 
 
+@pytest.mark.ci
 def test_a_killed_writer_leaves_a_readable_record(tmp_path: Path) -> None:
     ends = [kill_and_read(tmp_path, k, delay) for k, delay in enumerate((0.0, 0.05, 0.4))]
     assert ends[-1] > ends[0]
@@ -434,6 +439,7 @@ def test_missing_damaged_and_foreign_files_are_told(tmp_path: Path, run_file: Pa
         load(cut)
 
 
+@pytest.mark.ci
 def test_a_scrambled_file_never_ends_in_a_traceback(tmp_path: Path, run_file: Path) -> None:
     whole = np.frombuffer(run_file.read_bytes(), np.uint8)
     draw = np.random.default_rng(2)

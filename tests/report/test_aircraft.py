@@ -26,6 +26,7 @@ def test_shipped_aircraft_are_listed() -> None:
     assert all(name in shown(None) for name in aircraft.shipped())
 
 
+@pytest.mark.ci
 def test_limits_trims_and_modes_fit_80_columns() -> None:
     text = shown("flying_wing")
     assert "…" not in text

@@ -68,6 +68,7 @@ def test_no_file_has_two_figures() -> None:
     assert len(names) == len(set(names))
 
 
+@pytest.mark.ci
 def test_estimators_are_told_apart(run: Run, drawn: dict[str, Figure]) -> None:
     assert len({(line["color"], line["ls"]) for line in map(style.line_of, range(30))}) == 30
     for name in ("comparison", "ground_track", "attitude", "wind", "ellipses"):
@@ -75,6 +76,7 @@ def test_estimators_are_told_apart(run: Run, drawn: dict[str, Figure]) -> None:
             assert (line.get_color(), line.get_linestyle()) == tuple(run.lines[line.get_label()].values())
 
 
+@pytest.mark.ci
 def test_legends_are_whole_and_above_everything(drawn: dict[str, Figure]) -> None:
     for name, figure in drawn.items():
         if not figure.legends:
@@ -89,6 +91,7 @@ def test_legends_are_whole_and_above_everything(drawn: dict[str, Figure]) -> Non
     assert set(NAMES) <= set(legend(drawn["comparison"]))
 
 
+@pytest.mark.ci
 def test_labels_lie_on_the_page(drawn: dict[str, Figure]) -> None:
     for name, figure in drawn.items():
         for ax in seen(figure.axes):
@@ -99,6 +102,7 @@ def test_labels_lie_on_the_page(drawn: dict[str, Figure]) -> None:
             assert not ax.axison or ax.get_xlabel() or ax is not figure.axes[-1], name
 
 
+@pytest.mark.ci
 def test_all_figures_over_time_are_shaded_alike(drawn: dict[str, Figure]) -> None:
     for name, figure in drawn.items():
         kind = next((kind for kind in TIMED if name == kind or name.endswith(f"_{kind}")), None)
@@ -108,6 +112,7 @@ def test_all_figures_over_time_are_shaded_alike(drawn: dict[str, Figure]) -> Non
         assert plot.timed == (plot.name.removeprefix("{}_") in TIMED)
 
 
+@pytest.mark.ci
 def test_nothing_hides_truth(drawn: dict[str, Figure]) -> None:
     for ax in (*drawn["ground_track"].axes, *drawn["attitude"].axes, drawn["flight"].axes[0]):
         lines = {line.get_label(): line for line in ax.get_lines()}
@@ -139,6 +144,7 @@ def test_biases_have_panels_for_the_states_that_there_are() -> None:
     assert imu.biases(Run(dataset), "ins") is None
 
 
+@pytest.mark.ci
 def test_ellipses_are_shown_around_the_outage(drawn: dict[str, Figure]) -> None:
     titles = [ax.get_title(loc="left") for ax in seen(drawn["ellipses"].axes)]
     assert titles[0] == "69 s, before the outage"

@@ -68,6 +68,7 @@ def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> N
     assert not list(tmp_path.iterdir()), "the next run would leave it there"
 
 
+@pytest.mark.ci
 def test_a_figure_that_is_not_ours_is_not_replaced(tmp_path: Path) -> None:
     run = synthetic_run.dataset(**RUNS["no gnss"])
     (tmp_path / "flight.png").write_text("mine")
@@ -78,6 +79,7 @@ def test_a_figure_that_is_not_ours_is_not_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "flight.png").stat().st_size > 1000
 
 
+@pytest.mark.ci
 def test_a_body_at_rest(tmp_path: Path) -> None:
     recorder = Recorder(None, scenario(100.0), 1)
     truth = circle(100.0)
@@ -92,6 +94,7 @@ def test_a_body_at_rest(tmp_path: Path) -> None:
     assert page.read_text(encoding="utf-8").count("data:image/png;base64,") == len(images)
 
 
+@pytest.mark.ci
 def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
     recorder = Recorder(None, scenario(120.0), 1)
     named = {"jump": ("gnss", 80.0), "rise": ("barometer", 85.0), "unseen": ("airspeed", 70.0)}

@@ -331,6 +331,7 @@ def test_one_axis_refused_is_an_alarm() -> None:
     assert metrics.compute(run)["ins.false_alarms_per_look"] > 0.0
 
 
+@pytest.mark.ci
 def test_faults_that_overlap_end_when_they_end() -> None:
     run = faulty(("long", "gnss", 100.0, 130.0), ("short", "gnss", 105.0, 110.0), ("next", "gnss", 140.0, 150.0))
     refuse(run, "gnss_position", 100.0, 133.0)
@@ -371,6 +372,7 @@ def test_the_wrong_sensor_is_no_isolation() -> None:
     assert metrics.compute(run)["ins.isolation_correct.jump"] == 0
 
 
+@pytest.mark.ci
 def test_false_alarms_are_rejections_while_there_is_a_fix() -> None:
     dataset = synthetic_run.dataset(200.0, denied=((100.0, 150.0),))
     take_all(dataset, "barometer", "gnss_position", "gnss_velocity")
@@ -442,6 +444,7 @@ def test_no_recovery_is_no_time(tmp_path: Path) -> None:
     assert found["ins.unrecovered_outages"] == 1
 
 
+@pytest.mark.ci
 def test_a_hold_that_the_end_of_the_run_cuts_off_is_no_recovery(tmp_path: Path) -> None:
     found = recovering(tmp_path, 172.0)  # of 200 s
     assert "ins.recovery_s" not in found

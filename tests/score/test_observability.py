@@ -52,6 +52,7 @@ def overridden(estimator: str, faults: Sequence[str] = ()) -> list[str]:
     return [f"estimator=[{estimator}]", f"fault=[{','.join(faults)}]", "expect={}"]
 
 
+@pytest.mark.ci
 def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tmp_path: Path) -> None:
     straight = run(cheng2020.selected(["improved", "no_course"], STRAIGHT)).dataset
     found = visibility.of_run(straight)
@@ -128,6 +129,7 @@ def test_a_look_that_was_not_used_shows_nothing() -> None:
 SECOND_LOG = 'sensors.second={kind="body_velocity",grade="dvl",rate_hz=1}'
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "estimator",
     [
@@ -184,6 +186,7 @@ def test_a_record_without_its_scenario_has_none() -> None:
     assert tables.seen({}) == []
 
 
+@pytest.mark.ci
 def test_a_receiver_may_have_any_name() -> None:
     flown = run(Scenario.load("regression", ["duration_s=30", "fault=[]", *HEALTHY, "expect={}"])).dataset
     found = visibility.of_run(flown)

@@ -26,6 +26,7 @@ def test_perfect_barometer_is_truth_bit_for_bit():
     np.testing.assert_allclose([s.t_arrival - s.t for s in samples], 0.02, atol=1e-12)
 
 
+@pytest.mark.ci
 def test_barometer_errors():
     truth = still(200_000, 10.0)
     noise = pressures(BarometerConfig(grade="perfect", noise_pa=2.0), truth, rate_hz=10.0) - 101_325

@@ -53,6 +53,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "own.toml"
 
 
+@pytest.mark.ci
 def test_it_is_recorded_with_unit_and_noise(scenario: Path) -> None:
     dropout = {"sensor": "radar", "kind": "dropout", "window": [10.0, 15.0]}
     result = run(Scenario.load(scenario, {"duration_s": 20, "fault": [dropout], "sensors.radar.noise_m": 2.0}))

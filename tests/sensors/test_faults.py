@@ -348,6 +348,7 @@ def test_a_receiver_without_fix_has_nothing_to_falsify() -> None:
     assert all(math.isfinite(s.lat) for s in found if s.fix_type is not FixType.NO_FIX)
 
 
+@pytest.mark.ci
 def test_absurd_sizes_after_garbage_raise_nothing() -> None:
     for kind in KINDS:
         for channel, row in CHANNELS[kind].items():

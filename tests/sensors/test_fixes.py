@@ -88,6 +88,7 @@ def test_odometer_noise():
     assert stats.kstest(error / 0.3, "norm").pvalue > 1e-3
 
 
+@pytest.mark.ci
 def test_doppler_white_and_markov_noise():
     """White variance and correlated variance apart by the autocovariance, which is that of a first-order process."""
     tau, n = 30.0, 400_000  # 13000 correlation times: 1 % of a standard deviation
@@ -104,6 +105,7 @@ def test_doppler_white_and_markov_noise():
     assert np.abs(np.corrcoef(error.T)[np.triu_indices(3, 1)]).max() < 0.02
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("grade", ["dvl", "doppler"])
 def test_scale_factor_is_constant_and_of_each_axis(grade):
     share = {"dvl": 0.005, "doppler": 0.001}[grade]
@@ -152,6 +154,7 @@ def test_perfect_star_tracker_is_attitude_in_inertial_axes():
         assert np.linalg.norm(sample.q_ib) == pytest.approx(1, abs=1e-14)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("boresight", "poor"), [("forward", 0), ("right", 1), ("down", 2)])
 def test_star_tracker_noise_about_each_body_axis(boresight, poor):
     n = 8000
@@ -245,6 +248,7 @@ def test_denied_windows_are_silent(kind):
     np.testing.assert_array_equal(times, [t for t in expected if not (1 <= t < 2 or 4 <= t < 6)])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", CONFIGS)
 def test_dropouts_come_at_their_rate_one_by_one_and_move_no_other_number(kind):
     n, share = 20_000, 0.1
@@ -344,6 +348,7 @@ def test_recorded_columns_say_what_they_are(twins):
     assert "far" not in twins.dataset["sensors"].children
 
 
+@pytest.mark.ci
 def test_twins_in_export_and_report(twins):
     folder = export(twins.path / "run.nc", "csv")
     for name in ("imu2", "gnss2", "radar2", "star_tracker2", "beacon2"):

@@ -251,6 +251,7 @@ def assert_spread(values, sigma):
     assert early.std() == pytest.approx(late.std(), rel=0.15)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "grade",
     [

@@ -107,6 +107,7 @@ def test_range():
     assert np.abs(field).max() == pytest.approx(10e-6, rel=1e-12)
 
 
+@pytest.mark.ci
 def test_noise_and_spread():
     truth = still(40_000)
     truth.lat[:], truth.lon[:] = SITE.lat, SITE.lon

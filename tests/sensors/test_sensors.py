@@ -199,6 +199,7 @@ def test_a_rate_that_does_not_divide_the_tick_is_refused(kind):
         sensors.build("x", SECTIONS[kind](rate_hz=30.0), RATE_HZ, 1, SITE)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", SECTIONS)
 @settings(max_examples=40, deadline=None)
 @given(cuts=st.lists(st.integers(0, 400), max_size=8))
