@@ -1,4 +1,4 @@
-"""What a federation is made of (`Config`), and what speaks for which choice; `nav.federated` is the estimator.
+"""The options of a federated filter (`Config`), and when to choose which; `nav.federated` is the estimator.
 
 Sharing
     The common process noise and initial covariance reach every filter, which correlates their errors. With shares
@@ -19,10 +19,10 @@ Faults
     A fault that grows slowly has pulled its filter before it is found. Therefore, on every isolation, all filters start
     again from the fused solution of those without an isolated part, P_i = P_g / beta_i: nothing of the faulty sensor
     stays in any of them, nothing is counted twice, and the Markov errors of its aid go back to their first variance.
-    Filters with an isolated part get next to no share of the information: what they hold is lost when another part is
-    isolated. When all filters have an isolated part, they are left as they are.
+    Filters with an isolated part get next to no share of the information, as it is lost when another part is isolated.
+    When all filters have an isolated part, they are left as they are.
 
-    When every position was refused for ``patience_s``, the filters were too sure of themselves: their positions and
+    When every position was refused for ``patience_s``, the filters' covariances were too small: their positions and
     velocities are given up as in `nav.ins`, and the next fixes are believed.
 
 Which structure finds faults
@@ -37,32 +37,32 @@ Cross-check
     A fault that grows as smoothly as the aircraft could move drags its own filter along and is never seen there; but
     then the filters contradict each other. With ``cross_check``, before a fusion each filter without an isolated part
     is compared with the fused solution of the others in position and velocity, which sharing has made independent:
-    (x_i - x_o)' (P_i + P_o)^-1 (x_i - x_o) is chi-square of six degrees of freedom at most. When one exceeds its limit,
-    a filter is wrong. Of two that contradict each other as strongly, it is taken to be the one whose detectors have
-    more evidence (`Monitor.suspicion`). That may be little, but a sound filter has none, provided that the detectors
-    remember the onset as `nav.detection.Glr` does. That sensor is isolated. With resets all filters agree and nothing
-    can be compared: a cross-check needs ``no_reset``. Without a third filter to tell which of two is wrong this is the
-    weakest link: a fault so slow that no detector has evidence of its onset is found, but may be laid on the wrong one
-    of two receivers.
+    (x_i - x_o)' (P_i + P_o)^-1 (x_i - x_o) is chi-square of six degrees of freedom at most. When the largest exceeds
+    its limit, one filter is wrong. Among the filters that contradict the others about as strongly, the sensor whose
+    detector has the most evidence (`Monitor.suspicion`) is isolated. A sound sensor's has none; a faulty one's has at
+    least a little if it remembers the onset, as `nav.detection.Glr` does. With resets all filters agree and nothing can
+    be compared, so a cross-check needs ``no_reset``. With two receivers and no third filter to decide between them, a
+    fault that is too slow for any detector is found, but may be laid on the wrong receiver.
 
 Weighting
     ``normalised`` weakens a measurement before its detector refuses it: its variances become R / N with the weight of
     `nav.weighting.normalised_weights` (Zhou et al. 2025, Eq 22-26) from its own statistic and that of every other
     filter, each filter counting by the most suspect of its latest measurements. A filter without one in the last
-    seconds has no say.
+    seconds is not counted.
 
-    A policy that learns R (`nav.weighting.SageHusa`) is asked before the detector, which judges by what was learned.
-    What is refused or isolated teaches nothing: a sensor so much noisier than it says that it is isolated before its R
-    is known stays so, as a faulty one would. A detector that keeps the sound axes, or gathers evidence, leaves it the
-    time.
+    A policy that learns R (`nav.weighting.SageHusa`) is asked before the detector, which judges by the learned R.
+    Nothing is learned from samples that are refused or isolated: a sensor that is far noisier than it says may be
+    isolated before its R is known, and then stays isolated like a faulty one. A detector that keeps the sound axes, or
+    gathers evidence, leaves time to learn.
 
 Engines
-    A filter with a `Local.scaling` works by sigma points around its own estimate, nominal state and x together, which
-    may be tens of degrees from the nominal one: there x of the attitude is a rotation vector and is composed, not
-    added. Its P is of its own estimate's error, and is turned into x's for the fusion and back after a reset
-    (`nav.reference.turned`). A federation of one such filter gives what the closed filter of `nav.ins` gives, however
-    seldom it fuses. A linear filter beside it may be wrong about a heading far off and claim to know it, and then so
-    does the fusion: where the initial heading may be far off, give every filter that is to find it the engine.
+    A filter with a `Local.scaling` works by sigma points around its own estimate, which is the nominal state with x
+    added to it and may be tens of degrees away. The attitude's part of x is therefore a rotation vector, which is
+    composed with the nominal attitude instead of added. P is the covariance of the error of the filter's own estimate;
+    for the fusion it is turned into that of x, and back after a reset (`nav.reference.turned`). A federation of one
+    such filter gives what the closed filter of `nav.ins` gives, however seldom it fuses. Where the initial heading may
+    be far off, let every filter that can observe the heading work by sigma points: a linear one may be wrong about it
+    and claim a small sigma, and the fusion would follow.
 
 Recall
     Starting again from the others is costly when they don't know what the isolated filter knew. With ``recall_s``, and

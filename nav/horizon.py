@@ -61,9 +61,9 @@ class Estimator(Protocol):
 class FusionHorizon:
     """Feeds one estimator in time order, ``lag_s`` [s] (the largest latency of its aids) behind the newest increment.
 
-    Only samples cut the increments, never the blocks they are pushed in, so the same data give the same result however
-    they are pushed. An increment counts from its end: nothing at a time knows the one that is still running then, and
-    the state between two of them goes on from the last at its rates. With ``coning`` raw increments are compensated
+    Increments are split at samples only, whatever the blocks in which they are pushed, so the same data give the same
+    result. An increment is known at the end of its interval; until then the state is carried on at the rates of the one
+    before. With ``coning`` raw increments are compensated
     (`nav.strapdown.compensate`): right for an IMU that sums over intervals in which its rate changes, wrong for
     increments that are rotation vectors already.
     """

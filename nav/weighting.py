@@ -8,7 +8,7 @@ Order of application (`InOrder` sees to it that each policy is told the S that t
 has gate and detectors of its own and keeps the same order around them: see `split`):
 
 1. `SageHusa`: what R has been learned to be, so that everything after it judges by the R that is true;
-2. `Gate`: an axis that a detector has put out stays out, and nobody inflates or learns from it;
+2. `Gate`: an axis that a detector refuses is left out, and is neither inflated nor learned from;
 3. `MahalanobisInflation`: what passes and is still too far off counts for less;
 4. `Weight`: what the detectors of all sensors together say (`normalised_weights`);
 5. after the update `learn` shows to `SageHusa` what is left of the innovation.
@@ -16,12 +16,12 @@ has gate and detectors of its own and keeps the same order around them: see `spl
 `Fading` is about P: it raises the gain, so it must never answer an outlier of the measurement. Gate first, then apply
 its factor to P, and form S (and the sigma points) anew before the update.
 
-Detectors see the S of the R that was told or learned, never of one that was inflated or weighted here: otherwise a
-weight feeds back into the statistic that made it. The learned R must reach them, for a sensor noisier than it says
-would be condemned for that alone. The feedback that this brings is a slow one: only what passed teaches, and by no
-more than 1 - b of the mean. Its price is that a fault which grows more slowly than the memory of 1/(1 - b) samples, and
-stays below the limit while it does, is taken for noise: where slow faults are to be found, the memory must be longer
-than what the detector gathers, or R not learned.
+Detectors are given S with the told or the learned R, never with one that was inflated or weighted here: otherwise a
+weight would feed back into the statistic that made it. They need the learned R, or a sensor noisier than it says would
+be condemned for that alone. Learning is a feedback too, but a slow one: R is learned only from what passed, and each
+sample changes the mean by 1 - b of it at most. The price: a fault that grows more slowly than the memory of 1/(1 - b)
+samples, and stays below the limit while it does, is learned as noise. Where slow faults are to be found, make the
+memory longer than what the detector gathers, or do not learn R.
 
 Sources: Zhou et al. 2025 (normalised weights, Eq 22-26), Cheng et al. 2020 (Sage-Husa, Eq 25-30; fading, Eq 31-36),
 Zhu et al. 2020 (inflation, Eq 8-12), Chang, J. Geodesy 88 (2014) 391 (inflation by the Mahalanobis distance).
@@ -58,7 +58,7 @@ class Policy(Protocol):
 
 @dataclass
 class Gate:
-    """The axes that a ``detector`` puts out are left out."""
+    """Leaves out the axes that a ``detector`` refuses."""
 
     detector: Detector
 
