@@ -146,6 +146,7 @@ def test_weights_by_the_sum_double_healthy_R():
 # --- Zhu et al. 2020 --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.ci
 def test_inflation_with_its_fraction_upside_down():
     """A few per cent of random cases come near the root, most never stop."""
     near = stuck = total = 0
@@ -164,6 +165,7 @@ def test_inflation_with_its_fraction_upside_down():
     assert theta(nu, 0.01 * np.diag(R), R, lam) > 2.5 * LIMIT2
 
 
+@pytest.mark.ci
 def test_inflation_with_its_fraction_put_right():
     rng = np.random.default_rng(1)
     taken = []
@@ -197,6 +199,7 @@ def test_weights_of_equation_13_do_not_see_a_lost_position():
 # --- Jiang et al. 2021 ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.ci
 def test_equation_10_never_levels_the_east_axis():
     runs = fly(replace(PAPER, correction=correction_eq10))
     largest, _ = level_figures(runs)
