@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nav.samples import Array
+from nav.samples import Array, Outcome
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,7 +31,15 @@ TRUTH = "#000000"
 NEUTRAL = "#3A4A5A"  # what belongs to no estimator: a sensor
 GUIDE = "#444444"  # gates, bounds
 PROMISED = "#B06A00"  # by a data sheet
-REFUSED = "#C00020"
+# Samples that were not used, by what became of them: apart from each other, and from the shades of an estimator.
+NOT_USED = {
+    Outcome.OUTSIDE_GATE: "#C00020",
+    Outcome.ISOLATED: "#7A1FA2",
+    Outcome.WITHHELD: "#8A949E",
+    Outcome.WEAKENED: "#8C5A2B",
+    Outcome.OUT_OF_RANGE: "#00838F",
+    Outcome.UNSOUND: "#000000",
+}
 SHADE = "#DDDDDD"
 FAULT = "#FBE9A8"
 CONSISTENT = "#DCE8DC"

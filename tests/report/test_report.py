@@ -15,6 +15,7 @@ from rich.console import Console
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
+from nav.samples import Outcome
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.report import campaign_figures, style, tables
@@ -132,6 +133,41 @@ def test_faults_are_shaded_and_their_detection_is_told(tmp_path: Path) -> None:
         if to_hex(patch.get_facecolor()).upper() == style.FAULT
     ]
     assert shaded == ["gnss_position", "gnss_velocity", "barometer"]
+
+
+def test_refused_innovations_have_the_colour_of_their_outcome() -> None:
+    run = synthetic_run.dataset(120.0, {"ins": Errors(aligned_after=0.0)})
+    reports = run["estimators/ins/innovations/barometer"]
+    t = reports["sample_time"].values
+    spans = {
+        Outcome.OUTSIDE_GATE: (20.0, 30.0),
+        Outcome.ISOLATED: (30.0, 50.0),
+        Outcome.WITHHELD: (50.0, 52.0),
+        Outcome.UNSOUND: (60.0, 61.0),
+        Outcome.FUSED: (70.0, 70.5),  # at weight 0
+    }
+    for outcome, (start, end) in spans.items():
+        rows = (t >= start) & (t < end)
+        reports["outcome"].values[rows], reports["weight"].values[rows] = outcome, 0.0
+        if outcome is Outcome.UNSOUND:
+            reports["innovation"].values[rows] = np.nan
+    figure = consistency.innovations(Run(run), "ins")
+    assert figure is not None
+    panel = next(ax for ax in figure.axes if ax.get_title(loc="left").startswith("barometer"))
+    crosses = {line.get_color(): line for line in panel.lines if line.get_marker() == "x" and len(line.get_xdata())}
+    assert len(crosses) == len(spans)
+    for outcome, (start, end) in spans.items():
+        line = crosses[style.NOT_USED[Outcome.WEAKENED if outcome is Outcome.FUSED else outcome]]
+        np.testing.assert_array_equal(line.get_xdata(), t[(t >= start) & (t < end)])
+        assert np.isfinite(line.get_ydata()).all()
+    told = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert told[:4] == [
+        "gate",
+        "outside the gate",
+        "sensor isolated",
+        "withheld: probation, or refused with another part",
+    ]
+    assert "out of range" not in told
 
 
 def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
-from nav.samples import Array
+from nav.samples import Array, Outcome
 from testbed.report.figures.errors import LOG_LINE, SMOOTH_S, moving_rms
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
@@ -17,7 +17,7 @@ from testbed.report.style import (
     FAR,
     GUIDE,
     LEFT,
-    REFUSED,
+    NOT_USED,
     focus_log,
     keys_of,
     layer,
@@ -37,6 +37,14 @@ MOMENTS = 6  # at which they are shown
 ABREAST = 3  # of them beside each other
 CORNERS = 73  # of an ellipse
 MOST_DOTS = 4000  # of one aid
+OUTCOMES = {
+    Outcome.OUTSIDE_GATE: "outside the gate",
+    Outcome.ISOLATED: "sensor isolated",
+    Outcome.WITHHELD: "withheld: probation, or refused with another part",
+    Outcome.WEAKENED: "weight zero",
+    Outcome.OUT_OF_RANGE: "out of range",
+    Outcome.UNSOUND: "unsound",
+}
 
 
 def consistency(run: Run) -> Figure | None:
@@ -167,7 +175,7 @@ def ellipse(covariance: Array, sigmas: float) -> Array:
 
 
 def innovations(run: Run, name: str) -> Figure | None:
-    """Innovations over their claimed sigma, with the gate; refused ones crossed."""
+    """Innovations over their claimed sigma, with the gate; refused ones crossed, in the colour of their outcome."""
     aids = [aid for aid in scores.aids(run.dataset, name) if run.has(f"estimators/{name}/innovations/{aid}/innovation")]
     if not aids:
         return None
@@ -176,32 +184,45 @@ def innovations(run: Run, name: str) -> Figure | None:
     drawn = sheet(len(aids), height=1.5, gap=0.32)
     sensors = [_innovations_of(run, ax, name, aid) for ax, aid in zip(drawn.axes[:, 0], aids, strict=True)]
     drawn.axes[len(aids) // 2, 0].set_ylabel("innovation / its sigma")
+    first = drawn.axes[0, 0]
     gates = [run.estimate(name, f"innovations/{aid}/threshold") for aid in aids]
     if any(np.isfinite(gate).any() for gate in gates):
-        first = drawn.axes[0, 0]
         first.plot([], [], color=GUIDE, lw=0.8, ls="--", label="gate")
-        first.add_line(Line2D([], [], color=REFUSED, marker="x", ls="", ms=5, label="refused"))
+    seen = np.unique(np.concatenate([_refused_as(run, name, aid) for aid in aids]))
+    for outcome in (one for one in NOT_USED if one in seen):
+        first.add_line(Line2D([], [], color=NOT_USED[outcome], marker="x", ls="", ms=5, label=OUTCOMES[outcome]))
     run.against_time(drawn, 0.28, sensors)
     return drawn.figure
+
+
+def _refused_as(run: Run, name: str, aid: str) -> Array:
+    """What became of each sample (N,) that was not used, or not with every axis; NaN for the others."""
+    own = f"innovations/{aid}"
+    outcome = run.estimate(name, f"{own}/outcome")
+    became = np.where(outcome == Outcome.FUSED, Outcome.WEAKENED, outcome)  # fused with weight 0
+    return np.where(scores.refused(run.estimate(name, f"{own}/weight"), outcome), became, np.nan)
 
 
 def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:
     """Draw those of one aid, and say whose they are."""
     own = f"innovations/{aid}"
     t, z = run.estimate(name, f"{own}/sample_time"), run.estimate(name, f"{own}/innovation")
-    refused = scores.refused(run.estimate(name, f"{own}/weight"), run.estimate(name, f"{own}/outcome"))
+    became = _refused_as(run, name, aid)
+    refused = np.isfinite(became)
     gate = np.sqrt(run.estimate(name, f"{own}/threshold"))
     with np.errstate(invalid="ignore", divide="ignore"):
         normalised = z / np.sqrt(np.diagonal(run.estimate(name, f"{own}/S"), axis1=1, axis2=2))
     limit = 1.6 * float(np.nanmax(gate)) if np.isfinite(gate).any() else 6.0
     shown = np.clip(normalised, -0.97 * limit, 0.97 * limit)
+    shown[refused] = np.nan_to_num(shown[refused], nan=-0.97 * limit)
     some = slice(None, None, max(1, len(t) // MOST_DOTS))
     fused = ~refused[some]
     axes, colours = _axes_of(run, f"estimators/{name}/{own}/innovation"), tints(run.colours[name])
     for k in range(z.shape[1]):
         colour = colours[k % 3] if axes else run.colours[name]
         ax.plot(t[some][fused], shown[some, k][fused], ".", ms=1.6, color=colour)
-        ax.plot(t[refused], shown[refused, k], "x", ms=4, color=REFUSED, mew=0.9)
+        for outcome, cross in reversed(NOT_USED.items()):  # those that the gate refused above the others
+            ax.plot(t[became == outcome], shown[became == outcome, k], "x", ms=4, color=cross, mew=0.9)
     for sign in (-1, 1):
         ax.plot(t, sign * gate, color=GUIDE, lw=0.8, ls="--")
     ax.set_ylim(-limit, limit)
@@ -243,8 +264,9 @@ OF_EACH = (
     Plot(
         "{}_innovations",
         "What each aid said that was not expected, over the sigma that was expected of it. Dots: used, one shade per"
-        " axis; red crosses: refused, one axis at least, at the edge if it lies beyond; dashed lines: the gate. Faults"
-        " are shaded where their sensor is shown.",
+        " axis; crosses: not used, one axis at least, in the colour of what became of it, at the edge if it lies"
+        " beyond, at the lower one if it has no innovation; dashed lines: the gate. Faults are shaded where their"
+        " sensor is shown.",
         innovations,
     ),
 )
