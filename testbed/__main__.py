@@ -257,13 +257,14 @@ def report(run_file: RunFile, force: Force = False) -> None:
     """Write figures and report.html again from a run file, beside it."""
     from testbed.record.reader import load
     from testbed.score import metrics
+    from testbed.score.remarks import remarks
 
     dataset = load(run_file)
     try:
         computed = metrics.compute(dataset)
     except UserError as error:
         raise UserError(f"{run_file}: {error}") from None
-    for remark in metrics.unscored(dataset):
+    for remark in remarks(dataset, computed):
         _remark(remark)
     kept = run_file.parent / METRICS
     if not kept.exists():  # the run was killed

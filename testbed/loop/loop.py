@@ -33,7 +33,7 @@ from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
 from testbed.scenario import Scenario
 from testbed.score import metrics
-from testbed.score.doubts import doubts
+from testbed.score.remarks import remarks
 
 if TYPE_CHECKING:
     import xarray
@@ -110,8 +110,8 @@ def run(
         results = metrics.compute(flown.dataset) | {f"run.{name}": value for name, value in flown.seconds.items()}
         if setup.out is not None:
             metrics.save(results, setup.out / METRICS)
-    remarks = (*flown.remarks, *metrics.unscored(flown.dataset), *doubts(flown.dataset, results))
-    return RunResult(flown.dataset, results, setup.out, flown.failure, remarks)
+    told = (*flown.remarks, *remarks(flown.dataset, results))
+    return RunResult(flown.dataset, results, setup.out, flown.failure, told)
 
 
 @dataclass(frozen=True, slots=True)

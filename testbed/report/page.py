@@ -17,8 +17,8 @@ from testbed.report import tables
 from testbed.report.figures import CHAPTERS
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
-from testbed.score.doubts import doubts
-from testbed.score.metrics import column, unscored
+from testbed.score.metrics import column
+from testbed.score.remarks import remarks
 
 if TYPE_CHECKING:
     import xarray
@@ -86,7 +86,7 @@ def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "duration_s": float(run.t[-1]),
         "seed": attributes.get("seed", ""),
         "complete": bool(attributes.get("complete", 1)),
-        "remarks": [*unscored(run.dataset), *doubts(run.dataset, metrics)],
+        "remarks": remarks(run.dataset, metrics),
         "summary": tables.summary(metrics),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),

@@ -1,4 +1,6 @@
-"""What a run gives to doubt of an estimator: led astray by a fault, or surer than its innovations allow.
+"""What the reader of a record should know first: what is not scored, a leg cut short, estimators not to be trusted.
+
+An estimator is not to be trusted that faults led astray, or that is surer than its innovations allow.
 
 The normalised innovation squared of n samples with m components each is, summed, chi-square with n m degrees of freedom
 if the filter's model is right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from testbed.score import metrics as scores
+from testbed.score.plan import unfinished_leg
 
 if TYPE_CHECKING:
     import xarray
@@ -23,12 +26,14 @@ CONFIDENCE = 0.999  # of the bound
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
 
 
-def doubts(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]:
-    """A sentence for each estimator that faults led astray, and for each aid whose innovations are far too large.
-
-    ``metrics`` are those of the run (`testbed.score.metrics.compute`).
-    """
-    return [*_astray(dataset, metrics), *_overconfident(dataset, metrics)]
+def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]:
+    """A sentence for each thing that the reader of a record should know first; ``metrics`` are its own."""
+    return [
+        *scores.unscored(dataset),
+        *unfinished_leg(dataset),
+        *_astray(dataset, metrics),
+        *_overconfident(dataset, metrics),
+    ]
 
 
 def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[str]:
