@@ -205,12 +205,12 @@ def _nees(result: CampaignResult, groups: Sequence[Group], runs: int) -> Figure:
     low, high = nees_bounds(runs)
     for k, (ax, estimator) in enumerate(zip(drawn.axes[:, 0], result.combinations[0].scenario.estimator, strict=True)):
         ax.axhspan(low, high, color=style.CONSISTENT, lw=0, label="95 % bounds", zorder=0.2)
-        ax.axhline(1.0, color=style.GUIDE, lw=0.8)
-        for group in groups:
+        ax.axhline(1.0, color=style.GUIDE, lw=0.8, zorder=1.5)
+        for rank, group in enumerate(groups):
             mean, _ = nees_mean(group.outcomes, estimator.name)
             colour = style.line_of(k)["color"] if len(groups) == 1 else group.colour
-            label = group.label if len(groups) > 1 else None
-            ax.plot(_longest(group.outcomes)["time"], mean, color=colour, lw=1.0, label=label)
+            told = {"color": colour, "label": group.label if len(groups) > 1 else None}
+            ax.plot(_longest(group.outcomes)["time"], mean, **told, **style.layer(rank, len(groups), 1.0))
         ax.set_ylabel(f"{'attitude' if estimator.attitude_only else 'position'} NEES / dof")
         style.logarithmic(ax, 0.1, 10.0)
     _against_time(result, drawn, 0.28)
