@@ -34,11 +34,9 @@ from nav.reference import (
     UNAIDED,
     FieldModel,
     Reference,
-    State,
     align,
     describe,
     forget,
-    inject,
     nothing_known,
     spread,
     turned,
@@ -53,6 +51,7 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.state import State, inject
 from nav.weighting import InOrder, Policy, Weight
 
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion

@@ -33,7 +33,6 @@ from nav.reference import (
     UNAIDED,
     FieldModel,
     Reference,
-    State,
     align,
     describe,
     forget,
@@ -51,6 +50,7 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.state import State
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
 

@@ -19,8 +19,9 @@ from nav.detection import ChiSquareGate, Mask
 from nav.error_model import MOTION, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid
-from nav.reference import Reference, State, absorb, remove_open
+from nav.reference import Reference, remove_open
 from nav.samples import Array, Outcome, Sample, UpdateReport
+from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
 from nav.weighting import Fading, Policy, SageHusa, split
 

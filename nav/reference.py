@@ -12,24 +12,20 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from nav._jit import inlined, njit
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT, Alignment, InitialState
-from nav.earth import radii, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors, transition
-from nav.kalman import predict, update
+from nav._jit import njit
+from nav.alignment import Alignment, InitialState
+from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, sensor_errors
 from nav.rotation import (
     dcm_from_quat,
     left_jacobian_solve,
     quat_conjugate,
     quat_from_rotvec,
     quat_multiply,
-    quat_normalise,
     rotvec_from_quat,
 )
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
-from nav.strapdown import step
-from nav.unscented import Scaling, carry, remove, scratch
-from nav.unscented import predict as predict_points
+from nav.state import State, inject, propagate, sigma_step, working
+from nav.unscented import Scaling, carry, scratch
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
 RECENT_S = 2.0  # a position this fresh counts as aided
@@ -38,7 +34,6 @@ BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMP
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 NEVER = 1 << 62
 NO_INCREMENTS, NO_TIMES = np.empty((0, 3)), np.empty(0)
-FIXED = 57  # numbers in a `State` of any size
 PREDICTED_PERIODS = 5  # covariance periods in one step of a prediction, which is short and not built upon
 
 # Order of the covariance in an estimate; and the blocks that have a place of their own there
@@ -46,67 +41,6 @@ ESTIMATE_ORDER = np.r_[POS : POS + 3, VEL : VEL + 3, PHI : PHI + 3]
 REPORTED = ("phi", "dv", "dp", "gyro_bias", "accel_bias")
 
 FieldModel = Callable[[float, float, float], Array]
-
-
-class State:
-    """Everything that moves: nominal motion and sensor errors, what the filters hold, and integrals still to be used.
-
-    ``x[i, :common]`` is what filter i would add to the nominal state, the estimated error with its sign turned; behind
-    that are the estimated errors of its own aids, whole values. All are views of one array, the ``whole``, so that a
-    prediction can `take` it at once, and a kernel is handed one array for ten: each costs as much as a small product.
-    """
-
-    q_nb: Array
-    v_n: Array
-    lla: Array
-    imu: Array  # (common,) estimated sensor errors, the motion's own entries zero
-    x: Array  # (filters, n)
-    P: Array  # (filters, n, n)
-    errors: Array  # (4, 3) nominal sensor errors by kind
-    sums: Array  # (3, 3, 3), see `error_model.transition`
-    elapsed: Array  # (2,) seconds and samples since the last covariance step
-    rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
-
-    def __init__(self, common: int, filters: int, n: int) -> None:
-        self.shape = common, filters, n
-        self.whole = np.zeros(FIXED + common + filters * n * (n + 1))
-        (
-            self.q_nb, self.v_n, self.lla, self.imu, self.x, self.P, self.errors, self.sums, self.elapsed, self.rates,
-        ) = _parts(self.whole, common, filters, n)  # fmt: skip
-
-    def take(self, other: State) -> None:
-        """Become the same as ``other``, which has as many filters and states."""
-        self.whole[:] = other.whole
-
-    def copy(self) -> State:
-        """The same in arrays of its own."""
-        made = State(*self.shape)
-        made.take(self)
-        return made
-
-
-@njit
-def _parts(
-    whole: Array, common: int, filters: int, n: int
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
-    """The parts of the ``whole`` of a `State` as views, in the order of the class; those of fixed size lie first."""
-    x = FIXED + common
-    P = x + filters * n
-    return (
-        whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
-        whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
-        whole[49:51], whole[51:FIXED].reshape(2, 3),
-    )  # fmt: skip
-
-
-@njit
-def _scratch(room: Array, common: int, n: int) -> tuple[Array, Array, Array, Array]:
-    """Where a covariance step works in: two matrices of `transition`, decay and half noise of each state."""
-    matrix = MOTION * common
-    return (
-        room[:matrix].reshape(MOTION, common), room[matrix : 2 * matrix].reshape(MOTION, common),
-        room[2 * matrix : 2 * matrix + n], room[2 * matrix + n :],
-    )  # fmt: skip
 
 
 class Reference:
@@ -149,7 +83,7 @@ class Reference:
             self._noise[i, : model.size] = model.density**2
         self._variance_rate = self._noise.copy()
         self._room, self._work = np.zeros(2 * MOTION * self.common + 2 * n), scratch(n)
-        self._scratch = (*_scratch(self._room, self.common, n), self._work)
+        self._scratch = (*working(self._room, self.common, n), self._work)
         self.share_noise(shares)
         # The longest kernel is loaded here, or compiled, and not when samples wait for it.
         self._propagate(State(self.common, filters, n), NEVER, NO_INCREMENTS, NO_INCREMENTS, NO_TIMES)
@@ -204,7 +138,7 @@ class Reference:
         """Bring the covariances up to the time of the motion."""
         s = state
         if s.elapsed[0] > 0 and self.scaling is not None:
-            _sigma_step(
+            sigma_step(
                 s.q_nb, s.v_n, s.lla, s.imu, s.x[0], s.P[0], s.errors, s.sums, s.elapsed, self.driven,
                 self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
@@ -226,7 +160,7 @@ class Reference:
         x[:MOTION] = -carry(-x, Phi, before.sums[2].sum(axis=1), T)
         q_nb, v_n, lla, imu = s.q_nb.copy(), s.v_n.copy(), s.lla.copy(), np.zeros(self.common)
         inject(q_nb, v_n, lla, imu, x[: self.common])
-        error = _sigma_step(
+        error = sigma_step(
             q_nb, v_n, lla, imu, x, before.P[row], np.empty((4, 3)), dcm_from_quat(_turn(x)) @ before.sums,
             np.array([T, 0.0]), self.driven, self._decay_rate[row], self._variance_rate[row], *self._scratch,
             scaling.spread, scaling.excess,
@@ -236,7 +170,7 @@ class Reference:
 
     def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
         """See the kernel."""
-        return _propagate(
+        return propagate(
             s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._room, self._work,
             period, dtheta, dv, dt, settle,
         )  # fmt: skip
@@ -362,174 +296,3 @@ def spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
     for i in range(len(P)):
         sigma[i] = math.sqrt(P[i, i])
     return covariance, sigma
-
-
-@njit
-def absorb(
-    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices,
-    nu: Array, H: Array, R: Array, threshold: float, close: bool,
-) -> tuple[Array, float]:  # fmt: skip
-    """One measurement into filter ``row`` of a `State` if its nis is at most ``threshold``; (S, nis).
-
-    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
-    """
-    q_nb, v_n, lla, imu, x, P, errors, _, _, _ = _parts(whole, common, filters, n)
-    S, nis = update(x[row], P[row], H, R, nu, threshold)
-    if close and nis <= threshold:
-        inject(q_nb, v_n, lla, imu, x[row])
-        for i in range(common):
-            x[row, i] = 0.0
-        sensor_errors(errors, imu, driven)
-    return S, nis
-
-
-@njit
-def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -> None:
-    """Add a correction (of the common states at least) to the nominal state, with the sign of `kalman.correct`."""
-    # C_nb_hat = (I - [phi x]) C_nb, and the correction is minus phi's estimate
-    turn = quat_conjugate(quat_from_rotvec(correction[PHI : PHI + 3]))
-    turned = quat_normalise(quat_multiply(turn, q_nb))
-    for i in range(4):
-        q_nb[i] = turned[i]
-    for i in range(3):
-        v_n[i] += correction[VEL + i]
-    R_M, R_N = radii(lla[0])
-    lla[1] = wrap_longitude(lla[1] + correction[POS + 1] / ((R_N + lla[2]) * math.cos(lla[0])))
-    lla[0] += correction[POS] / (R_M + lla[2])
-    lla[2] -= correction[POS + 2]
-    for i in range(MOTION, len(imu)):
-        imu[i] += correction[i]
-
-
-@njit
-def _covariance_step(
-    v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
-    work: Array,
-) -> None:  # fmt: skip
-    """Take every filter's covariance and states over the time in ``elapsed``, and empty the integrals."""
-    T = elapsed[0]
-    transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
-    common = len(imu)
-    for f in range(len(x)):
-        for i in range(x.shape[1]):
-            half_noise[i] = 0.5 * T * variance_rate[f, i]
-            decay[i] = math.exp(-T * decay_rate[f, i]) if decay_rate[f, i] > 0.0 else 1.0
-        estimated = False
-        for i in range(common):
-            if x[f, i] != 0.0:
-                estimated = True
-        if estimated:
-            for i in range(MOTION):
-                work[i, 0] = 0.0
-                for j in range(common):
-                    work[i, 0] += Phi[i, j] * x[f, j]
-            for i in range(MOTION):
-                x[f, i] = work[i, 0]
-        for i in range(MOTION, x.shape[1]):
-            x[f, i] *= decay[i]
-        if f == 0:
-            for i in range(MOTION, common):
-                imu[i] *= decay[i]
-        predict(P[f], Phi, decay, half_noise, work)
-    sensor_errors(errors, imu, driven)
-    _empty(sums, elapsed)
-
-
-@njit
-def _empty(sums: Array, elapsed: Array) -> None:
-    """Begin the integrals anew."""
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                sums[i, j, k] = 0.0
-    elapsed[0] = elapsed[1] = 0.0
-
-
-@njit
-def _sigma_step(
-    q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
-    work: Array, spread: float, excess: float,
-) -> Array:  # fmt: skip
-    """`_covariance_step` of one closed filter by sigma points, whose mean error (n,) is taken out of the motion."""
-    T = elapsed[0]
-    transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
-    push_n = np.empty(3)
-    for i in range(3):
-        push_n[i] = sums[2, i, 0] + sums[2, i, 1] + sums[2, i, 2]
-    for i in range(len(x)):
-        half_noise[i] = 0.5 * T * variance_rate[i]
-        decay[i] = math.exp(-T * decay_rate[i]) if decay_rate[i] > 0.0 else 1.0
-    for i in range(MOTION, len(x)):
-        x[i] *= decay[i]
-    for i in range(MOTION, len(imu)):
-        imu[i] *= decay[i]
-    error = predict_points(P, Phi, decay, half_noise, work, push_n, T, spread, excess)
-    remove(q_nb, v_n, lla, imu, error[: len(imu)])
-    sensor_errors(errors, imu, driven)
-    _empty(sums, elapsed)
-    return error
-
-
-@njit
-def _propagate(
-    whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
-    room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
-) -> int:  # fmt: skip
-    """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
-
-    A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
-    since it is long to compile.
-    """
-    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates = _parts(whole, common, filters, n)
-    Phi, FT, decay, half_noise = _scratch(room, common, n)
-    bad = -1
-    angle, push, before = np.empty(3), np.empty(3), np.empty(4)
-    for k in range(len(dt) + 1):
-        T = dt[k] if k < len(dt) else 0.0
-        if T > 0.0:
-            sound = True
-            for i in range(3):
-                if not (abs(dtheta[k, i]) <= RATE_LIMIT * T and abs(dv[k, i]) <= FORCE_LIMIT * T):
-                    sound = False
-            if sound:
-                for i in range(3):
-                    rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
-            else:
-                bad = k
-            for i in range(3):
-                angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
-                push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
-            for i in range(4):
-                before[i] = q_nb[i]
-            step(q_nb, v_n, lla, angle, push, T)
-            integrate(sums, before, q_nb, angle, push, T)
-            elapsed[0] += T
-            elapsed[1] += 1.0
-        if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
-            _covariance_step(
-                v_n, lla, imu, x, P, errors, sums, elapsed,
-                driven, decay_rate, variance_rate, Phi, FT, decay, half_noise, work,
-            )  # fmt: skip
-    return bad
-
-
-@inlined
-def integrate(sums: Array, before: Array, after: Array, angle: Array, push: Array, T: float) -> None:
-    """Add one interval to the integrals of `error_model.transition`, with C_nb in its middle: of the mean quaternion.
-
-    Written out in scalars: a matrix made for every increment would take as long as the strapdown.
-    """
-    w, x, y, z = before[0] + after[0], before[1] + after[1], before[2] + after[2], before[3] + after[3]
-    s = 2.0 / (w * w + x * x + y * y + z * z)
-    C_nb = (
-        (1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)),
-        (s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)),
-        (s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)),
-    )
-    for i in range(3):
-        for j in range(3):
-            sums[0, i, j] += C_nb[i][j] * T
-            sums[1, i, j] += C_nb[i][j] * angle[j]
-            sums[2, i, j] += C_nb[i][j] * push[j]

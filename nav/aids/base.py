@@ -19,7 +19,8 @@ from nav.error_model import PHI, Block
 from nav.samples import Array, Outcome, Sample, UpdateReport
 
 if TYPE_CHECKING:
-    from nav.reference import Reference, State
+    from nav.reference import Reference
+    from nav.state import State
 
 # What an instrument could possibly report; beyond it the sample is broken.
 HEIGHT_LIMITS = (-1000.0, 50_000.0)  # [m]

@@ -23,8 +23,8 @@ from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.monitor import MonitoredAid
-from nav.reference import integrate
 from nav.samples import Array, FixType, GnssSample, ImuSamples, Sample
+from nav.state import integrate
 
 REST_S, REST_HZ = 600, 200
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
