@@ -583,7 +583,7 @@ def _conclude(
 def _lost(result: RunResult) -> bool:
     """Whether the flight got out of control; if so, it is said."""
     if result.failure:
-        from testbed.score.metrics import column
+        from testbed.score.accuracy import column
 
         t = column(result.dataset, "truth/time")[-1]
         _remark(f"the flight ended after {t:.0f} s: {result.failure}")

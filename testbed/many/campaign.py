@@ -38,7 +38,7 @@ from testbed.motion import aircraft
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
 from testbed.scenario import Scenario
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 
 if TYPE_CHECKING:
     import pandas
@@ -418,11 +418,11 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
 
 def _history(dataset: xarray.DataTree) -> dict[str, Array]:
     """The errors of a run over time, as `Outcome` keeps them."""
-    t = metrics.column(dataset, "truth/time")
-    kept = {"time": t, "outage": metrics.inside(t, metrics.outages(dataset)).astype(float)}
-    for name in metrics.names(dataset):
-        errors = metrics.errors(dataset, name)
-        rows = np.searchsorted(t, errors.t - metrics.SAME_TIME_S)
+    t = accuracy.column(dataset, "truth/time")
+    kept = {"time": t, "outage": accuracy.inside(t, metrics.outages(dataset)).astype(float)}
+    for name in accuracy.names(dataset):
+        errors = accuracy.errors(dataset, name)
+        rows = np.searchsorted(t, errors.t - accuracy.SAME_TIME_S)
         if errors.attitude_only:
             error, sigma, nees = np.rad2deg(errors.tilt), np.rad2deg(errors.sigma_attitude), errors.attitude_nees
         else:

@@ -32,7 +32,7 @@ from testbed.many import pool, progress
 from testbed.report import page as report
 from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 
 if TYPE_CHECKING:
     from junitparser import Error, Failure

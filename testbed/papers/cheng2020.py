@@ -23,7 +23,7 @@ from testbed.loop.loop import run
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.results import write_result
 from testbed.scenario import Scenario
-from testbed.score import metrics
+from testbed.score import accuracy
 
 SEEDS = range(1, 11)
 SHORT_S, LONG_S, STRAIGHT_S = 1000, 10_800, 300
@@ -50,20 +50,20 @@ def selected(estimators: Sequence[str], overrides: Sequence[str] = ()) -> Scenar
 def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any]:
     """One run: what each of the estimators made of it. Angles in deg."""
     dataset = run(selected(estimators, [f"duration_s={duration_s}"]), seed=seed).dataset
-    t = metrics.column(dataset, "truth/time")
-    rate = np.abs(metrics.column(dataset, "truth/omega_b")[:, 2])
-    speed = np.linalg.norm(metrics.column(dataset, "truth/v_n"), axis=1)
+    t = accuracy.column(dataset, "truth/time")
+    rate = np.abs(accuracy.column(dataset, "truth/omega_b")[:, 2])
+    speed = np.linalg.norm(accuracy.column(dataset, "truth/v_n"), axis=1)
     turning = rate > KAPPA
     near_turn = np.convolve(turning, np.ones(AFTER_TURN_S + 1))[: len(t)] > 0
     first_turn = t[np.argmax(turning)]
     result: dict[str, Any] = {}
     for name in estimators:
-        e = metrics.errors(dataset, name, 0.0)
+        e = accuracy.errors(dataset, name, 0.0)
         heading, level = np.degrees(e.attitude[:, 2]), np.degrees(e.attitude[:, :2])
         settled, turned = e.t > SETTLED_S, e.t > first_turn + AFTER_TURN_S
         own = f"estimators/{name}/innovations"
         learned = {
-            aid: 1 / metrics.column(dataset, f"{own}/{aid}/weight") for aid in metrics.aids(dataset, name)
+            aid: 1 / accuracy.column(dataset, f"{own}/{aid}/weight") for aid in accuracy.aids(dataset, name)
         }  # of R, to what was told
         result[name] = {
             "heading_straight": _largest(heading[settled & ~near_turn]),
@@ -77,7 +77,7 @@ def road(seed: int, duration_s: int, estimators: Sequence[str]) -> dict[str, Any
             "least_R": float(min(ratio.min() for ratio in learned.values())),
         }
         if "gnss_course" in learned:
-            at = np.searchsorted(t, metrics.column(dataset, f"{own}/gnss_course/sample_time") - metrics.SAME_TIME_S)
+            at = np.searchsorted(t, accuracy.column(dataset, f"{own}/gnss_course/sample_time") - accuracy.SAME_TIME_S)
             result[name] |= {"course_looks": len(at), "course_amiss": int(np.sum(turning[at] | (speed[at] < 1.0)))}
         if seed == SEEDS[0]:
             result[name] |= {"t": e.t.tolist(), "heading": heading.tolist(), "level": level.tolist()}
@@ -92,8 +92,8 @@ def noisier(seed: int) -> dict[str, float]:
     off = {}
     for aid in ("gnss_position", "gnss_velocity"):
         own = f"estimators/improved/innovations/{aid}"
-        last = np.searchsorted(metrics.column(dataset, f"{own}/sample_time"), end)
-        off[aid] = abs(1 / float(metrics.column(dataset, f"{own}/weight")[last]) / 4 - 1)
+        last = np.searchsorted(accuracy.column(dataset, f"{own}/sample_time"), end)
+        off[aid] = abs(1 / float(accuracy.column(dataset, f"{own}/weight")[last]) / 4 - 1)
     return off
 
 
@@ -104,7 +104,7 @@ def straight(seed: int) -> tuple[float, float]:
         "truth.start.speed_mps=3",
         'truth.segments=[{ leg = "straight", duration_s = 1e4 }]',
     ]
-    e = metrics.errors(run(selected(["no_course"], overrides), seed=seed).dataset, "no_course", 0.0)
+    e = accuracy.errors(run(selected(["no_course"], overrides), seed=seed).dataset, "no_course", 0.0)
     sigma = e.sigma_attitude[:, 2]
     return math.degrees(e.attitude[-1, 2]), float(sigma[-1] / sigma[0])
 

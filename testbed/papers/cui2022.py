@@ -33,8 +33,8 @@ from testbed.motion.table import TruthBlock
 from testbed.papers import Claim, Job, Paper, scenario
 from testbed.report.style import AXIS_COLOURS, COLOURS, FAULT
 from testbed.results import write_result
-from testbed.score import metrics
-from testbed.score.metrics import column
+from testbed.score import accuracy, detection
+from testbed.score.accuracy import column
 
 if TYPE_CHECKING:
     import xarray
@@ -73,10 +73,10 @@ def fly(seed: int, overrides: tuple[str, ...], names: tuple[str, ...], series: b
     flown = tuple(one for one in chosen.estimator if one.name in names)
     done = run(chosen.model_copy(update={"estimator": flown}), seed=seed)
     tree = done.dataset
-    faulty = bool(metrics.faults(tree))
+    faulty = bool(detection.faults(tree))
     replayed = _replayed(tree, Glr(FALSE_ALARM))
     result: Result = {"faulty": faulty, "glr_on_residuals": _scored(*replayed[:2], SMALL_STEP)}
-    for name in metrics.names(tree):
+    for name in accuracy.names(tree):
         t, errors = _errors(tree, name)
         result[name] = {
             "largest": _largest(t, errors),
@@ -91,7 +91,7 @@ def fly(seed: int, overrides: tuple[str, ...], names: tuple[str, ...], series: b
     if faulty:
         result["kept"] = _kept(tree)
     if series:
-        result["faults"] = [(f.sensor, f.start, f.end) for f in metrics.faults(tree)]
+        result["faults"] = [(f.sensor, f.start, f.end) for f in detection.faults(tree)]
         result["measurements"] = {part: _measurements(tree, "with_star", part)[:2] for part in PARTS}
         result["glr_statistic"] = replayed[0], *replayed[2:]
     return result
@@ -105,7 +105,7 @@ class KnownFaults:
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
         """See `nav.weighting.Policy`."""
-        out = [axis for axis, start, end in self.wrong if start <= t + metrics.SAME_TIME_S < end]
+        out = [axis for axis, start, end in self.wrong if start <= t + accuracy.SAME_TIME_S < end]
         told = R.copy()
         told[out] = np.inf
         return told
@@ -144,7 +144,7 @@ def floor(seed: int) -> dict[str, dict[str, list[float]]]:
         ins.start(handed_over(built.handover, truth))
         handed = [sample for aid in built.sensors for sample in sensed[aid]]
         _, estimates = FusionHorizon(ins).track(built.increments(sensed)[0], handed, t.tolist())
-        largest[when] = _largest(t, _differences(estimates, truth, np.searchsorted(truth.t, t - metrics.SAME_TIME_S)))
+        largest[when] = _largest(t, _differences(estimates, truth, np.searchsorted(truth.t, t - accuracy.SAME_TIME_S)))
     return largest
 
 
@@ -157,8 +157,8 @@ def _differences(estimates: Sequence[Estimate], truth: TruthBlock, rows: npt.NDA
     """The same as `_errors` from estimates (N,), ``rows`` (N,) of truth being at their times."""
     lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
     q_nb, true = np.array([e.q_nb for e in estimates]), truth.q_nb[rows]
-    attitude = metrics.euler(q_nb) - metrics.euler(true)
-    attitude[:, 2] = metrics.attitude_error(q_nb, true)[:, 2]
+    attitude = accuracy.euler(q_nb) - accuracy.euler(true)
+    attitude[:, 2] = accuracy.attitude_error(q_nb, true)[:, 2]
     return {
         "position": position_difference_n(lat, lon, h, truth.lat[rows], truth.lon[rows], truth.h[rows]),
         "velocity": np.array([e.v_n for e in estimates]) - truth.v_n[rows],
@@ -168,7 +168,7 @@ def _differences(estimates: Sequence[Estimate], truth: TruthBlock, rows: npt.NDA
 
 def _errors(tree: xarray.DataTree, name: str) -> tuple[Array, dict[str, Array]]:
     """Times (N,) and errors (N, 3) of position [m], velocity [m/s], roll, pitch and heading [arcsec]."""
-    e = metrics.errors(tree, name)
+    e = accuracy.errors(tree, name)
     attitude = np.column_stack([e.angles[:, :2], e.attitude[:, 2]]) * ARCSEC_PER_RAD
     return e.t, {"position": e.position, "velocity": e.velocity, "attitude": attitude}
 
@@ -182,7 +182,7 @@ def _measurements(tree: xarray.DataTree, name: str, part: str) -> tuple[Array, A
 
 def _refused(tree: xarray.DataTree, name: str) -> tuple[int, int, int]:
     """How many measurements of a run had an axis refused, how many an axis isolated, and how many there were."""
-    measurements = [_measurements(tree, name, part)[2:] for part in metrics.aids(tree, name)]
+    measurements = [_measurements(tree, name, part)[2:] for part in accuracy.aids(tree, name)]
     refused = sum(int(np.sum(weight < 1)) for weight, _ in measurements)
     isolated = sum(int(np.sum(outcome == Outcome.ISOLATED)) for _, outcome in measurements)
     return refused, isolated, sum(len(w) for w, _ in measurements)
@@ -191,11 +191,11 @@ def _refused(tree: xarray.DataTree, name: str) -> tuple[int, int, int]:
 def _kept(tree: xarray.DataTree) -> float:
     """Share of the two sound axes of GPS position that were used while the third was refused."""
     t, _, weight, _ = _measurements(tree, "with_star", "gnss_position")
-    windows = [(f.start, f.end) for f in metrics.faults(tree) if f.channel in ("east", "north", "down")]
-    return float(np.mean(weight[metrics.inside(t, windows) & (weight < 1)])) * 3 / 2
+    windows = [(f.start, f.end) for f in detection.faults(tree) if f.channel in ("east", "north", "down")]
+    return float(np.mean(weight[accuracy.inside(t, windows) & (weight < 1)])) * 3 / 2
 
 
-def _replayed(tree: xarray.DataTree, detector: Detector) -> tuple[Array, metrics.Mask, Array, Array]:
+def _replayed(tree: xarray.DataTree, detector: Detector) -> tuple[Array, accuracy.Mask, Array, Array]:
     """Times, alarms, statistics and thresholds, each (N,), of a detector on the residuals of GPS velocity.
 
     They are those that the filters with ERAIM met around the small step, which ERAIM let through.
@@ -210,9 +210,9 @@ def _replayed(tree: xarray.DataTree, detector: Detector) -> tuple[Array, metrics
     )  # fmt: skip
 
 
-def _scored(t: Array, alarm: metrics.Mask, window: metrics.Window) -> tuple[float, float]:
+def _scored(t: Array, alarm: accuracy.Mask, window: accuracy.Window) -> tuple[float, float]:
     """Delay [s], NaN without an alarm in the window, and coverage."""
-    score = metrics.detection(t, alarm, window)
+    score = detection.detection(t, alarm, window)
     assert score is not None
     return score.delay, score.coverage
 

@@ -27,7 +27,7 @@ from testbed.papers import Claim, Job, Paper, scenario
 from testbed.papers.misprints import correction_eq10
 from testbed.results import write_result
 from testbed.scenario import Scenario
-from testbed.score import metrics
+from testbed.score import accuracy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -126,9 +126,9 @@ def _run(case: Case, running: Lane, truth: TruthBlock, sensed: dict[str, Any]) -
     t = np.arange(1.0, truth.t[-1] + 0.5)
     increments, _ = running.increments(sensed)
     reports, estimates = running.horizon.track(increments, aids, t.tolist())
-    rows = np.searchsorted(truth.t, t - metrics.SAME_TIME_S)
+    rows = np.searchsorted(truth.t, t - accuracy.SAME_TIME_S)
     q_nb, true = np.array([estimate.q_nb for estimate in estimates]), truth.q_nb[rows]
-    angles = np.degrees(metrics.euler(q_nb) - metrics.euler(true))
+    angles = np.degrees(accuracy.euler(q_nb) - accuracy.euler(true))
     turning = truth.t[truth.leg == TURN]
     return Flown(
         t=t,
@@ -145,9 +145,9 @@ def largest_correction(levelled: Flown, gyros: Flown) -> float:
 
     To a thousandth: the Earth turns under the two, which are tilted differently, by 0.2 mdeg.
     """
-    correction = metrics.attitude_error(levelled.q_nb, gyros.q_nb)
+    correction = accuracy.attitude_error(levelled.q_nb, gyros.q_nb)
     turned = [quat_from_rotvec(-phi) for phi in correction]
-    steps = metrics.attitude_error(np.array(turned[1:]), np.array(turned[:-1]))
+    steps = accuracy.attitude_error(np.array(turned[1:]), np.array(turned[:-1]))
     return round(float(np.degrees(np.abs(steps[:, :2]).max())), 3)
 
 

@@ -31,7 +31,7 @@ from testbed.papers.misprints import FadingMean, InclusiveEvidence, weights_by_s
 from testbed.report.style import COLOURS, FAULT
 from testbed.results import write_result
 from testbed.scenario import Scenario
-from testbed.score import metrics
+from testbed.score import accuracy, detection
 from testbed.sensors.noise import stream
 
 P = 1e-3  # false alarms and missed ones, per sample
@@ -128,13 +128,13 @@ def ramp(t: Array, slope: float) -> Array:
     return np.where(during(t, RAMP), slope * (t - RAMP[0]), 0.0)
 
 
-def during(t: Array, span: tuple[float, float]) -> metrics.Mask:
+def during(t: Array, span: tuple[float, float]) -> accuracy.Mask:
     """Where the times lie in [start, end)."""
-    inside: metrics.Mask = (t >= span[0] - 1e-9) & (t < span[1] - 1e-9)
+    inside: accuracy.Mask = (t >= span[0] - 1e-9) & (t < span[1] - 1e-9)
     return inside
 
 
-def watch(detector: Detector, t: Array, r: Array) -> tuple[metrics.Mask, Array, Array]:
+def watch(detector: Detector, t: Array, r: Array) -> tuple[accuracy.Mask, Array, Array]:
     """(alarms, statistics, thresholds), each (samples,), of a detector on residuals ``r`` (samples,) of unit sigma."""
     S = np.eye(1)
     decisions = [detector.step(r[k : k + 1], S, float(t[k])) for k in range(len(t))]
@@ -154,7 +154,7 @@ def replay(name: str, rate: int, first_seed: int, seeds: int) -> dict[str, Any]:
         start = int(np.searchsorted(t, RAMP[0] - 1e-9))
         detector = BUILD[name](rate)
         alarms, statistics, _ = watch(detector, t[:start], r[:start])
-        step = metrics.detection(t[:start], alarms, STEP, RAMP[0])
+        step = detection.detection(t[:start], alarms, STEP, RAMP[0])
         assert step is not None
         gap = during(t[:start], GAP)
         end_lag = STEP[1] - STEP[0] if math.isnan(step.end_lag) else step.end_lag
@@ -165,7 +165,7 @@ def replay(name: str, rate: int, first_seed: int, seeds: int) -> dict[str, Any]:
         for slope in SLOPES:
             later = t[start:]
             found, _, _ = watch(copy.deepcopy(detector), later, r[start:] + ramp(later, slope))
-            score = metrics.detection(later, found, RAMP)
+            score = detection.detection(later, found, RAMP)
             assert score is not None
             end_lag = SCORED_S - RAMP[1] if math.isnan(score.end_lag) else score.end_lag
             wrong_s = float(wrong + np.sum(found != during(later, RAMP))) / rate
@@ -203,7 +203,7 @@ def fly(case: str, seed: int) -> dict[str, Any]:
     result = loop.run(chosen(FLOWN[case], keys), build=build)
     found: dict[str, Any] = {"case": case, "seed": seed, "rmse": {}, "sigma": {}, "errors": {}}
     for name in FLOWN[case]:
-        e = metrics.errors(result.dataset, name, 0.0)
+        e = accuracy.errors(result.dataset, name, 0.0)
         found["rmse"][name] = [float(np.sqrt(np.mean(e.position[:, axis] ** 2))) for axis in (0, 1)]
         found["sigma"][name] = float(np.mean(e.sigma_position[:, :2]))
         if seed == 1:

@@ -30,7 +30,7 @@ from testbed.papers.misprints import inflation_by_newton, inflation_upside_down,
 from testbed.report.style import COLOURS, SHADE
 from testbed.results import write_result
 from testbed.scenario import Scenario
-from testbed.score.metrics import attitude_error
+from testbed.score.accuracy import attitude_error
 from testbed.sensors.faults import Faults
 from testbed.sensors.noise import stream
 

@@ -17,7 +17,7 @@ from testbed.report import tables
 from testbed.report.figures import CHAPTERS
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 from testbed.score.remarks import remarks
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from nav.samples import Array
 from testbed.errors import UserError
 from testbed.report import style
 from testbed.scenario import Scenario
+from testbed.score import accuracy, detection, observability
 from testbed.score import metrics as scores
-from testbed.score import observability
-from testbed.score.metrics import Errors, column
+from testbed.score.accuracy import Errors, column
 from testbed.sensors.imu import ImuConfig, ImuErrors
 
 if TYPE_CHECKING:
@@ -32,9 +32,9 @@ class Run:
     def __init__(self, dataset: xarray.DataTree) -> None:
         self.dataset = dataset
         self.windows = scores.outages(dataset)
-        self.faults = scores.faults(dataset)
-        names = scores.names(dataset)
-        self.errors = {name: scores.errors(dataset, name) for name in names}
+        self.faults = detection.faults(dataset)
+        names = accuracy.names(dataset)
+        self.errors = {name: accuracy.errors(dataset, name) for name in names}
         self.lines = {name: style.line_of(k) for k, name in enumerate(names)}
         self.colours = {name: line["color"] for name, line in self.lines.items()}
         self.t = self.truth("time")

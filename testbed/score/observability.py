@@ -44,8 +44,8 @@ from nav.samples import (
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.record.reader import scenario_of
-from testbed.score import metrics as scores
-from testbed.score.metrics import column
+from testbed.score import accuracy, detection
+from testbed.score.accuracy import column
 
 if TYPE_CHECKING:
     import xarray
@@ -79,7 +79,7 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     found = {}
     own = [section for section in scenario.estimator if section.kind in registry.BUILT_IN]  # others say nothing of it
     for name, running in registry.build(own, scenario.rig(scenario.seed)).items():
-        way = _way(dataset, name) if name in scores.names(dataset) else None
+        way = _way(dataset, name) if name in accuracy.names(dataset) else None
         if way is None:
             continue
         match running.horizon.estimator:
@@ -121,7 +121,7 @@ def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, in
     """
     aid, m = part
     best = np.zeros((len(edges) - 1, m))
-    if aid not in scores.aids(dataset, name):
+    if aid not in accuracy.aids(dataset, name):
         return best
     own = f"estimators/{name}/innovations/{aid}"
     total = column(dataset, f"{own}/weight")
@@ -130,7 +130,7 @@ def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, in
         mine &= column(dataset, f"{own}/sensor").astype(str) == sensor
     total = total[mine]
     weight = np.repeat(total[:, None], m, axis=1)
-    cut = scores.refused(total, column(dataset, f"{own}/outcome")[mine])
+    cut = detection.refused(total, column(dataset, f"{own}/outcome")[mine])
     if cut.any():
         nu, S = (column(dataset, f"{own}/{what}")[mine][cut] for what in ("innovation", "S"))
         order = np.argsort(np.argsort(-np.abs(nu) / np.sqrt(np.diagonal(S, axis1=1, axis2=2)), axis=1), axis=1)

@@ -27,7 +27,7 @@ from testbed.motion.legs import (
 from testbed.motion.paths import turn_radius
 from testbed.motion.sections import FlightTruth
 from testbed.record.reader import scenario_of
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 
 if TYPE_CHECKING:
     import xarray

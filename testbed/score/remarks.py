@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
 from testbed.score.plan import unfinished_leg
 
@@ -37,13 +38,13 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
 
 
 def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[str]:
-    faults = scores.faults(dataset)
-    for name in scores.names(dataset):
+    faults = detection.faults(dataset)
+    for name in accuracy.names(dataset):
         during = [one for one in faults if metrics.get(f"{name}.error_over_3sigma.{one.name}", 0.0) > 1.0]
         if not during:
             continue
-        e = scores.errors(dataset, name)
-        rows = np.flatnonzero(e.valid & scores.inside(e.t, [scores.fault_window(one) for one in during]))
+        e = accuracy.errors(dataset, name)
+        rows = np.flatnonzero(e.valid & accuracy.inside(e.t, [detection.fault_window(one) for one in during]))
         worst = rows[np.nanargmax(e.over_3sigma[rows])]
         error = e.horizontal[worst]
         yield (
@@ -56,12 +57,12 @@ def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> It
     """From `SETTLING_S` after alignment on, but not while a fault lasts, nor `RECOVERY_WINDOW_S` after it."""
     from scipy.stats import chi2
 
-    faulty = [scores.fault_window(one) for one in scores.faults(dataset)]
-    for name in scores.names(dataset):
-        start = metrics.get(f"{name}.aligned_s", np.inf) + scores.SETTLING_S
-        for aid in scores.aids(dataset, name):
-            looks = scores.judged(dataset, name, aid)
-            nis = looks.nis[(looks.t >= start) & ~scores.inside(looks.t, faulty)]
+    faulty = [detection.fault_window(one) for one in detection.faults(dataset)]
+    for name in accuracy.names(dataset):
+        start = metrics.get(f"{name}.aligned_s", np.inf) + accuracy.SETTLING_S
+        for aid in accuracy.aids(dataset, name):
+            looks = detection.judged(dataset, name, aid)
+            nis = looks.nis[(looks.t >= start) & ~accuracy.inside(looks.t, faulty)]
             degrees = len(nis) * looks.components
             if not degrees:
                 continue

@@ -8,7 +8,7 @@ import numpy as np
 
 from nav.samples import Array
 from testbed.errors import UserError
-from testbed.score import metrics
+from testbed.score import accuracy
 
 if TYPE_CHECKING:
     import pandas
@@ -42,10 +42,10 @@ def error_series(run: RunResult | xarray.DataTree, estimator: str) -> pandas.Dat
     import xarray
 
     dataset = run if isinstance(run, xarray.DataTree) else run.dataset
-    known = metrics.names(dataset)
+    known = accuracy.names(dataset)
     if estimator not in known:
         raise UserError(f"the run has no estimator {estimator}: choose from {', '.join(known) or 'none'}")
-    e = metrics.errors(dataset, estimator)
+    e = accuracy.errors(dataset, estimator)
     phi, sigma_phi = np.rad2deg(e.attitude), np.rad2deg(e.sigma_attitude)
     columns: dict[str, Array] = {}
     for name, unit, error, sigma in (
@@ -54,6 +54,6 @@ def error_series(run: RunResult | xarray.DataTree, estimator: str) -> pandas.Dat
         ("phi_{}", "deg", phi, sigma_phi),
     ):
         for values, said in ((error, ""), (sigma, "sigma_")):
-            columns |= {f"{said}{name.format(axis)}_{unit}": values[:, k] for k, axis in enumerate(metrics.AXES)}
+            columns |= {f"{said}{name.format(axis)}_{unit}": values[:, k] for k, axis in enumerate(accuracy.AXES)}
     columns |= {f"{angle}_deg": np.rad2deg(e.angles[:, k]) for k, angle in enumerate(("roll", "pitch", "heading"))}
     return pandas.DataFrame(columns, index=pandas.Index(e.t, name="t_s"))

@@ -16,7 +16,7 @@ import pytest
 
 from nav.samples import Outcome
 from testbed import Scenario, run
-from testbed.score import metrics
+from testbed.score import accuracy
 
 SEEDS = 10
 HEALTHY = ["fault=[]", "sensors.gnss1.denied=[]", "sensors.gnss2.denied=[]", "expect={}"]
@@ -34,10 +34,10 @@ def fly(scenario: Scenario, seed: int) -> tuple[dict[str, float], dict[str, int]
     own = "estimators/{}/innovations/{}/outcome"
     isolated = {
         name: sum(
-            int(np.sum(metrics.column(result.dataset, own.format(name, aid)) == Outcome.ISOLATED))
-            for aid in metrics.aids(result.dataset, name)
+            int(np.sum(accuracy.column(result.dataset, own.format(name, aid)) == Outcome.ISOLATED))
+            for aid in accuracy.aids(result.dataset, name)
         )
-        for name in metrics.names(result.dataset)
+        for name in accuracy.names(result.dataset)
     }
     return result.metrics, isolated
 

@@ -35,7 +35,7 @@ from testbed.report import page as report
 from testbed.report.figures import consistency, flight
 from testbed.report.figures import errors as errors_figures
 from testbed.report.run import Run
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 
 INS = '{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}'
 AHRS = '{name="ahrs", kind="ahrs", aids=["airspeed", "magnetometer", "barometer"]}'
@@ -154,7 +154,7 @@ def test_errors_are_those_of_the_attitude(flown: Any) -> None:
     result = flown[0]
     own, truth = result.dataset["estimators/ahrs"], result.dataset["truth"]
     t = own["time"].values
-    rows = (t >= result.metrics["ahrs.aligned_s"] + metrics.SETTLING_S) & (t < 74.9)
+    rows = (t >= result.metrics["ahrs.aligned_s"] + accuracy.SETTLING_S) & (t < 74.9)
     np.testing.assert_array_equal(t, truth["time"].values)
     verticals = [
         Rotation.from_quat(q[rows], scalar_first=True).inv().apply([0.0, 0.0, 1.0])
@@ -291,7 +291,7 @@ def test_export(flown: Any, tmp_path: Path) -> None:
 def test_a_campaign_counts_degrees(flown: Any, tmp_path: Path) -> None:
     result = flown[0]
     history = campaign._history(result.dataset)
-    errors = metrics.errors(result.dataset, "ahrs")
+    errors = accuracy.errors(result.dataset, "ahrs")
     np.testing.assert_allclose(np.nanmax(history["ahrs.error"][60:]), np.rad2deg(errors.tilt[600:].max()), rtol=0.2)
     assert np.nanmean(history["ahrs.nees"]) > 0.0
     own = Scenario.load("u_turn", [f"estimator=[{AHRS}, {INS}, {BLIND}, {GYROS}]", "expect={}"])

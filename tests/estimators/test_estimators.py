@@ -22,7 +22,7 @@ from testbed.errors import UserError
 from testbed.feeds.simulated import motion
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import KinematicStart
-from testbed.score import metrics
+from testbed.score import accuracy
 from testbed.sensors import build as build_sensor
 from testbed.sensors.imu import ImuConfig
 
@@ -150,8 +150,8 @@ def test_fixes_and_body_velocities_are_of_the_centre_of_gravity_wherever_the_imu
 
     def rms(arm: str) -> Any:
         dataset = run(papers.scenario("zhu2020", [*RIVER, f"sensors.imu.lever_arm_m={arm}"])).dataset
-        found = [metrics.errors(dataset, name, 60.0) for name in ("frkf", "tfkf")]
-        nis = metrics.column(dataset, "estimators/frkf/innovations/body_velocity/nis")
+        found = [accuracy.errors(dataset, name, 60.0) for name in ("frkf", "tfkf")]
+        nis = accuracy.column(dataset, "estimators/frkf/innovations/body_velocity/nis")
         values = [np.sqrt(np.mean(values**2, axis=0)) for e in found for values in (e.position, e.velocity, e.attitude)]
         return np.concatenate([*values, [np.median(nis)]])
 
@@ -167,8 +167,8 @@ def test_velocity_at_the_end_of_an_arm_waits_for_the_rates(arm: str, first: floa
     more = [*RIVER, "duration_s=5", f"sensors.gnss={receiver}", f"estimator=[{estimator}]"]
     own = "estimators/ins/innovations/gnss_velocity"
     dataset = run(papers.scenario("zhu2020", more)).dataset
-    assert metrics.column(dataset, f"{own}/sample_time")[0] == 0.0
-    assert metrics.column(dataset, f"{own}/weight").tolist() == [first, 1.0, 1.0, 1.0, 1.0, 1.0]
+    assert accuracy.column(dataset, f"{own}/sample_time")[0] == 0.0
+    assert accuracy.column(dataset, f"{own}/weight").tolist() == [first, 1.0, 1.0, 1.0, 1.0, 1.0]
 
 
 THREE_IMUS = [
@@ -236,7 +236,7 @@ def test_a_start_is_handed_over_with_its_errors() -> None:
             "u_turn", ["duration_s=0.1", f"estimator=[{{name='ins', aids=[], {handover}}}]", "expect={}"]
         )
         dataset = run(scenario, seed=seed, source=still()).dataset
-        e = metrics.errors(dataset, "ins")
+        e = accuracy.errors(dataset, "ins")
         assert e.aligned_s == 0.0
         drawn.append(np.concatenate([e.attitude[0], e.velocity[0], e.position[0]]))
     sigma = np.array([*np.deg2rad([0.5, 0.5, 2.0]), *[0.3] * 3, *[8.0] * 3])

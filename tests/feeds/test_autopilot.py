@@ -23,7 +23,7 @@ from testbed.loop.requests import Clear, Inject, Recorded
 from testbed.many.check import judge
 from testbed.motion.flight import Flight
 from testbed.motion.paths import Feedback
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 
 PERFECT = [f"sensors.{name}.grade=perfect" for name in ("imu", "gnss", "barometer", "magnetometer", "airspeed")]
 LOITER = [

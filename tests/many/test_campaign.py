@@ -37,7 +37,7 @@ from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
 from testbed.report import campaign_figures
 from testbed.results import MANIFEST
-from testbed.score import metrics
+from testbed.score import accuracy
 
 AT_REST = """
 title = "At rest, some of it without GNSS"
@@ -570,7 +570,7 @@ def test_history_is_the_error_once_a_second() -> None:
     np.testing.assert_array_equal(np.flatnonzero(history["outage"]), np.arange(40, 51))  # the fix comes at 50.1 s
     assert np.flatnonzero(np.isfinite(history["ins.error"]))[0] == 5
     assert np.flatnonzero(np.isfinite(history["ins.nees"]))[0] == 65
-    errors = metrics.errors(dataset, "ins")
+    errors = accuracy.errors(dataset, "ins")
     row = int(np.argmin(np.abs(errors.t - 77.0)))
     assert history["ins.error"][77] == pytest.approx(math.hypot(*errors.position[row, :2]))
     assert history["ins.sigma"][77] == pytest.approx(math.sqrt(2.0))

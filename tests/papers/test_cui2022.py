@@ -26,7 +26,7 @@ from testbed.estimators.datasheet import imu_model
 from testbed.feeds.simulated import motion
 from testbed.papers import Claim, cui2022
 from testbed.scenario import Scenario
-from testbed.score import metrics
+from testbed.score import accuracy
 from testbed.sensors.imu import ImuConfig
 
 PAPER = cui2022.PAPER
@@ -142,7 +142,7 @@ def normalised(seeds: range, duration_s: int, *, faults: bool) -> Array:
         overrides += ["fault=[]", f"estimator=[{one}]", "expect={}"]
     rows = []
     for seed in seeds:
-        errors = metrics.errors(run(papers.scenario("cui2022", overrides), seed=seed).dataset, "with_star")
+        errors = accuracy.errors(run(papers.scenario("cui2022", overrides), seed=seed).dataset, "with_star")
         rows.append([3 * errors.position_nees[-1], 3 * errors.velocity_nees[-1]])
     return np.array(rows)
 
@@ -338,4 +338,4 @@ def test_every_claim(tmp_path: Path) -> None:
 @pytest.mark.ci
 def test_a_claim_has_its_paper_s_value(flights: list[Any]) -> None:
     assert all(isinstance(claim, Claim) and claim.paper for claim in PAPER.conclude(flights))
-    assert metrics.SETTLING_S == cui2022.AFTER_S
+    assert accuracy.SETTLING_S == cui2022.AFTER_S

@@ -16,7 +16,7 @@ from testbed.record import format1
 from testbed.record.columns import FORMAT
 from testbed.record.reader import load
 from testbed.record.recorder import Recorder
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_a_record_of_the_first_format_is_read_and_scored_as_before(tmp_path: Pat
         for own in reports.values():
             del own["outcome"]
     before = load(path)
-    for aid in metrics.aids(now, "ins"):
+    for aid in accuracy.aids(now, "ins"):
         own = f"estimators/ins/innovations/{aid}"
         assert {Outcome.FUSED, Outcome.OUTSIDE_GATE} >= set(now[f"{own}/outcome"].values.tolist())
         np.testing.assert_array_equal(before[f"{own}/outcome"], now[f"{own}/outcome"])

@@ -20,7 +20,7 @@ from testbed import Scenario
 from testbed import run as fly
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
-from testbed.score import metrics, observability
+from testbed.score import accuracy, detection, metrics, observability
 from testbed.score.series import error_series
 from testbed.sensors.faults import FaultTruth
 
@@ -92,7 +92,7 @@ def test_error_series_agree_with_independent_libraries(run: Any) -> None:
         (["phi_north_deg", "phi_east_deg", "phi_down_deg"], -x["turn_deg"], 1e-5),
         (["sigma_north_m", "sigma_east_m", "sigma_down_m"], own["sigma_position_n"].values, 0),
         (["sigma_v_north_mps", "sigma_v_east_mps", "sigma_v_down_mps"], own["sigma_velocity_n"].values, 0),
-        ([f"sigma_phi_{axis}_deg" for axis in metrics.AXES], np.rad2deg(own["sigma_attitude_n"].values), 1e-6),
+        ([f"sigma_phi_{axis}_deg" for axis in accuracy.AXES], np.rad2deg(own["sigma_attitude_n"].values), 1e-6),
         (["roll_deg", "pitch_deg", "heading_deg"], euler_difference_deg(run, "late"), 1e-6),
     ):
         np.testing.assert_allclose(after[columns], expected[rows], rtol=1e-6, atol=atol)
@@ -127,7 +127,7 @@ def test_heading_error_is_the_difference_of_headings_in_level_flight() -> None:
     heading = np.deg2rad(np.array([10.0, 179.0, -179.0, 90.0]))
     error = np.deg2rad(np.array([2.0, 3.0, -3.0, 0.0]))
     q, q_true = (Rotation.from_euler("z", h[:, None]).as_quat(scalar_first=True) for h in (heading + error, heading))
-    np.testing.assert_allclose(metrics.attitude_error(q, -q_true)[:, 2], -error, atol=1e-12)
+    np.testing.assert_allclose(accuracy.attitude_error(q, -q_true)[:, 2], -error, atol=1e-12)
 
 
 def test_attitude_error_has_the_sign_of_the_conventions() -> None:
@@ -137,7 +137,7 @@ def test_attitude_error_has_the_sign_of_the_conventions() -> None:
     C_hat = np.array([(np.eye(3) - np.cross(np.eye(3), p)) @ C for p, C in zip(phi, true.as_matrix(), strict=True)])
     estimated = Rotation.from_matrix(C_hat).as_quat(scalar_first=True)
     # the rows of np.cross(I, p) are e_i x p, so it is the matrix [p x]
-    np.testing.assert_allclose(metrics.attitude_error(estimated, true.as_quat(scalar_first=True)), phi, atol=1e-7)
+    np.testing.assert_allclose(accuracy.attitude_error(estimated, true.as_quat(scalar_first=True)), phi, atol=1e-7)
 
 
 def test_nees_is_the_quadratic_form_and_nan_where_singular() -> None:
@@ -146,10 +146,10 @@ def test_nees_is_the_quadratic_form_and_nan_where_singular() -> None:
     P = A @ A.transpose(0, 2, 1) * np.array([1e-8, 1.0, 1e8])[rng.integers(0, 3, 20), None, None]
     e = rng.normal(size=(20, 3))
     expected = [x @ np.linalg.inv(p) @ x / 3 for x, p in zip(e, P, strict=True)]
-    np.testing.assert_allclose(metrics.nees(e, P), expected, rtol=1e-6)
-    assert np.isnan(metrics.nees(e[:1], np.zeros((1, 3, 3)))).all()
-    assert np.isnan(metrics.nees(e[:1], np.ones((1, 3, 3)))).all()
-    assert np.isnan(metrics.nees(e[:1], np.full((1, 3, 3), np.nan))).all()
+    np.testing.assert_allclose(accuracy.nees(e, P), expected, rtol=1e-6)
+    assert np.isnan(accuracy.nees(e[:1], np.zeros((1, 3, 3)))).all()
+    assert np.isnan(accuracy.nees(e[:1], np.ones((1, 3, 3)))).all()
+    assert np.isnan(accuracy.nees(e[:1], np.full((1, 3, 3), np.nan))).all()
 
 
 def test_consistent_errors_give_one_and_overconfident_ones_their_square() -> None:
@@ -261,7 +261,7 @@ def alarms(*spans: tuple[float, float]) -> Any:
 def test_detection_scores(
     spans: list[tuple[float, float]], delay: float, sustained: float, coverage: float, end_lag: float
 ) -> None:
-    score = metrics.detection(T, alarms(*spans), (40.0, 60.0))
+    score = detection.detection(T, alarms(*spans), (40.0, 60.0))
     assert score is not None
     found = [score.delay, score.sustained_delay, score.coverage, score.end_lag]
     np.testing.assert_allclose(found, [delay, sustained, coverage, end_lag], atol=1e-9)
@@ -270,10 +270,10 @@ def test_detection_scores(
 
 def test_an_alarm_that_lasts_into_the_next_fault_has_not_ended() -> None:
     both = alarms((40.0, 80.0))
-    score = metrics.detection(T, both, (40.0, 60.0), until=70.0)
+    score = detection.detection(T, both, (40.0, 60.0), until=70.0)
     assert score is not None
     assert np.isnan(score.end_lag)
-    assert metrics.detection(T, both, (200.0, 210.0)) is None
+    assert detection.detection(T, both, (200.0, 210.0)) is None
 
 
 def faulty(*injected: tuple[Any, ...], chunk: int = 200) -> Any:
@@ -294,7 +294,7 @@ def refuse(run: Any, aid: str, start: float, end: float, outcome: Outcome = Outc
 
 def test_faults_are_scored_by_name() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0), ("rise", "barometer", 110.0, 130.0), ("quiet", "airspeed", 5.0, 9.0))
-    assert next((f.name, f.start, f.end) for f in metrics.faults(run)) == ("jump", 100.0, 120.0)
+    assert next((f.name, f.start, f.end) for f in detection.faults(run)) == ("jump", 100.0, 120.0)
     refuse(run, "gnss_velocity", 102.0, 120.0)  # one aid of the sensor is enough
     for aid in ("gnss_position", "gnss_velocity"):
         refuse(run, aid, 120.0, 121.0, Outcome.WITHHELD)  # and it is not used yet

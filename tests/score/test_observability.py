@@ -17,9 +17,9 @@ from testbed.report import page as report
 from testbed.report import tables
 from testbed.report.figures import observability as figures
 from testbed.report.run import Run
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 from testbed.score import observability as visibility
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 
 STRAIGHT = [
     "duration_s=60",
@@ -115,7 +115,7 @@ def test_a_look_that_was_not_used_shows_nothing() -> None:
     dataset = run(cheng2020.selected(["improved"], STRAIGHT)).dataset
     before = visibility.of_run(dataset)["improved"]
     place = states(before, "dp north", "dp east", "dp down")
-    for part in metrics.aids(dataset, "improved"):
+    for part in accuracy.aids(dataset, "improved"):
         own = f"estimators/improved/innovations/{part}"
         column(dataset, f"{own}/weight")[column(dataset, f"{own}/sample_time") > 30] = 0.0
     after = visibility.of_run(dataset)["improved"]
@@ -200,7 +200,7 @@ def test_the_figure_is_pale_where_only_the_past_helps() -> None:
     drawn = Run(dataset)
     t = np.array([2.0, 7.0, 12.0])
     share, alone = np.array([[1.0, 0.0], [1.0, 0.5]]), np.array([[1.0, 0.0], [0.0, 0.5]])
-    name = metrics.names(dataset)[0]
+    name = accuracy.names(dataset)[0]
     own = Visibility(["phi north", "wind 1"], t, np.array([1, 2]), share, share, alone)
     drawn.seen = {name: own}
     figure = figures.visibility(drawn)

@@ -11,7 +11,7 @@ from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from testbed.record.recorder import Recorder
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 from testbed.score.remarks import remarks
 from testbed.sensors.faults import FaultTruth
 
@@ -43,7 +43,7 @@ def test_an_honest_estimator_is_not_doubted() -> None:
 def test_who_is_led_astray_is_named() -> None:
     run = flown(6.0)
     found = metrics.compute(run)
-    e = metrics.errors(run, "other")
+    e = accuracy.errors(run, "other")
     rows = (e.t >= 100.0) & (e.t < 130.0)
     expected = float(np.max(e.horizontal[rows] / (3.0 * np.hypot(*e.sigma_position[rows, :2].T))))
     assert found["other.error_over_3sigma.jump"] == pytest.approx(expected)

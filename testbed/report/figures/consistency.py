@@ -26,7 +26,7 @@ from testbed.report.style import (
     thin,
     tints,
 )
-from testbed.score import metrics as scores
+from testbed.score import accuracy, detection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -110,7 +110,7 @@ def _moments(run: Run) -> list[tuple[float, str]]:
         return []
     first, last = min(float(t[0]) for t in counted), max(float(t[-1]) for t in counted)
     cut = [(max(start, first), min(end, last)) for start, end in run.windows]
-    cut = [(start, end) for start, end in cut if end - start > scores.RECOVERY_WINDOW_S]
+    cut = [(start, end) for start, end in cut if end - start > accuracy.RECOVERY_WINDOW_S]
     if not cut:
         return [(t, f"{t:.0f} s") for t in np.linspace(first, last, MOMENTS).tolist()] if last > first else []
     start, end = max(cut, key=lambda window: window[1] - window[0])
@@ -119,9 +119,9 @@ def _moments(run: Run) -> list[tuple[float, str]]:
     moments.append((end - 0.5, f"{end:.0f} s, the end of the outage"))
     if first < start - 1:
         moments.insert(0, (start - 1, f"{start - 1:.0f} s, before the outage"))
-    after = end + scores.RECOVERY_WINDOW_S
+    after = end + accuracy.RECOVERY_WINDOW_S
     if after < last:
-        moments.append((after, f"{after:.0f} s, {scores.RECOVERY_WINDOW_S:.0f} s after it"))
+        moments.append((after, f"{after:.0f} s, {accuracy.RECOVERY_WINDOW_S:.0f} s after it"))
     return moments
 
 
@@ -176,7 +176,9 @@ def ellipse(covariance: Array, sigmas: float) -> Array:
 
 def innovations(run: Run, name: str) -> Figure | None:
     """Innovations over their claimed sigma, with the gate; refused ones crossed, in the colour of their outcome."""
-    aids = [aid for aid in scores.aids(run.dataset, name) if run.has(f"estimators/{name}/innovations/{aid}/innovation")]
+    aids = [
+        aid for aid in accuracy.aids(run.dataset, name) if run.has(f"estimators/{name}/innovations/{aid}/innovation")
+    ]
     if not aids:
         return None
     from matplotlib.lines import Line2D
@@ -200,7 +202,7 @@ def _refused_as(run: Run, name: str, aid: str) -> Array:
     own = f"innovations/{aid}"
     outcome = run.estimate(name, f"{own}/outcome")
     became = np.where(outcome == Outcome.FUSED, Outcome.WEAKENED, outcome)  # fused with weight 0
-    return np.where(scores.refused(run.estimate(name, f"{own}/weight"), outcome), became, np.nan)
+    return np.where(detection.refused(run.estimate(name, f"{own}/weight"), outcome), became, np.nan)
 
 
 def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:

@@ -11,8 +11,8 @@ from nav.samples import Array
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
 from testbed.report.style import FAINT, FAR, TRUTH, focus_log, layer, sheet, stride, thin
-from testbed.score import metrics as scores
-from testbed.score.metrics import Errors
+from testbed.score import accuracy
+from testbed.score.accuracy import Errors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,7 +84,7 @@ def attitude(run: Run) -> Figure | None:
 
 def _euler_deg(q: Array) -> Array:
     """Roll, pitch, heading (N, 3) of q_nb (N, 4); heading in [0, 360)."""
-    angles = np.rad2deg(scores.euler(q))
+    angles = np.rad2deg(accuracy.euler(q))
     angles[:, 2] %= 360.0
     return angles
 
@@ -100,7 +100,7 @@ def _error_panels(run: Run, axes: Any, name: str, error: Array, sigma: Array, la
         ax.set_ylabel(labels[k])
 
 
-def _limits(error: Array, sigma: Array, mask: scores.Mask) -> list[float]:
+def _limits(error: Array, sigma: Array, mask: accuracy.Mask) -> list[float]:
     """How far the panels have to reach to hold errors and bounds of the rows in ``mask``; 0 where there is nothing."""
     limits = []
     for k in range(error.shape[1]):
@@ -115,7 +115,7 @@ def _reach(axes: Any, limits: Sequence[float]) -> None:
             ax.set_ylim(-limit, limit)
 
 
-def _shown_rows(e: Errors) -> scores.Mask:
+def _shown_rows(e: Errors) -> accuracy.Mask:
     """Rows that decide the limits: those that count, of a short run those that there are."""
     return e.valid if e.valid.any() else np.asarray(np.isfinite(e.attitude).all(axis=1))
 
@@ -125,14 +125,14 @@ def position_errors(run: Run, name: str) -> Figure | None:
     e = run.errors[name]
     if e.attitude_only:
         return None
-    near_outage = scores.inside(e.t, [(start, end + scores.RECOVERY_WINDOW_S) for start, end in run.windows])
+    near_outage = accuracy.inside(e.t, [(start, end + accuracy.RECOVERY_WINDOW_S) for start, end in run.windows])
     masks = [_shown_rows(e), e.valid & ~near_outage]
     reach = [_limits(e.position, e.sigma_position, mask) for mask in masks]
     closer = [masks[1].any() and far > FAR * near for far, near in zip(*reach, strict=True)]
     drawn = sheet(3, 2 if any(closer) else 1)
     for k, (mask, limits) in enumerate(zip(masks[: 2 if any(closer) else 1], reach, strict=False)):
         scale, unit = (1e-3, "km") if np.abs(e.position[mask]).max(initial=0.0) > 5000 else (1.0, "m")
-        labels = [f"{axis} [{unit}]" for axis in scores.AXES]
+        labels = [f"{axis} [{unit}]" for axis in accuracy.AXES]
         _error_panels(run, drawn.axes[:, k], name, scale * e.position, scale * e.sigma_position, labels)
         _reach(drawn.axes[:, k], [scale * limit for limit in limits])
     if any(closer):

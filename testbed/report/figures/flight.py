@@ -22,7 +22,7 @@ from testbed.report.style import (
     stride,
     thin,
 )
-from testbed.score import metrics as scores
+from testbed.score import accuracy
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,7 +60,7 @@ def ground_track(run: Run) -> Figure:
 
 
 def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> None:
-    denied = scores.inside(run.t, run.windows)
+    denied = accuracy.inside(run.t, run.windows)
     ax.plot(truth[:, 1], truth[:, 0], color=TRUTH, lw=1.0, label="truth", zorder=4)
     if denied.any():
         gap = np.where(denied[:, None], truth, np.nan)

@@ -13,7 +13,7 @@ from nav.samples import Array
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
 from testbed.report.style import FAINT, NEUTRAL, PROMISED, TRUTH, keys_of, logarithmic, sheet, stride, tints
-from testbed.score.metrics import column
+from testbed.score.accuracy import column
 from testbed.sensors.imu import ImuErrors
 
 if TYPE_CHECKING:

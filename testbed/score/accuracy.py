@@ -1,0 +1,213 @@
+"""Errors of an estimator against truth: what every score and figure begins with."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from nav import earth
+from nav.samples import Array, Status
+
+if TYPE_CHECKING:
+    import xarray
+
+SETTLING_S = 60.0  # after alignment, before errors count: biases and heading settle
+RECOVERY_WINDOW_S = 10.0
+SAME_TIME_S = 1e-6
+AXES = ("north", "east", "down")
+
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
+Window: TypeAlias = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors of one estimator where truth has a row at the same time: estimate - truth, by the conventions of `nav`.
+
+    ``t`` (N,) [s]; ``position`` (N, 3) NED [m]; ``velocity`` (N, 3) NED [m/s]; ``attitude`` (N, 3) phi in n [rad];
+    ``angles`` (N, 3) differences of roll, pitch and heading [rad]; ``sigma_*`` (N, 3) what the estimator claimed;
+    ``*_nees`` (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of
+    alignment, None when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,)
+    rows that should be numbers and are not; ``valid`` (N,) rows that count.
+    """
+
+    t: Array
+    position: Array
+    velocity: Array
+    attitude: Array
+    angles: Array
+    sigma_position: Array
+    sigma_velocity: Array
+    sigma_attitude: Array
+    position_nees: Array
+    velocity_nees: Array
+    attitude_nees: Array
+    aligned_s: float | None
+    attitude_only: bool
+    nonfinite: Mask
+    valid: Mask
+
+    @property
+    def horizontal(self) -> Array:
+        """Length of the horizontal position error (N,) [m]."""
+        return np.hypot(self.position[:, 0], self.position[:, 1])
+
+    @property
+    def over_3sigma(self) -> Array:
+        """Horizontal position error over three times its claimed sqrt(P_N + P_E) (N,), NaN where none is claimed."""
+        claimed = 3.0 * np.hypot(self.sigma_position[:, 0], self.sigma_position[:, 1])
+        ratio: Array = np.divide(self.horizontal, claimed, out=np.full(len(claimed), np.nan), where=claimed > 0)
+        return ratio
+
+    @property
+    def tilt(self) -> Array:
+        """Angle between true and estimated vertical (N,) [rad]."""
+        return np.hypot(self.attitude[:, 0], self.attitude[:, 1])
+
+
+def worst_over_3sigma(e: Errors, mask: Mask, key: str) -> dict[str, float]:
+    """The largest horizontal error over the claimed 3 sigma of these rows; nothing where none is claimed."""
+    values = e.over_3sigma[mask]
+    values = values[np.isfinite(values)]
+    return {key: float(values.max())} if len(values) else {}
+
+
+def column(dataset: xarray.DataTree, path: str) -> npt.NDArray[Any]:
+    """The bare array of one variable, such as ``truth/v_n``."""
+    return np.asarray(cast("xarray.DataArray", dataset[path]).values)
+
+
+def names(dataset: xarray.DataTree) -> list[str]:
+    """The recorded estimators, in the order of the scenario."""
+    return list(dataset["estimators"].children) if "estimators" in dataset.children else []
+
+
+def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:
+    """The aids whose innovations one estimator reported."""
+    children = dataset.children["estimators"].children[estimator].children
+    return list(children["innovations"].children) if "innovations" in children else []
+
+
+def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLING_S) -> Errors:
+    """Errors of one estimator of a recorded run."""
+    own = f"estimators/{estimator}"
+    rows, at = _common(column(dataset, f"{own}/time"), column(dataset, "truth/time"))
+
+    def estimated(name: str) -> Array:
+        return np.asarray(column(dataset, f"{own}/{name}")[rows], np.float64)
+
+    def true(name: str) -> Array:
+        return np.asarray(column(dataset, f"truth/{name}")[at], np.float64)
+
+    t = estimated("time")
+    position = earth.position_difference_n(
+        estimated("lat"), estimated("lon"), estimated("h"), true("lat"), true("lon"), true("h")
+    )
+    velocity = estimated("v_n") - true("v_n")
+    # Truth is of the centre of gravity, the estimate of the IMU. (The Earth's own rate does 1e-4 m/s per metre.)
+    arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator])
+    position -= _rotate(true("q_nb"), np.broadcast_to(arm_b, position.shape))
+    velocity -= _rotate(true("q_nb"), np.cross(true("omega_b"), arm_b))
+    attitude = attitude_error(estimated("q_nb"), true("q_nb"))
+    covariance = estimated("covariance")
+    status = column(dataset, f"{own}/status")[rows]
+    aligned = (status & Status.ALIGNED) != 0
+    attitude_only = bool(np.any(aligned & ((status & Status.ATTITUDE_ONLY) != 0)))
+    aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
+    judged = slice(6 if attitude_only else 0, 9)
+    every = np.column_stack([position, velocity, attitude])[:, judged]
+    finite = np.isfinite(every).all(axis=1)
+    claimed = np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
+    if claimed.any():  # one that never claims a covariance is judged by its errors alone
+        finite &= claimed
+    since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
+    settled = since if aligned_s is None else t >= aligned_s + settling_s
+    return Errors(
+        t=t,
+        position=position,
+        velocity=velocity,
+        attitude=attitude,
+        angles=_wrapped(euler(estimated("q_nb")) - euler(true("q_nb"))),
+        sigma_position=estimated("sigma_position_n"),
+        sigma_velocity=estimated("sigma_velocity_n"),
+        sigma_attitude=estimated("sigma_attitude_n"),
+        position_nees=nees(position, covariance[:, 0:3, 0:3]),
+        velocity_nees=nees(velocity, covariance[:, 3:6, 3:6]),
+        attitude_nees=nees(attitude, covariance[:, 6:9, 6:9]),
+        aligned_s=aligned_s,
+        attitude_only=attitude_only,
+        nonfinite=since & ~finite,
+        valid=settled & finite,
+    )
+
+
+def _common(t: Array, t_true: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Indices into both of the times they share."""
+    if not len(t) or not len(t_true):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    at = np.clip(np.searchsorted(t_true, t - SAME_TIME_S), 0, len(t_true) - 1)
+    rows = np.flatnonzero(np.abs(t_true[at] - t) <= SAME_TIME_S)
+    return rows, at[rows]
+
+
+def _rotate(q: Array, v: Array) -> Array:
+    """Vectors (N, 3) in the axes that quaternions (N, 4) take them to."""
+    twice = 2 * np.cross(q[:, 1:], v)
+    turned: Array = v + q[:, :1] * twice + np.cross(q[:, 1:], twice)
+    return turned
+
+
+def attitude_error(q: Array, q_true: Array) -> Array:
+    """Phi (N, 3) [rad] in n with ``C_hat = exp(-[phi x]) C``, of quaternions (N, 4) that take b to n."""
+    w, v = q[:, :1], q[:, 1:]
+    w0, v0 = q_true[:, :1], q_true[:, 1:]
+    scalar = w * w0 + np.sum(v * v0, axis=1, keepdims=True)
+    vector = w0 * v - w * v0 - np.cross(v, v0)  # of q times the inverse of q_true
+    vector = np.where(scalar < 0, -vector, vector)
+    sine = np.linalg.norm(vector, axis=1, keepdims=True)
+    angle = 2 * np.arctan2(sine, np.abs(scalar))
+    phi: Array = -vector * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 0)
+    return phi
+
+
+def euler(q: Array) -> Array:
+    """Roll, pitch, heading (N, 3) [rad] of q_nb (N, 4)."""
+    w, x, y, z = q.T
+    roll = np.arctan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    heading = np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+    return np.column_stack([roll, pitch, heading])
+
+
+def _wrapped(angle: Array) -> Array:
+    """The same angles in [-pi, pi)."""
+    wrapped: Array = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return wrapped
+
+
+def nees(error: Array, covariance: Array) -> Array:
+    """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) of covariances (N, n, n), NaN where singular."""
+    n = error.shape[1]
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = error / sigma
+        correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    result = np.full(len(error), np.nan)
+    good = np.isfinite(scaled).all(axis=1) & np.isfinite(correlation).all(axis=(1, 2))
+    good[good] = np.linalg.det(correlation[good]) > 1e-12
+    solved = np.linalg.solve(correlation[good], scaled[good][:, :, None])[:, :, 0]
+    result[good] = np.sum(scaled[good] * solved, axis=1) / n
+    return result
+
+
+def inside(t: Array, windows: list[Window]) -> Mask:
+    """Which times (N,) lie in one of the windows [start, end)."""
+    result = np.zeros(len(t), bool)
+    for start, end in windows:
+        result |= (t >= start) & (t < end)
+    return result
