@@ -129,7 +129,6 @@ class Director:
 
     def __init__(
         self,
-        scenario: Scenario,
         sources: Sequence[Callable[[], Sequence[Request]]],
         replay: Sequence[tuple[float, Recorded]],
         factor: float | None,

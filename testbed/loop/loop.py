@@ -98,11 +98,11 @@ def run(
             require_own(setup.out, [RECORD, METRICS])
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
         asking = (*(link.requests for link in links if link.asks), *controls)
-        director = Director(scenario, asking, replay, realtime, rate_hz, source is None)
+        director = Director(asking, replay, realtime, rate_hz, source is None)
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
             rehearsal = scenario.model_copy(update={"duration_s": min(REHEARSAL_S, scenario.duration_s)})
-            _fly(rehearsal, Setup(seed, build=build), Director(scenario, (), (), None, rate_hz))
+            _fly(rehearsal, Setup(seed, build=build), Director((), (), None, rate_hz))
         flown = None
         while flown is None:
             with suppress(Restarted):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -20,19 +20,18 @@ from testbed.loop import injection
 from testbed.loop import requests as control
 from testbed.mavlink import messages, mission
 from testbed.mavlink.encode import Encoder, Fields, Voice
-from testbed.mavlink.identity import Identity
+from testbed.mavlink.identity import Identity, autopilot_version, available_mode, current_mode
 from testbed.mavlink.link import Station
-from testbed.mavlink.messages import Snapshot
 from testbed.mavlink.parameters import Parameters, refusal
 from testbed.mavlink.receive import Message, Reader, whole_number
 from testbed.mavlink.signing import Signing
+from testbed.mavlink.snapshot import Snapshot
 from testbed.mavlink.stream import PUBLISH_HZ, STREAMS, Stream
 from testbed.scenario import Scenario
 
 COMPONENT = mav.MAV_COMP_ID_AUTOPILOT1
 _PARAMETERS_A_TURN = 10
 _NAK, _FTP_FAIL = 129, 1  # MAVFTP's opcode and error: https://mavlink.io/en/services/ftp.html
-_RELEASE = 255  # version type
 
 _UNITS = {
     mav.FAILURE_UNIT_SENSOR_GYRO: "gyro",
@@ -94,39 +93,41 @@ class Talk:
             self.due.clear()
 
 
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """What a vehicle has to tell: as which system, in whose ways, its parameters, mission and streams."""
+
+    identity: Identity
+    parameters: Parameters
+    items: Sequence[mission.Item] = ()
+    streams: Sequence[Stream] = STREAMS
+    system: int = 1
+
+
 class Answers:
     """The answering side of one vehicle.
 
     ``snapshot`` is the newest row, None before the first; ``asked`` collects what concerns the run.
     """
 
-    def __init__(
-        self,
-        identity: Identity,
-        parameters: Parameters,
-        items: Sequence[mission.Item],
-        streams: Sequence[Stream] = STREAMS,
-        *,
-        system: int = 1,
-        scenario: Scenario | None = None,
-        readonly: bool = False,
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, scenario: Scenario | None = None, readonly: bool = False) -> None:
         """Without a ``scenario`` nothing can be injected; ``readonly`` denies all that changes the run."""
         self.snapshot: Snapshot | None = None
         self.asked: list[control.Request] = []
-        self._system = system
-        self._identity = identity
-        self._parameters = parameters
-        self._items = items
-        self._streams = {
-            stream.message: [one for one in streams if one.message == stream.message] for stream in streams
-        }
+        self._identity, self._system = vehicle.identity, vehicle.system
+        self._parameters, self._items = vehicle.parameters, vehicle.items
+        self._streams: defaultdict[str, list[Stream]] = defaultdict(list)
+        for stream in vehicle.streams:
+            self._streams[stream.message].append(stream)
         self._numbers = {mav_id(name): name for name in self._streams}
-        self._scenario = scenario
-        self._readonly = readonly
-        self.encoder = Encoder(system, COMPONENT)
+        self._scenario, self._readonly = scenario, readonly
+        self.encoder = Encoder(self._system, COMPONENT)
         self._texts = 0
-        self._requests: Mapping[str, Callable[[Message, Talk], None]] = {
+        self._requests, self._commands, self._changes = self._by_message(), self._by_command(), self._by_change()
+
+    def _by_message(self) -> Mapping[str, Callable[[Message, Talk], None]]:
+        """Who answers a message."""
+        return {
             "PARAM_REQUEST_LIST": self._param_list,
             "PARAM_REQUEST_READ": self._param_read,
             "PARAM_SET": self._param_set,
@@ -148,21 +149,27 @@ class Answers:
             "COMMAND_INT": self._command_int,
             "SET_MODE": self._set_mode,
             "REQUEST_DATA_STREAM": self._data_stream,
-            "AUTOPILOT_VERSION_REQUEST": lambda message, talk: self._say(talk, "AUTOPILOT_VERSION", self._version()),
+            "AUTOPILOT_VERSION_REQUEST": self._version,
             "PING": self._ping,
             "TIMESYNC": self._timesync,
             "FILE_TRANSFER_PROTOCOL": self._file,
             "LOG_REQUEST_LIST": self._log_list,
             "LOG_REQUEST_DATA": self._log_data,
         }
-        self._commands: Mapping[int, Callable[[Params, Talk], int]] = {
+
+    def _by_command(self) -> Mapping[int, Callable[[Params, Talk], int]]:
+        """Who answers a command that changes nothing."""
+        return {
             mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mav.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
             mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
             mav.MAV_CMD_GET_HOME_POSITION: lambda params, talk: self._stream("HOME_POSITION", talk),
         }
-        self._changes: Mapping[int, Callable[[Params, Talk], int]] = {
+
+    def _by_change(self) -> Mapping[int, Callable[[Params, Talk], int]]:
+        """Who answers a command that changes the run."""
+        return {
             mav.MAV_CMD_DO_SET_MODE: self._do_set_mode,
             mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mav.MAV_CMD_INJECT_FAILURE: self._inject,
@@ -361,9 +368,9 @@ class Answers:
         if number == mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
             return self._capabilities(params, talk)
         if number == mav.MAVLINK_MSG_ID_AVAILABLE_MODES and which in (0, 1):
-            self._say(talk, "AVAILABLE_MODES", self._mode())
+            self._say(talk, "AVAILABLE_MODES", available_mode(self._identity))
         elif number == mav.MAVLINK_MSG_ID_CURRENT_MODE:
-            self._say(talk, "CURRENT_MODE", _current_mode(self._identity))
+            self._say(talk, "CURRENT_MODE", current_mode(self._identity))
         elif number == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             return self._get_interval(params[1:], talk)
         else:
@@ -377,48 +384,12 @@ class Answers:
             talk.due.append(frame)
         return int(mav.MAV_RESULT_ACCEPTED if frames else mav.MAV_RESULT_TEMPORARILY_REJECTED)
 
+    def _version(self, message: Message, talk: Talk) -> None:
+        self._say(talk, "AUTOPILOT_VERSION", autopilot_version(self._identity, self._system))
+
     def _capabilities(self, params: Params, talk: Talk) -> int:
-        self._say(talk, "AUTOPILOT_VERSION", self._version())
+        self._say(talk, "AUTOPILOT_VERSION", autopilot_version(self._identity, self._system))
         return int(mav.MAV_RESULT_ACCEPTED)
-
-    def _version(self) -> Fields:
-        """What is spoken (that autopilot's version) and what this is (`middleware_sw_version`)."""
-        encoding = mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
-        if self._identity.byte_wise:
-            encoding = mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
-        capabilities = (
-            mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-            | mav.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-            | mav.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
-            | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-            | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-            | encoding
-        )
-        own = [int(part) for part in version("navigation-testbed").split(".")[:3]]
-        return {
-            "capabilities": capabilities,
-            "uid": self._system,
-            "flight_sw_version": _packed(self._identity.version),
-            "middleware_sw_version": _packed(own),
-            "os_sw_version": 0,
-            "board_version": 0,
-            "vendor_id": 0,
-            "product_id": 0,
-            "flight_custom_version": b"testbed\0",
-            "middleware_custom_version": bytes(8),
-            "os_custom_version": bytes(8),
-            "uid2": bytes([self._system, *bytes(17)]),
-        }
-
-    def _mode(self) -> Fields:
-        return {
-            "number_modes": 1,
-            "mode_index": 1,
-            "standard_mode": mav.MAV_STANDARD_MODE_NON_STANDARD,
-            "custom_mode": self._identity.mode,
-            "properties": 0,
-            "mode_name": self._identity.mode_name.encode(),
-        }
 
     # Rates
 
@@ -490,16 +461,3 @@ def _to(message: Message) -> dict[str, float]:
 
 def _granted(is_so: bool) -> int:
     return int(mav.MAV_RESULT_ACCEPTED if is_so else mav.MAV_RESULT_DENIED)
-
-
-def _packed(version: Sequence[int]) -> int:
-    major, minor, patch = version
-    return (major & 0xFF) << 24 | (minor & 0xFF) << 16 | (patch & 0xFF) << 8 | _RELEASE
-
-
-def _current_mode(identity: Identity) -> Fields:
-    return {
-        "standard_mode": mav.MAV_STANDARD_MODE_NON_STANDARD,
-        "custom_mode": identity.mode,
-        "intended_custom_mode": 0,
-    }

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from testbed.errors import UserError
+from testbed.mavlink.encode import Fields
+
+_RELEASE = 255  # version type
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,3 +64,59 @@ def identity_of(name: str) -> Identity:
     if name not in IDENTITIES:
         raise UserError(f"--mavlink-identity {name}: not known: choose from {', '.join(IDENTITIES)}")
     return IDENTITIES[name]
+
+
+def autopilot_version(identity: Identity, system: int) -> Fields:
+    """AUTOPILOT_VERSION: what is spoken (that autopilot's version) and what this is (`middleware_sw_version`)."""
+    encoding = mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST
+    if identity.byte_wise:
+        encoding = mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    capabilities = (
+        mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+        | mav.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        | mav.MAV_PROTOCOL_CAPABILITY_MISSION_FLOAT
+        | mav.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+        | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        | encoding
+    )
+    own = [int(part) for part in version("navigation-testbed").split(".")[:3]]
+    return {
+        "capabilities": capabilities,
+        "uid": system,
+        "flight_sw_version": _packed(identity.version),
+        "middleware_sw_version": _packed(own),
+        "os_sw_version": 0,
+        "board_version": 0,
+        "vendor_id": 0,
+        "product_id": 0,
+        "flight_custom_version": b"testbed\0",
+        "middleware_custom_version": bytes(8),
+        "os_custom_version": bytes(8),
+        "uid2": bytes([system, *bytes(17)]),
+    }
+
+
+def _packed(version: Sequence[int]) -> int:
+    major, minor, patch = version
+    return (major & 0xFF) << 24 | (minor & 0xFF) << 16 | (patch & 0xFF) << 8 | _RELEASE
+
+
+def available_mode(identity: Identity) -> Fields:
+    """AVAILABLE_MODES: the one that there is."""
+    return {
+        "number_modes": 1,
+        "mode_index": 1,
+        "standard_mode": mav.MAV_STANDARD_MODE_NON_STANDARD,
+        "custom_mode": identity.mode,
+        "properties": 0,
+        "mode_name": identity.mode_name.encode(),
+    }
+
+
+def current_mode(identity: Identity) -> Fields:
+    """CURRENT_MODE."""
+    return {
+        "standard_mode": mav.MAV_STANDARD_MODE_NON_STANDARD,
+        "custom_mode": identity.mode,
+        "intended_custom_mode": 0,
+    }

@@ -15,14 +15,14 @@ import numpy as np
 from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, Status, UpdateReport
 from testbed.loop.requests import Request
 from testbed.loop.settings import settings
-from testbed.mavlink import messages, mission
-from testbed.mavlink.answers import Answers, Talk
+from testbed.mavlink import estimates, messages, mission
+from testbed.mavlink.answers import Answers, Talk, Vehicle
 from testbed.mavlink.encode import Encoder, microseconds
 from testbed.mavlink.identity import identity_of
 from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
-from testbed.mavlink.messages import Point, Snapshot
 from testbed.mavlink.parameters import Parameters
 from testbed.mavlink.signing import Signing
+from testbed.mavlink.snapshot import Point, Snapshot, known_point
 from testbed.mavlink.stream import BESIDE_VEHICLES, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
 from testbed.motion.table import TruthBlock
 from testbed.scenario import Scenario
@@ -114,14 +114,8 @@ class MavlinkPublisher:
         self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
         self._isolated: dict[tuple[str, str], bool] = {}
         self._told: frozenset[str] = frozenset()  # isolations
-        self._main = Answers(
-            self._identity,
-            self._parameters,
-            self._items,
-            self._streams,
-            scenario=self._scenario,
-            readonly=self._readonly,
-        )
+        vehicle = Vehicle(self._identity, self._parameters, self._items, self._streams)
+        self._main = Answers(vehicle, self._scenario, self._readonly)
         for talk in self._talks.values():
             talk.lists.clear()
 
@@ -149,7 +143,7 @@ class MavlinkPublisher:
             for report in reports:
                 self._read_report(report)
             if self._home is None:
-                self._home = messages.known_point(estimate)
+                self._home = known_point(estimate)
             snapshot = Snapshot(
                 truth,
                 estimate,
@@ -281,23 +275,22 @@ class MavlinkPublisher:
             for system, (name, _) in enumerate(estimates, 2):
                 facts = {name: (system, text) for name, (_, text) in list(self._identity.facts.items())[:1]}
                 parameters = Parameters(facts, {}, self._identity.byte_wise)
-                self._beside.append(
-                    Answers(self._identity, parameters, (), VEHICLE_STREAMS, system=system, readonly=True)
-                )
+                vehicle = Vehicle(self._identity, parameters, streams=VEHICLE_STREAMS, system=system)
+                self._beside.append(Answers(vehicle, readonly=True))
                 self._beside_encoders.append(Encoder(system))
                 self.event(shown.t, "info", f"system {system} is {name}")
-        for vehicle, encoder, (_, estimate) in zip(self._beside, self._beside_encoders, estimates, strict=True):
-            before = vehicle.snapshot
+        for beside, encoder, (_, estimate) in zip(self._beside, self._beside_encoders, estimates, strict=True):
+            before = beside.snapshot
             home = before.home if before is not None and before.t <= shown.t else None
-            vehicle.snapshot = replace(
+            beside.snapshot = replace(
                 shown,
                 estimate=estimate,
                 gyro=shown.truth.omega_b[0] + estimate.gyro_bias,
                 others=(),
-                home=home or messages.known_point(estimate),
+                home=home or known_point(estimate),
                 legs=0,
             )
-            due = self._due(encoder, vehicle, vehicle.snapshot, self._beside_schedule)
+            due = self._due(encoder, beside, beside.snapshot, self._beside_schedule)
             self._send(shown.t, due, encoder.system)
 
     def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
@@ -318,7 +311,7 @@ class MavlinkPublisher:
 
     def _health_changed(self, snapshot: Snapshot) -> list[bytes]:
         """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
-        sensors, filters = messages.sys_status(snapshot), messages.ekf_status_report(snapshot)
+        sensors, filters = messages.sys_status(snapshot), estimates.ekf_status_report(snapshot)
         before, self._health = self._health, (sensors["onboard_control_sensors_health"], filters["flags"])
         if before in (None, self._health):
             return []

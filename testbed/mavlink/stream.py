@@ -8,9 +8,9 @@ from functools import partial
 
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from testbed.mavlink import messages
+from testbed.mavlink import estimates, messages
 from testbed.mavlink.encode import Fields
-from testbed.mavlink.messages import Snapshot
+from testbed.mavlink.snapshot import Snapshot
 
 PUBLISH_HZ = 25
 
@@ -42,27 +42,27 @@ STREAMS = (
     Stream("EXTENDED_SYS_STATE", 1, messages.extended_sys_state, _STATUS),
     Stream("MISSION_CURRENT", 1, messages.mission_current, _STATUS),
     Stream("HOME_POSITION", 0.5, messages.home_position),
-    Stream("ATTITUDE", 25, messages.attitude, _ATTITUDE),
-    Stream("ATTITUDE_QUATERNION", 10, messages.attitude_quaternion, _ATTITUDE),
-    Stream("GLOBAL_POSITION_INT", 10, messages.global_position_int, _POSITION),
-    Stream("LOCAL_POSITION_NED", 10, messages.local_position_ned, _POSITION),
-    Stream("VFR_HUD", 5, messages.vfr_hud, _HUD),
-    Stream("ODOMETRY", 5, messages.odometry, _POSITION),
-    Stream("ALTITUDE", 2, messages.altitude, _POSITION),
-    Stream("WIND_COV", 1, messages.wind_cov, _REST),
-    Stream("ESTIMATOR_STATUS", 2, messages.estimator_status, _REST),
-    Stream("EKF_STATUS_REPORT", 1, messages.ekf_status_report, _REST),
+    Stream("ATTITUDE", 25, estimates.attitude, _ATTITUDE),
+    Stream("ATTITUDE_QUATERNION", 10, estimates.attitude_quaternion, _ATTITUDE),
+    Stream("GLOBAL_POSITION_INT", 10, estimates.global_position_int, _POSITION),
+    Stream("LOCAL_POSITION_NED", 10, estimates.local_position_ned, _POSITION),
+    Stream("VFR_HUD", 5, estimates.vfr_hud, _HUD),
+    Stream("ODOMETRY", 5, estimates.odometry, _POSITION),
+    Stream("ALTITUDE", 2, estimates.altitude, _POSITION),
+    Stream("WIND_COV", 1, estimates.wind_cov, _REST),
+    Stream("ESTIMATOR_STATUS", 2, estimates.estimator_status, _REST),
+    Stream("EKF_STATUS_REPORT", 1, estimates.ekf_status_report, _REST),
     Stream("GPS_RAW_INT", 5, messages.gps_raw_int, _STATUS),
     Stream("GNSS_INTEGRITY", 1, messages.gnss_integrity, _STATUS),
     Stream("HIGHRES_IMU", 10, messages.highres_imu, _RAW),
     Stream("SCALED_PRESSURE", 1, messages.scaled_pressure, _RAW),
-    Stream("HIL_STATE_QUATERNION", 10, messages.hil_state_quaternion, _ATTITUDE),
-    Stream("SIMSTATE", 5, messages.simstate, _ATTITUDE),
-    Stream("SIM_STATE", 1, messages.sim_state, _ATTITUDE),
-    Stream("AHRS2", 5, messages.ahrs2, _ATTITUDE),
-    Stream("AHRS3", 5, messages.ahrs3, _ATTITUDE),
+    Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE),
+    Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE),
+    Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE),
+    Stream("AHRS2", 5, estimates.ahrs2, _ATTITUDE),
+    Stream("AHRS3", 5, estimates.ahrs3, _ATTITUDE),
     *(
-        Stream("NAMED_VALUE_FLOAT", 1, partial(messages.error, name), _REST)
+        Stream("NAMED_VALUE_FLOAT", 1, partial(estimates.error, name), _REST)
         for name in (f"{kind}_{error}" for error in ("horiz", "down", "vel", "tilt", "head") for kind in ("err", "sig"))
     ),
 )

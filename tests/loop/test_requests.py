@@ -458,7 +458,7 @@ def test_the_speed_changes_on_the_way_and_is_no_part_of_the_record(asked: Reques
 
 def test_faster_is_meant_of_the_speed_in_force_and_ends_where_speeds_do() -> None:
     asked: list[Request] = [Faster(2.0), Change("SIM_SPEEDUP", 8.0), Faster(0.5), Faster(1e6), Faster(1e-9)]
-    director = Director(scenario(6), [lambda: asked and [asked.pop(0)]], (), 3.0, 200.0)
+    director = Director([lambda: asked and [asked.pop(0)]], (), 3.0, 200.0)
     desk = SimpleNamespace(values={})
     director.begin(desk, None, lambda *_: None, lambda *_: None, lambda _: None)  # type: ignore[arg-type]
     speeds = []
@@ -491,9 +491,8 @@ def test_a_restart_begins_anew_in_the_same_folder(tmp_path: Path) -> None:
 
 
 def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
-    short = scenario(6)
     asked: list[Request] = [Speed(500.0), Restart()]
-    director = Director(short, [lambda: [asked.pop(0)] if asked else []], (), 1000.0, 200.0)
+    director = Director([lambda: [asked.pop(0)] if asked else []], (), 1000.0, 200.0)
     told: list[str] = []
     desk = SimpleNamespace(values={})
     director.begin(desk, None, lambda *_: None, lambda *event: told.append(event[-1]), lambda _: None)  # type: ignore[arg-type]
