@@ -1,0 +1,226 @@
+"""``testbed run``: fly one scenario, or run a record again."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from testbed import interrupts
+from testbed.commands.shared import (
+    EXIT_FAILED,
+    RUNS,
+    Force,
+    Overrides,
+    conclude,
+    console,
+    output_folder,
+    remark,
+)
+from testbed.errors import UserError
+from testbed.results import METRICS, RECORD, REPORT, require_own
+
+if TYPE_CHECKING:
+    from testbed.loop.links import Publisher
+    from testbed.loop.loop import RunResult
+    from testbed.loop.requests import Recorded
+    from testbed.scenario import Scenario
+
+Flown = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO|RUN.nc", help="A scenario file, a shipped one by name, or a record to be run again."
+    ),
+]
+Folder = Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for the results; runs/<scenario>.")]
+Seed = Annotated[int | None, typer.Option(metavar="N", min=0, max=2**63 - 1, help="In place of the scenario's seed.")]
+Mavlink = Annotated[
+    list[str] | None,
+    typer.Option(metavar="URL", help="To udpout, udpin, tcp or tcpin:HOST:PORT, serial:DEVICE, tlog:FILE; repeatable."),
+]
+MavlinkIdentity = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Whose ways the vehicle has: px4, or ardupilot.")
+]
+MavlinkVehicles = Annotated[
+    bool, typer.Option("--mavlink-vehicles", help="Show truth and the other estimators as vehicles of their own.")
+]
+MavlinkReadonly = Annotated[bool, typer.Option("--mavlink-readonly", help="Let stations watch, but change nothing.")]
+MavlinkKey = Annotated[
+    str | None,
+    typer.Option(metavar="KEY", help="Hear only what is signed with this passphrase or 64 hexadecimal digits."),
+]
+Shown = Annotated[str | None, typer.Option(metavar="NAME", help="Which estimator to stream; the scenario's first.")]
+Realtime = Annotated[
+    float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
+]
+Report = Annotated[bool, typer.Option("--report/--no-report", help="Write figures and report.html.")]
+
+
+def run(
+    scenario: Flown,
+    out: Folder = None,
+    seed: Seed = None,
+    overrides: Overrides = None,
+    mavlink: Mavlink = None,
+    mavlink_identity: MavlinkIdentity = None,
+    mavlink_vehicles: MavlinkVehicles = False,
+    mavlink_readonly: MavlinkReadonly = False,
+    mavlink_key: MavlinkKey = None,
+    estimator: Shown = None,
+    realtime: Realtime = None,
+    report: Report = True,
+    force: Force = False,
+) -> None:
+    """Fly one scenario: record, metrics, report. Exit code 1 if control was lost on the way.
+
+    A record is run again with everything that was asked of it, bit for bit; --seed and --set make another run of it,
+    of which the same is asked at the same times.
+    """
+    from testbed.scenario import Scenario
+
+    if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
+        raise UserError(f"--realtime {realtime:g}: the factor must be above 0, such as 1 for wall-clock time")
+    replay: Sequence[tuple[float, Recorded]] = ()
+    if scenario.endswith(".nc"):
+        loaded, folder, recorded_seed, replay = _again(Path(scenario), overrides or [])
+        seed = recorded_seed if seed is None else seed
+    else:
+        loaded, folder = Scenario.load(scenario, overrides or ()), RUNS / Path(scenario).stem
+    folder = out or folder
+    if (folder / RECORD).resolve() == Path(scenario).resolve():
+        raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
+    with output_folder(folder):
+        _require_own(loaded, folder, report, force)
+        links = _connect(
+            mavlink or [],
+            loaded,
+            folder,
+            estimator,
+            identity=mavlink_identity,
+            vehicles=mavlink_vehicles,
+            readonly=mavlink_readonly,
+            key=mavlink_key,
+        )
+        result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay)
+        conclude(result.dataset, result.metrics, folder / RECORD, report, force)
+    if _lost(result):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
+    """Scenario, folder, seed and requests for running a record again."""
+    from testbed.loop import director
+    from testbed.record import format1
+    from testbed.record.reader import load, scenario_of
+    from testbed.record.recorder import versions as installed
+
+    dataset = load(run_file)
+    said = dataset.attrs
+    try:
+        versions, seed = [*json.loads(said["versions"]).items()], int(said["seed"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
+    try:
+        scenario = scenario_of(dataset, overrides)
+    except UserError as error:
+        raise UserError(f"{run_file}: {error}") from None
+    other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
+    if other:
+        remark(f"{run_file}: was made with {', '.join(other)}: bits may differ")
+    if said["format"] == format1.FORMAT:
+        remark(f"{run_file}: is of format {said['format']!r}: {format1.CHANGED}")
+    if not said["complete"]:
+        remark(f"{run_file}: ends early; the rerun goes on to the scenario's end")
+    name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
+    return scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario)
+
+
+def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) -> None:
+    """See before a run that nothing of somebody else's is where its results go."""
+    if force:  # what figures there will be is not known; each is forced as it is written
+        require_own(folder, [RECORD, METRICS], force)
+        return
+    names = [RECORD, METRICS]
+    if report:
+        from testbed.report import page
+
+        names += page.files([*(one.name for one in scenario.estimator), *scenario.sensors])
+    require_own(folder, names)
+
+
+def _connect(
+    urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, **options: Any
+) -> list[Publisher]:
+    """Open the links, once it is sure that there is something to show and that no log would overwrite a result.
+
+    ``options`` are those of `testbed.mavlink.MavlinkPublisher`.
+    """
+    if not urls:
+        if any(options.values()):
+            given = ", ".join(f"--mavlink-{name}" for name, value in options.items() if value)
+            raise UserError(f"{given}: there is no link: add --mavlink URL, or leave it out")
+        return []
+    from testbed.loop.links import shown_estimator
+    from testbed.mavlink import MavlinkPublisher, log_path
+
+    shown_estimator(scenario, estimator)
+    for url in urls:
+        path = log_path(url)
+        if path is not None and path.resolve().parent == folder.resolve() and path.name in (RECORD, METRICS, REPORT):
+            raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
+    return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
+
+
+def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: Any) -> RunResult:
+    """Run with progress and keys; ``options`` are others of `testbed.run`."""
+    from testbed.loop import keyboard, loop
+    from testbed.many import progress
+
+    record, before = folder / RECORD, _stamp(folder / RECORD)
+    with (
+        interrupts.leaving(lambda: _kept(record) if _stamp(record) != before else "nothing was recorded"),
+        keyboard.keys() if realtime else nullcontext() as keys,
+        progress.shown(console(stderr=True), scenario.title) as tell,
+    ):
+        if keys is not None:
+            print(keyboard.HELP, file=sys.stderr)
+        result = loop.run(
+            scenario,
+            out=folder,
+            realtime=realtime,
+            progress=lambda now: tell(*progress.of_run(now)),
+            controls=[keys.requests] if keys is not None else (),
+            **options,
+        )
+    for text in result.remarks:
+        remark(text)
+    return result
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is written or made anew; None when there is none."""
+    with suppress(OSError):
+        status = path.stat()
+        return status.st_ino, status.st_mtime_ns
+    return None
+
+
+def _kept(record: Path) -> str:
+    return f"the record so far is {record}: `testbed report {shlex.quote(str(record))}` shows it"
+
+
+def _lost(result: RunResult) -> bool:
+    """Whether the flight got out of control; if so, it is said."""
+    if result.failure:
+        from testbed.score.accuracy import column
+
+        t = column(result.dataset, "truth/time")[-1]
+        remark(f"the flight ended after {t:.0f} s: {result.failure}")
+    return bool(result.failure)
