@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from distributed import LocalCluster
+from scipy.stats import chi2
 from typer.testing import CliRunner
 from worlds import synthetic_run
 
@@ -486,10 +487,9 @@ def test_scheduler_address_that_is_none(at_rest: Path, tmp_path: Path, address: 
 
 @pytest.mark.ci
 def test_scheduler_that_does_not_answer(at_rest: Path, tmp_path: Path) -> None:
-    started = time.monotonic()
+    assert pool.CONNECT_S <= 3.0  # after which it is given up
     with pytest.raises(UserError, match="nothing answers there"):
         campaign(at_rest, 1, workers=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
-    assert time.monotonic() - started < 6.0
 
 
 def test_scheduler_without_workers(at_rest: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -543,10 +543,11 @@ def made_up_campaign(tmp_path: Path, values: list[str], runs: int = 30) -> campa
 def test_statistics(tmp_path: Path) -> None:
     statistics = made_up_campaign(tmp_path, ["0", "5"]).statistics
     first, second = statistics.consistency
-    assert first.nees == pytest.approx(1.0, abs=0.05)
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * 30 * 390) / (3 * 30 * 390)  # 30 runs of 390 independent errors
+    assert low < first.nees < high
     assert first.inside == pytest.approx(0.95, abs=0.04)
     assert first.lower < 1.0 < first.upper
-    assert second.nees == pytest.approx(4.0, abs=0.2)
+    assert 4 * low < second.nees < 4 * high
     assert second.inside == 0.0
     assert first.false_alarms_per_h == pytest.approx(0.5)
     rms = next(s for s in statistics.spreads if s.metric == "position_horizontal_rms_m")

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mav
-from worlds.mavlink import SCENARIO, publish
+from worlds.mavlink import SCENARIO, Calls, publish
 
 from testbed import Scenario, run
 from testbed.mavlink import MavlinkPublisher
@@ -147,15 +147,18 @@ def test_fields_are_what_pymavlink_reads(seed):
             np.testing.assert_equal(np.asarray(value), np.asarray(expected))
 
 
+MOST_CALLS = 20_000  # of Python functions in a turn, some tens of milliseconds; 4200 are the most that was seen
+
+
 def fire(publisher, station, rounds, rng):
-    """Hostile datagrams at a publisher between rows; the longest that it took to bear one turn's."""
-    worst = 0.0
+    """Hostile datagrams at a publisher between rows; the most calls that it took to bear one turn's."""
+    worst = 0
     for k in range(rounds):
         for _ in range(20):
             station.send(hostile_bytes(rng))
-        begun = time.perf_counter()
-        publisher.requests()
-        worst = max(worst, time.perf_counter() - begun)
+        with Calls() as calls:
+            publisher.requests()
+        worst = max(worst, calls.count)
         if k % 20 == 0:
             publish(publisher, [k // 20])
         while True:
@@ -177,7 +180,8 @@ def test_hostile_station(key, vehicles):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.connect(("127.0.0.1", port))
         station.setblocking(False)
-        assert fire(publisher, station, 200, random.Random(1)) < 0.25
+        worst = fire(publisher, station, 200, random.Random(1))
+        assert worst < MOST_CALLS
     if key:
         assert publisher._links[0].stations == []
     publisher.close()
@@ -207,11 +211,11 @@ def test_endless_input_is_taken_a_little_at_a_time():
         thread.start()
         other.sendall(request)
         other.settimeout(0.05)
-        heard, worst = b"", 0.0
+        heard, worst = b"", 0
         for _ in range(60):
-            begun = time.perf_counter()
-            publisher.requests()
-            worst = max(worst, time.perf_counter() - begun)
+            with Calls() as calls:
+                publisher.requests()
+            worst = max(worst, calls.count)
             try:
                 heard += other.recv(1 << 16)
             except TimeoutError:
@@ -221,7 +225,7 @@ def test_endless_input_is_taken_a_little_at_a_time():
         publisher.close()
         thread.join(5.0)
     assert b"SIM_SPEEDUP" in heard
-    assert worst < 0.25
+    assert worst < MOST_CALLS
 
 
 def flown(urls, **options):
@@ -281,22 +285,22 @@ def test_a_million_hostile_frames(readonly):
     publish(publisher, range(1))
     rng = random.Random(3)
     pool = [hostile_bytes(rng) for _ in range(50_000)]
-    worst, asked = 0.0, 0
+    worst, asked = 0, 0
     for k in range(1_000_000 // 50):
         listener.datagrams = k % 2 == 0
-        begun = time.perf_counter()
-        for data in rng.choices(pool, k=50):
-            for message in talk.hear(listener, data):
+        with Calls() as calls:
+            for data in rng.choices(pool, k=50):
+                for message in talk.hear(listener, data):
+                    for vehicle in (publisher._main, *publisher._beside):
+                        vehicle.answer(message, talk)
                 for vehicle in (publisher._main, *publisher._beside):
-                    vehicle.answer(message, talk)
-            for vehicle in (publisher._main, *publisher._beside):
-                vehicle.go_on(talk)
-            talk.flush(listener)
-        worst = max(worst, time.perf_counter() - begun)
+                    vehicle.go_on(talk)
+                talk.flush(listener)
+        worst = max(worst, calls.count)
         if k % 1000 == 0:
             publish(publisher, [1 + k // 1000])
         asked += len(publisher.requests())
-    assert worst < 1.0
+    assert worst < 4 * MOST_CALLS
     assert (asked == 0) == readonly
     assert listener.frames > 200_000
     publisher.close()
@@ -309,9 +313,7 @@ def test_a_million_hostile_frames_into_a_run_change_none_of_its_bits():
     fire = _Fire(random.Random(4))
     publisher._links.append(fire)
     publisher.asks = True
-    begun = time.perf_counter()
     under_fire = bits(run(scenario, links=[publisher], realtime=1000.0).dataset)
-    assert time.perf_counter() - begun < 300.0
     assert fire.shots >= 1_000_000
     assert fire.stations[0].frames > 100_000  # it was answered, too
     assert under_fire == flown([])

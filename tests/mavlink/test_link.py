@@ -157,10 +157,9 @@ def test_datagrams_to_a_peer_that_never_reads_cost_no_time():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.bind(("127.0.0.1", 0))
         link = connect(f"udpout::{station.getsockname()[1]}")
-        start = time.perf_counter()
+        assert not link._socket.getblocking()  # so that no send can wait
         for _ in range(20_000):
             send(link, [FRAME])
-        assert time.perf_counter() - start < 5.0
         link.close()
 
 
@@ -215,10 +214,9 @@ def test_slow_station_costs_no_time_and_gets_whole_batches_only():
         station, _ = server.accept()
         with station:
             batch = b"".join(bytes([k]) * 1000 for k in range(1, 101))
-            start = time.perf_counter()
+            assert not link.stations[0]._socket.getblocking()  # so that no send can wait
             for _ in range(500):  # 50 MB, far beyond what the system holds
                 send(link, [batch])
-            assert time.perf_counter() - start < 5.0
             received = bytearray()
             station.settimeout(0.2)
             for _ in range(1000):

@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pymap3d
@@ -124,12 +125,14 @@ def test_an_outage_shows_while_it_lasts(flown: Path, capsys: pytest.CaptureFixtu
     assert any("dead reckoning" in rest for _, rest in lines)
 
 
-def test_a_terminal_sees_it_at_its_pace(flown: Path) -> None:
+def test_a_terminal_sees_it_at_its_pace(flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=100, height=40)
-    began = time.monotonic()
+    now = [100.0]  # the clock, which only sleeping moves
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda s: now.append(now.pop() + s))
+    monkeypatch.setattr("testbed.mavlink.watch.time", clock)
     drawn = shown(flown / "run.tlog", console, speed=SECONDS)
-    took = time.monotonic() - began
-    assert 0.9 <= took < 4
+    took = now[0] - 100.0
+    assert took == pytest.approx(1.0, abs=0.1)
     assert 4 <= drawn.count("╭") <= 5 * took + 3  # at 5 Hz, and the first and the last
     assert "\x1b[33mdenied" in drawn
 

@@ -1,7 +1,6 @@
 """Sigma points against the linear filter, dense numpy, and strapdowns of every point; and from a bad alignment."""
 
 import functools
-import time
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from scipy.stats import chi2
 from worlds.ins import flight
 
 from nav import error_model, kalman, strapdown, unscented
-from nav._jit import njit
 from nav.earth import position_difference_n
 from nav.error_model import ErrorModel, ImuModel, sensor_errors
 from nav.rotation import dcm_from_quat, quat_from_euler, quat_from_rotvec, quat_multiply
@@ -464,65 +462,3 @@ def test_positive_after_hostile_updates():
 @pytest.mark.slow
 def test_positive_after_a_hundred_thousand_hostile_updates():
     hostile(100_000)
-
-
-@njit
-def _cycles(
-    count, work, P0, q, v, lla, x, driven, sums, T, decay, half, z, Z, R, H, spread, excess, sigma_update
-):  # fmt: skip
-    """`count` filter periods from the same start: transition, `predict`, and GNSS position and velocity."""
-    n = len(P0)
-    P, Phi, FT = P0.copy(), np.zeros((9, n)), np.zeros((9, n))
-    root, points = np.empty((3, n)), np.empty((7, 10 + n))
-    push = sums[2].sum(axis=1)
-    for _ in range(count):
-        P[:] = P0
-        error_model.transition(Phi, FT, driven, v, lla[0], lla[2], sums, T)
-        shift = unscented.predict(P, Phi, decay, half, work, push, T, spread, excess)
-        unscented.remove(q, v, lla, x, shift)
-        if sigma_update:
-            unscented.factor_into(root, P)
-            unscented.points_into(points, q, v, lla, x, root, spread)
-            _, _, W, _ = unscented.innovate(P, Z, z, R, root, H, work, spread, excess)
-            unscented.correct(P, W, work)
-        else:
-            _, S_inverse, HP, _ = kalman.innovate(P, H, R, z)
-            kalman.correct(P, H, R, HP, S_inverse, z)
-
-
-@pytest.mark.slow
-def test_cost_beside_the_strapdown():
-    """15 states, 7 points, six rows of GNSS at 1 Hz cost less than the strapdown at 200 Hz; `-s` prints the figures."""
-    n, model = 15, ErrorModel(IMU)
-    q, v, lla, x = estimate(n)
-    rng = np.random.default_rng(8)
-    P = positive(rng, n, np.array([0.1] * 3 + [0.5] * 3 + [3.0] * 3 + [2e-4] * 3 + [0.02] * 3)) / n
-    sums = np.stack([dcm_from_quat(q)] * 3) * np.array([1.0, 0.1, 9.8])[:, None, None]
-    H, R, z = np.zeros((6, n)), np.array([1.0] * 3 + [0.01] * 3), 0.1 * rng.normal(size=6)
-    H[:3, 6:9] = H[3:, 3:6] = np.eye(3)
-    dtheta, dv, dt = np.full((200, 3), 1e-4), np.tile([0, 0, -9.8 * DT], (200, 1)), np.full(200, DT)
-
-    def fastest(function, count):
-        function()
-        spans = []
-        for _ in range(30):
-            start = time.perf_counter()
-            function()
-            spans.append((time.perf_counter() - start) / count)
-        return min(spans) * 1e6
-
-    def strapdowns():
-        for _ in range(50):
-            strapdown.propagate(q.copy(), v.copy(), lla.copy(), dtheta, dv, dt)
-
-    def cycles(sigma_update):
-        _cycles(
-            50, unscented.scratch(n), P, q.copy(), v.copy(), lla.copy(), x.copy(), model.driven, sums, 1.0,
-            np.ones(n), np.full(n, 1e-12), z, np.zeros((7, 6)), R, H, ONE.spread, ONE.excess, sigma_update,
-        )  # fmt: skip
-
-    second = fastest(strapdowns, 50)
-    sigma, linear = (fastest(lambda update=update: cycles(update), 50) for update in (True, False))
-    print(f"strapdown, a second of 200 Hz: {second:.1f} us; a period of the filter: {sigma:.1f} us, with the linear")
-    print(f"update {linear:.1f} us; as costly as the strapdown at {second / sigma:.1f} and {second / linear:.1f} Hz")
-    assert sigma < second
