@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from nav.samples import Outcome
 from testbed import Scenario, run
@@ -79,6 +80,8 @@ def test_mean_nees_per_degree_of_freedom(outages: list[Any], name: str, what: st
     aided = np.mean([found[f"{name}.{what}_nees_mean"] for found, _ in outages])
     denied = np.mean([found[f"{name}.outage_{what}_nees_mean"] for found, _ in outages])
     print(f"{name}, {what} NEES per degree of freedom: {aided:.3f} with GNSS, {denied:.3f} in the outage")
+    # A run is one independent draw at the least: 30 degrees of freedom, which would allow 0.46 to 1.79 at 99 %. Means
+    # over time are closer to 1. In the outage the model is not matched: wind and biases wander otherwise than it says.
     assert 0.6 <= aided <= 1.5
     assert denied <= 2.0
     if name == "resets":  # without them the shares of the noise are never taken back: claims are too large, not wrong
@@ -112,7 +115,7 @@ def test_healthy_federation_of_two_receivers_is_consistent(hours: list[Any]) -> 
     for what in ("position", "velocity", "attitude"):
         mean = np.mean([found[f"federated.{what}_nees_mean"] for found, _ in hours])
         print(f"{what} NEES per degree of freedom: {mean:.3f}")
-        assert 0.6 <= mean <= 1.5
+        assert 0.6 <= mean <= 1.5  # within the 99 % of chi-square with 30 degrees of freedom, 0.46 to 1.79
 
 
 @pytest.mark.slow
@@ -136,7 +139,8 @@ def test_two_minutes_of_healthy_flight() -> None:
     found, isolated = fly(Scenario.load("loiter_fault_tolerant", [*HEALTHY, "duration_s=120"]), 1)
     assert isolated["federated"] == 0
     assert found["federated.position_horizontal_max_m"] < 5.0
-    assert 0.05 < found["federated.velocity_nees_mean"] < 4.0
+    low, high = chi2.ppf([0.005, 0.995], 3) / 3  # of one draw; settled for a minute, the mean is hardly more
+    assert max(low, 0.05) < found["federated.velocity_nees_mean"] < min(high, 4.0)
 
 
 @pytest.mark.ci

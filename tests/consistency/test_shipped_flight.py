@@ -54,5 +54,7 @@ def test_mean_nees_per_degree_of_freedom(metrics: dict[str, np.ndarray], what: s
     aided = metrics[f"ins.{what}_nees_mean"].mean()
     denied = metrics[f"ins.outage_{what}_nees_mean"].mean()
     print(f"{what} NEES per degree of freedom: {aided:.3f} with GNSS, {denied:.3f} in the outage")
+    # A run is one independent draw at the least: 60 degrees of freedom, which would allow 0.59 to 1.53 at 99 %. Means
+    # over time are closer to 1. In the outage the model is not matched: wind and biases wander otherwise than it says.
     assert 0.6 <= aided <= 1.5
     assert 0.4 <= denied <= 2.0

@@ -369,7 +369,7 @@ def test_a_federation_in_a_run() -> None:
     metrics = result.metrics
     assert metrics["fed.position_horizontal_rms_m"] < 0.5  # RTK goes first
     assert metrics["fed.heading_rms_deg"] < 1.0
-    assert metrics["fed.velocity_nees_mean"] < 3.0
+    assert metrics["fed.velocity_nees_mean"] < 3.0  # 4.28 would be the 99.5 % of one draw of three components
     innovations = result.dataset["estimators/fed/innovations"]
     assert set(innovations.children) == {
         "gnss_position", "gnss_velocity", "airspeed", "sideslip", "barometer", "magnetometer",

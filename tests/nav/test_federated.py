@@ -306,7 +306,10 @@ def test_claims_without_resets():
 
 @pytest.mark.slow
 def test_nees_over_many_flights():
-    """Mean of nine states' NEES over 40 flights, against the one-sided 99 % bound of a consistent filter."""
+    """Mean of nine states' NEES over 40 flights, against the 99 % bound of a consistent filter.
+
+    One-sided, since shares of the noise that are never taken back make claims too large.
+    """
     runs, nees = 40, {"fixed": 0.0, "none": 0.0}
     for seed in range(runs):
         truth, increments, one, two, others = world.__wrapped__(60, 1000 + seed)
