@@ -204,6 +204,7 @@ def campaign(
         list[str] | None, typer.Option(metavar="KEY=A,B,C", help="Repeat for each of these values; repeatable.")
     ] = None,
     overrides: Overrides = None,
+    draw: Annotated[int, typer.Option(metavar="N", min=0, help="Other seeds for each number.")] = 0,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="An existing Dask cluster.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
 ) -> None:
@@ -221,7 +222,7 @@ def campaign(
         interrupts.leaving(lambda: f"what is finished is in {folder}; the same command carries on"),
         progress.shown(console(stderr=True), scenario) as tell,
     ):
-        plan = campaigns.Plan(scenario, runs, folder, varied, overrides or ())
+        plan = campaigns.Plan(scenario, runs, folder, varied, overrides or (), draw)
         result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)))
     for table in campaign_report.tables(result):
         console().print(table)

@@ -1,7 +1,9 @@
 """Many seeds: one scenario flown many times, for every combination of varied values, on many processors.
 
 Run k of a combination has the scenario's own seed + k, so `testbed run --seed` flies any one of them again, bit for
-bit. Every run is a task by itself: its numbers can't depend on how many workers there are, or on which of them it ran.
+bit; another draw begins `DRAW` seeds further on for each. Every run is a task by itself: its numbers can't depend on
+how many workers there are, or on which of them it ran.
+
 Results come back to this process, which writes them into the campaign's folder as they finish; a campaign that was
 interrupted carries on with the runs that are missing.
 """
@@ -48,6 +50,8 @@ if TYPE_CHECKING:
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
 SETUP = "setup.json"
+DRAW = 1_000_000  # seeds from the first of one draw to the first of the next, and the most runs in one
+LARGEST_DRAW = 1_000_000_000
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
 
 
@@ -177,7 +181,8 @@ def _plain(text: str) -> Any:
 class Plan:
     """What a campaign is to fly: ``runs`` seeds for every combination of the values in ``vary``, into folder ``out``.
 
-    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs.
+    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs. Each
+    ``draw`` has seeds of its own, so that a figure can be had on seeds that nobody looked at before.
     """
 
     scenario: str | Path
@@ -185,6 +190,12 @@ class Plan:
     out: Path
     vary: Mapping[str, Sequence[str]] = field(default_factory=dict)
     overrides: Sequence[str] = ()
+    draw: int = 0
+
+    def seeds(self, scenario: Scenario) -> range:
+        """The seeds of a scenario's runs."""
+        first = scenario.seed + self.draw * DRAW
+        return range(first, first + self.runs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,15 +215,17 @@ def campaign(
     *,
     vary: Mapping[str, Sequence[str]] | None = None,
     overrides: Sequence[str] = (),
+    draw: int = 0,
     workers: int | str | None = None,
     out: str | Path | None = None,
 ) -> CampaignResult:
     """Fly ``runs`` seeds of a scenario for every combination of the values in ``vary``, and say what they show.
 
-    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs.
-    ``workers`` is the number of processes, one for each core without, or the address of a Dask scheduler. In ``out``,
-    ``runs/<scenario>_campaign`` without, there are at the end runs/, campaign.csv, campaign.json and figures; what is
-    there already of the same campaign is not flown again. How far it is, and how long it will take, is told on stderr.
+    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs. Each
+    ``draw`` has other seeds. ``workers`` is the number of processes, one for each core without, or the address of a
+    Dask scheduler. In ``out``, ``runs/<scenario>_campaign`` without, there are at the end runs/, campaign.csv,
+    campaign.json and figures; what is there already of the same campaign is not flown again. How far it is, and how
+    long it will take, is told on stderr.
 
     A run that fails is in ``failures`` and stops no other. Raises UserError when the scenario or a varied value is
     wrong, when ``out`` can't be written or holds another campaign, or when the scheduler can't be reached.
@@ -221,7 +234,7 @@ def campaign(
     from rich.console import Console
 
     with progress.shown(Console(stderr=True), str(scenario)) as tell:
-        plan = Plan(scenario, runs, folder, vary or {}, overrides)
+        plan = Plan(scenario, runs, folder, vary or {}, overrides, draw)
         return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
 
 
@@ -232,10 +245,12 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     combinations = _combinations(plan)
     if plan.runs < 1:
         raise UserError(f"--runs {plan.runs}: give at least 1")
+    if not 0 <= plan.draw <= LARGEST_DRAW:
+        raise UserError(f"--draw {plan.draw}: give a number from 0 to {LARGEST_DRAW}")
     total = len(combinations) * plan.runs
     folder = plan.out.absolute()
     _claim(folder, _setup([one.scenario for one in combinations], plan))
-    stored = _load_all(folder, combinations, plan.runs)
+    stored = _load_all(folder, combinations, plan)
     failures: list[Failure] = []
     if len(stored) < total:
         teller = _Teller(tell, total, len(stored))
@@ -282,7 +297,7 @@ def _tasks(
     """The runs that are not there yet. There may be millions: they are made as they are flown."""
     code = _code()
     for i, combination in enumerate(combinations):
-        for seed in range(combination.scenario.seed, combination.scenario.seed + plan.runs):
+        for seed in plan.seeds(combination.scenario):
             if (i, seed) not in stored:
                 yield _Task(i, seed, combination.scenario, truth, code)
 
@@ -355,7 +370,7 @@ def _store(folder: Path, outcome: Outcome) -> None:
     write_file(stem.with_suffix(".json"), json.dumps(record, indent=1).encode())
 
 
-def _load_all(folder: Path, combinations: Sequence[Combination], runs: int) -> dict[tuple[int, int], Outcome]:
+def _load_all(folder: Path, combinations: Sequence[Combination], plan: Plan) -> dict[tuple[int, int], Outcome]:
     """The outcomes that are there, of those that are wanted, by combination and seed."""
     found = {}
     for path in (folder / "runs").glob("*.json"):
@@ -363,7 +378,7 @@ def _load_all(folder: Path, combinations: Sequence[Combination], runs: int) -> d
         if named is None:
             continue
         combination, seed = int(named[1]), int(named[2])
-        if combination < len(combinations) and 0 <= seed - combinations[combination].scenario.seed < runs:
+        if combination < len(combinations) and seed in plan.seeds(combinations[combination].scenario):
             outcome = _load(folder, combination, seed)
             if outcome is not None:
                 found[combination, seed] = outcome

@@ -1,6 +1,8 @@
 """What the runs of a campaign say together: statistics, tables, figures.
 
-Median, 95th percentile and worst are over the runs of one combination of varied values. Consistency is judged by the
+Median, 95th percentile and worst are over the runs of one combination of varied values. An interval of a quantile is
+from one order statistic to another, and holds the quantile of all draws with at least 95 %, whatever the distribution
+(Conover, Practical Nonparametric Statistics, 1999, 3.2). Consistency is judged by the
 position NEES: over n independent runs of a filter whose covariance is right, the sum at one instant is chi-square with
 3 n degrees of freedom, so that the mean per degree of freedom lies between the 2.5 % and 97.5 % points of
 chi2(3 n) / (3 n) at 95 % of all instants (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
@@ -56,20 +58,26 @@ OF_FAULTS: Mapping[str, str] = {
     "error_over_3sigma": "error / claimed 3 σ",
 }
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})
+CONFIDENCE = 0.95  # of the interval of a quantile
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
     """One metric of one estimator over the runs of one combination; ``runs`` counts those that have a number for it.
 
-    ``p95`` is what 95 % of them do not exceed, or do not stay below where large is good.
+    ``p95`` is what 95 % of them do not exceed, or do not stay below where large is good. The ``_low`` and ``_high`` of
+    median and p95 are the ends of their 95 % intervals, NaN where there are too few runs for one.
     """
 
     combination: int
     estimator: str
     metric: str
     median: float
+    median_low: float
+    median_high: float
     p95: float
+    p95_low: float
+    p95_high: float
     worst: float
     worst_seed: int
     runs: int
@@ -126,8 +134,16 @@ def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> I
             values = [value for value, _ in found]
             small = metric.partition(".")[0] in BEST_LARGE
             worst, seed = (min if small else max)(found, key=lambda pair: pair[0])
-            median, p95 = (float(np.percentile(values, p)) for p in (50, 5 if small else 95))
-            yield Spread(combination, estimator, metric, median, p95, worst, seed, len(found))
+            median, p95 = _quantile(values, 0.5), _quantile(values, 0.05 if small else 0.95)
+            yield Spread(combination, estimator, metric, *median, *p95, worst, seed, len(found))
+
+
+def _quantile(values: Sequence[float], p: float) -> tuple[float, float, float]:
+    """The ``p`` quantile of some values, and the ends of its interval."""
+    from scipy.stats import quantile_test  # takes half a second to import
+
+    low, high = quantile_test(values, p=p).confidence_interval(CONFIDENCE)
+    return float(np.quantile(values, p)), float(low), float(high)
 
 
 def _consistency(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Consistency:
@@ -225,13 +241,15 @@ def texts(result: CampaignResult) -> list[Text]:
     def values(combination: int) -> list[str]:
         return list(result.combinations[combination].values.values())
 
-    errors = [["estimator", "error", *keys, "median", "95 %", "worst", "of seed", "runs"]]
+    errors = [["estimator", "error", *keys, "median", "from – to", "95 %", "from – to", "worst", "of seed", "runs"]]
     spreads = result.statistics.spreads
     for estimator, metric in dict.fromkeys((s.estimator, s.metric) for s in spreads):
         rows = [s for s in spreads if (s.estimator, s.metric) == (estimator, metric)]
         for i, s in enumerate(rows):
             names = [estimator, _called(metric)] if i == 0 else ["", ""]
-            numbers = [_number(s.median), _number(s.p95), _number(s.worst), str(s.worst_seed), str(s.runs)]
+            median = [_number(s.median), _interval(s.median_low, s.median_high)]
+            p95 = [_number(s.p95), _interval(s.p95_low, s.p95_high)]
+            numbers = [*median, *p95, _number(s.worst), str(s.worst_seed), str(s.runs)]
             errors.append([*names, *values(s.combination), *numbers])
     consistency = [["estimator", *keys, "NEES/dof", "bounds", "inside", "false alarms/h", "runs"]]
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
@@ -268,6 +286,15 @@ def tables(result: CampaignResult) -> list[Table]:
 def _called(metric: str) -> str:
     what, _, fault = metric.partition(".")
     return f"{fault}: {OF_FAULTS[what]}" if what in OF_FAULTS else QUANTITIES[metric]
+
+
+def _interval(low: float, high: float) -> str:
+    """Both ends, or the one that there is."""
+    if math.isnan(low) and math.isnan(high):
+        return ""
+    if math.isnan(low):
+        return f"≤ {_number(high)}"
+    return f"≥ {_number(low)}" if math.isnan(high) else f"{_number(low)} – {_number(high)}"
 
 
 def _number(value: float) -> str:

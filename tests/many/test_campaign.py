@@ -303,6 +303,16 @@ def test_failing_run_is_reported_and_stops_no_other(
     assert not result.failures
 
 
+def test_a_draw_has_seeds_of_its_own(at_rest: Path, threads: str, tmp_path: Path) -> None:
+    result = campaign(at_rest, 2, draw=3, workers=threads, out=tmp_path / "third")
+    assert [o.seed for o in result.outcomes] == [3_000_011, 3_000_012]
+    again = campaign(at_rest, 2, workers=threads, out=tmp_path / "third")
+    assert [o.seed for o in again.outcomes] == [11, 12]
+    for draw in (-1, 10**9 + 1):
+        with pytest.raises(UserError, match=f"--draw {draw}: give a number from 0 to"):
+            campaign(at_rest, 2, draw=draw, workers=threads, out=tmp_path / "none")
+
+
 def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Falls(Kinematic):
         def __init__(self) -> None:
@@ -562,6 +572,27 @@ def test_statistics(tmp_path: Path) -> None:
     assert coverage.p95 == pytest.approx(1 - 0.95 * 0.29)
     shown = "".join(str(cell) for cell in campaign_report.tables(made_up_campaign(tmp_path, ["0"]))[0].columns[1].cells)
     assert "jump: detected after \\[s]" in shown
+
+
+def test_intervals_of_quantiles_hold_them() -> None:
+    rng = np.random.default_rng(8)
+    draws, held = 300, {0.5: 0, 0.95: 0}
+    for _ in range(draws):
+        runs = rng.exponential(size=100)
+        for p in held:
+            at, low, high = campaign_report._quantile(runs, p)
+            assert low <= at <= high
+            held[p] += low <= -math.log(1 - p) <= high
+    assert min(held.values()) >= 0.95 * draws - 3 * math.sqrt(0.95 * 0.05 * draws)
+
+
+def test_few_runs_have_no_interval(tmp_path: Path) -> None:
+    # P(all n on one side of the median) = 2^(1 - n), above 5 % up to five runs; 0.95^n above 2.5 % up to 71
+    for runs, ends in ((5, (False, False)), (6, (True, False)), (80, (True, True))):
+        spread = made_up_campaign(tmp_path, [""], runs).statistics.spreads[0]
+        assert (math.isfinite(spread.median_high), math.isfinite(spread.p95_high)) == ends
+    table = campaign_report.texts(made_up_campaign(tmp_path, [""], 6))[0]
+    assert table.rows[1][3] == "0 – 5.00"
 
 
 def test_history_is_the_error_once_a_second() -> None:
