@@ -142,8 +142,8 @@ def _quantile(values: Sequence[float], p: float) -> tuple[float, float, float]:
     """The ``p`` quantile of some values, and the ends of its interval."""
     from scipy.stats import quantile_test  # takes half a second to import
 
-    low, high = quantile_test(values, p=p).confidence_interval(CONFIDENCE)
-    return float(np.quantile(values, p)), float(low), float(high)
+    interval: Any = quantile_test(values, p=p).confidence_interval(CONFIDENCE)
+    return float(np.quantile(values, p)), float(interval.low), float(interval.high)
 
 
 def _consistency(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Consistency:
