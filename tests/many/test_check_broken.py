@@ -15,7 +15,7 @@ from typing import Any
 import numba
 import pytest
 
-from nav import aids, alignment, earth, reference, strapdown
+from nav import aids, alignment, earth, reference, state, strapdown
 from nav.aids.base import Measurement
 from nav.detection import Never
 from nav.error_model import PHI, POS, VEL
@@ -103,7 +103,7 @@ def gravity(monkeypatch: pytest.MonkeyPatch) -> None:
     """One mg too much, in the strapdown and in the alignment."""
     wrong = (1 + MILLI) * earth.GRAVITY_EQUATOR
     step = recompiled(strapdown, "step", GRAVITY_EQUATOR=wrong)
-    monkeypatch.setattr(reference, "_propagate", recompiled(reference, "_propagate", step=step))
+    monkeypatch.setattr(reference, "propagate", recompiled(state, "propagate", step=step))
     monkeypatch.setattr(alignment, "gravity", lambda lat, h: (1 + MILLI) * earth.gravity(lat, h))
 
 

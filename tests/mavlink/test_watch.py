@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -356,11 +357,14 @@ def test_live_until_interrupted() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
+    # Tests that run in the background of a shell inherit that interrupts are ignored.
+    heed = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
     watcher = subprocess.Popen(
         [sys.executable, "-m", "testbed", "watch", f"udpin:127.0.0.1:{port}"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=heed,
     )
     try:
         assert watcher.stdout is not None
