@@ -235,30 +235,34 @@ class Text:
 
 
 def texts(result: CampaignResult) -> list[Text]:
-    """The tables of a campaign: errors, then consistency."""
+    """The tables of a campaign: errors, how sure they are, then consistency."""
     keys = list(result.combinations[0].values)
 
     def values(combination: int) -> list[str]:
         return list(result.combinations[combination].values.values())
 
-    errors = [["estimator", "error", *keys, "median", "from – to", "95 %", "from – to", "worst", "of seed", "runs"]]
+    errors = [["estimator", "error", *keys, "median", "95 %", "worst", "of seed", "runs"]]
+    intervals = [["estimator", "error", *keys, "median", "95 %"]]
     spreads = result.statistics.spreads
     for estimator, metric in dict.fromkeys((s.estimator, s.metric) for s in spreads):
         rows = [s for s in spreads if (s.estimator, s.metric) == (estimator, metric)]
         for i, s in enumerate(rows):
             names = [estimator, _called(metric)] if i == 0 else ["", ""]
-            median = [_number(s.median), _interval(s.median_low, s.median_high)]
-            p95 = [_number(s.p95), _interval(s.p95_low, s.p95_high)]
-            numbers = [*median, *p95, _number(s.worst), str(s.worst_seed), str(s.runs)]
+            numbers = [_number(s.median), _number(s.p95), _number(s.worst), str(s.worst_seed), str(s.runs)]
             errors.append([*names, *values(s.combination), *numbers])
+            ends = [_interval(s.median_low, s.median_high), _interval(s.p95_low, s.p95_high)]
+            intervals.append([*names, *values(s.combination), *ends])
     consistency = [["estimator", *keys, "NEES/dof", "bounds", "inside", "false alarms/h", "runs"]]
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
     for c in sorted(result.statistics.consistency, key=lambda c: estimators.index(c.estimator)):
         bounds = f"{c.lower:.2f} – {c.upper:.2f}"
         numbers = [f"{c.nees:.2f}", bounds, f"{100 * c.inside:.0f} %", _number(c.false_alarms_per_h), str(c.runs)]
         consistency.append([c.estimator, *values(c.combination), *numbers])
+    enough = any(math.isfinite(s.median_low) for s in spreads)
+    sure = Text("95 % confidence intervals of median and 95th percentile", intervals, 2 + len(keys))
     return [
         Text("Errors over the runs", errors, 2 + len(keys)),
+        *([sure] if enough else []),
         Text("Consistency over the runs", consistency, 1 + len(keys)),
     ]
 
@@ -291,7 +295,7 @@ def _called(metric: str) -> str:
 def _interval(low: float, high: float) -> str:
     """Both ends, or the one that there is."""
     if math.isnan(low) and math.isnan(high):
-        return ""
+        return "too few runs"
     if math.isnan(low):
         return f"≤ {_number(high)}"
     return f"≥ {_number(low)}" if math.isnan(high) else f"{_number(low)} – {_number(high)}"

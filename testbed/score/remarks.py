@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import chdtri  # as scipy.stats, which takes half a second to import
 
 from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
@@ -55,8 +56,6 @@ def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[
 
 def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[str]:
     """From `SETTLING_S` after alignment on, but not while a fault lasts, nor `RECOVERY_WINDOW_S` after it."""
-    from scipy.stats import chi2
-
     faulty = [detection.fault_window(one) for one in detection.faults(dataset)]
     for name in accuracy.names(dataset):
         start = metrics.get(f"{name}.aligned_s", np.inf) + accuracy.SETTLING_S
@@ -66,7 +65,7 @@ def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> It
             degrees = len(nis) * looks.components
             if not degrees:
                 continue
-            mean, bound = float(nis.sum()) / degrees, float(chi2.ppf(CONFIDENCE, degrees)) / degrees
+            mean, bound = float(nis.sum()) / degrees, float(chdtri(degrees, 1.0 - CONFIDENCE)) / degrees
             if mean > max(FAR, bound):
                 yield (
                     f"{name} is too sure of {aid}: the mean NIS is {mean:.3g} per degree of freedom, where up to "

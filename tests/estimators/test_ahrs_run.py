@@ -35,7 +35,7 @@ from testbed.report import page as report
 from testbed.report.figures import consistency, flight
 from testbed.report.figures import errors as errors_figures
 from testbed.report.run import Run
-from testbed.score import accuracy, metrics
+from testbed.score import accuracy, detection, metrics
 
 INS = '{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed"]}'
 AHRS = '{name="ahrs", kind="ahrs", aids=["airspeed", "magnetometer", "barometer"]}'
@@ -203,7 +203,7 @@ def test_a_sample_that_is_refused_is_recorded(tmp_path: Path) -> None:
     assert own["airspeed"]["reason"].values.tolist() == ["not finite"]
     assert own["airspeed"]["weight"].values.tolist() == [0.0]
     dataset = recorder.dataset()
-    assert metrics._innovations(dataset, "ahrs", "airspeed", 0.0) == {}  # the gate has judged nothing
+    assert detection.innovation_scores(dataset, "ahrs", "airspeed", 0.0) == {}  # the gate has judged nothing
 
 
 # --- what is shown

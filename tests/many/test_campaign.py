@@ -591,8 +591,8 @@ def test_few_runs_have_no_interval(tmp_path: Path) -> None:
     for runs, ends in ((5, (False, False)), (6, (True, False)), (80, (True, True))):
         spread = made_up_campaign(tmp_path, [""], runs).statistics.spreads[0]
         assert (math.isfinite(spread.median_high), math.isfinite(spread.p95_high)) == ends
-    table = campaign_report.texts(made_up_campaign(tmp_path, [""], 6))[0]
-    assert table.rows[1][3] == "0 – 5.00"
+    intervals = campaign_report.texts(made_up_campaign(tmp_path, [""], 6))[1]
+    assert intervals.rows[1][2:] == ["0 – 5.00", "≥ 3.00"]
 
 
 def test_history_is_the_error_once_a_second() -> None:

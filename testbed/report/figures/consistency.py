@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtr, chdtri  # as scipy.stats, which takes half a second to import
 
 from nav.samples import Array, Outcome
 from testbed.report.figures.errors import LOG_LINE, SMOOTH_S, moving_rms
@@ -53,7 +53,7 @@ def consistency(run: Run) -> Figure | None:
         return None
     quantities = ("position", "velocity", "attitude") if run.positioned else ("attitude",)
     drawn = sheet(len(quantities), height=2.0, margins=(LEFT, 1.0))
-    low, high = (float(chi2.ppf(p, 3)) / 3 for p in (0.025, 0.975))
+    low, high = (float(chdtri(3, 1 - p)) / 3 for p in (0.025, 0.975))
     for ax, what in zip(drawn.axes[:, 0], quantities, strict=True):
         shown = run.aligned if what == "attitude" else run.positioned
         values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in shown.items()}
@@ -256,7 +256,7 @@ OF_ALL = (
     Plot(
         "ellipses",
         f"Horizontal error at chosen times. Cross: the error; ellipse: {SIGMAS:.0f} sigma as claimed, which holds"
-        f" {float(chi2.cdf(SIGMAS**2, 2)):.1%} of the errors of a consistent filter. What is far larger than the"
+        f" {float(chdtr(2, SIGMAS**2)):.1%} of the errors of a consistent filter. What is far larger than the"
         " smallest reaches beyond the axes; how far is written in the corner.",
         ellipses,
         timed=False,
