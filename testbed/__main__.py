@@ -204,7 +204,9 @@ def campaign(
         list[str] | None, typer.Option(metavar="KEY=A,B,C", help="Repeat for each of these values; repeatable.")
     ] = None,
     overrides: Overrides = None,
-    draw: Annotated[int, typer.Option(metavar="N", min=0, help="Other seeds for each number.")] = 0,
+    draw: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Seeds that no other draw has: 0, the scenario's, or 1, 2, ...")
+    ] = 0,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="An existing Dask cluster.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
 ) -> None:
@@ -214,7 +216,7 @@ def campaign(
     from testbed.report import campaign as campaign_report
 
     varied = parse_vary(vary or [])
-    folder = out or RUNS / f"{Path(scenario).stem}_campaign"
+    folder = out or campaigns.usual_folder(scenario, draw)
     require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
     with (
         output_folder(folder),

@@ -144,8 +144,10 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
         # those that wait for the record again and again, and all that was there before.
         gc.freeze()
         ending.callback(gc.unfreeze)
-        ending.callback(gc.set_threshold, *gc.get_threshold())
-        gc.set_threshold(COLLECT_AFTER)
+        thresholds = gc.get_threshold()
+        if 0 < thresholds[0] < COLLECT_AFTER:
+            ending.callback(gc.set_threshold, *thresholds)
+            gc.set_threshold(COLLECT_AFTER)
         while passage.tick < passage.ticks and director.ready(passage.tick) and passage.advance():
             pass
         remarks = passage.conclude()

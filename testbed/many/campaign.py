@@ -223,19 +223,24 @@ def campaign(
 
     ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs. Each
     ``draw`` has other seeds. ``workers`` is the number of processes, one for each core without, or the address of a
-    Dask scheduler. In ``out``, ``runs/<scenario>_campaign`` without, there are at the end runs/, campaign.csv,
-    campaign.json and figures; what is there already of the same campaign is not flown again. How far it is, and how
-    long it will take, is told on stderr.
+    Dask scheduler. In ``out``, `usual_folder` without, there are at the end runs/, campaign.csv, campaign.json and
+    figures; what is there already of the same campaign is not flown again. How far it is, and how long it will take,
+    is told on stderr.
 
     A run that fails is in ``failures`` and stops no other. Raises UserError when the scenario or a varied value is
     wrong, when ``out`` can't be written or holds another campaign, or when the scheduler can't be reached.
     """
-    folder = Path("runs", f"{Path(scenario).stem}_campaign") if out is None else Path(out)
+    folder = usual_folder(scenario, draw) if out is None else Path(out)
     from rich.console import Console
 
     with progress.shown(Console(stderr=True), str(scenario)) as tell:
         plan = Plan(scenario, runs, folder, vary or {}, overrides, draw)
         return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
+
+
+def usual_folder(scenario: str | Path, draw: int) -> Path:
+    """Where a campaign goes unless told otherwise: ``runs/<scenario>_campaign``, with the draw behind it if not 0."""
+    return Path("runs", f"{Path(scenario).stem}_campaign{f'_draw{draw}' if draw else ''}")
 
 
 def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress], None] | None = None) -> CampaignResult:
@@ -247,6 +252,8 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
         raise UserError(f"--runs {plan.runs}: give at least 1")
     if not 0 <= plan.draw <= LARGEST_DRAW:
         raise UserError(f"--draw {plan.draw}: give a number from 0 to {LARGEST_DRAW}")
+    if plan.draw and plan.runs > DRAW:
+        raise UserError(f"--runs {plan.runs}: a draw has {DRAW} seeds")
     total = len(combinations) * plan.runs
     folder = plan.out.absolute()
     _claim(folder, _setup([one.scenario for one in combinations], plan))

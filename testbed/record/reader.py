@@ -121,7 +121,8 @@ def _read_column(dataset: h5py.Dataset, rows: int, places: Mapping[int, str]) ->
         for name in ("units", "long_name", "flag_values", "flag_masks", "flag_meanings")
         if name in dataset.attrs
     }
-    dims = tuple(places[h5o.get_info(dataset.dims[k][0].id).addr] for k in range(1, dataset.ndim))
+    scales = [dataset.dims[k][0] for k in range(1, dataset.ndim)]
+    dims = tuple(places.get(h5o.get_info(scale.id).addr) or Path(scale.name).name for scale in scales)
     values = dataset[:rows]
     if values.dtype.kind == "S":
         values = values.view(f"S{values.shape[1]}")[:, 0]

@@ -32,7 +32,8 @@ from testbed.score.accuracy import column
 if TYPE_CHECKING:
     import xarray
 
-LATE = 1.25  # times what a leg takes in still air: less is ordinary wind
+LATE = 1.25  # times what a leg takes in still air, and more where ordinary wind asks for it
+ORDINARY = 0.5  # wind over airspeed that a plan must reckon with
 SETTLED_S = 15.0  # and so long on top, for getting onto its path
 TURNED_S, FARTHER_M = 60.0, 50.0  # after which a leg to a place should come nearer to it, not farther
 
@@ -40,8 +41,8 @@ TURNED_S, FARTHER_M = 60.0, 50.0  # after which a leg to a place should come nea
 def unfinished_leg(dataset: xarray.DataTree) -> list[str]:
     """A sentence when a run ended in a leg that should have been over by then, or led away from its place; or none.
 
-    Over: after `LATE` times what its path takes at its airspeed in still air, and `SETTLED_S`. Away: `FARTHER_M` and
-    more, when `TURNED_S` have passed.
+    Over: after `LATE` times what its path takes at its airspeed in still air, and `SETTLED_S`; against an ordinary wind
+    after what it takes there. Away: `FARTHER_M` and more, when `TURNED_S` have passed.
     """
     try:
         scenario = scenario_of(dataset)
@@ -59,7 +60,9 @@ def unfinished_leg(dataset: xarray.DataTree) -> list[str]:
     if took > TURNED_S and last > first + FARTHER_M:
         return [f"{said}: it was {first / 1000:.3g} km away at first, and {last / 1000:.3g} km after {took:.0f} s"]
     due = _seconds(leg, dataset, rows[0], airspeed)
-    if took > LATE * due + SETTLED_S:
+    share = float(np.linalg.norm(column(dataset, "truth/wind_n")[rows[0], :2])) / airspeed
+    late = max(LATE, 1.05 / (1.0 - share)) if share <= ORDINARY else LATE
+    if took > late * due + SETTLED_S:
         return [f"{said}: after {took:.0f} s, where still air would ask for {due:.0f} s"]
     return []
 

@@ -11,12 +11,12 @@ misleads nobody.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.special import chdtri  # as scipy.stats, which takes half a second to import
 
+from nav.detection import chi_square_threshold
 from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
 from testbed.score.plan import unfinished_leg
@@ -25,39 +25,54 @@ if TYPE_CHECKING:
     import xarray
 
 CONFIDENCE = 0.999  # of the bound
+WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
 
 
 def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]:
     """A sentence for each thing that the reader of a record should know first; ``metrics`` are its own."""
+    astray = dict(_astray(dataset, metrics))
+    trusted = [name for name in accuracy.names(dataset) if name not in astray]
     return [
         *scores.unscored(dataset),
         *unfinished_leg(dataset),
-        *_astray(dataset, metrics),
-        *_overconfident(dataset, metrics),
+        *astray.values(),
+        *_overconfident(dataset, metrics, trusted),
     ]
 
 
-def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[str]:
+def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[tuple[str, str]]:
+    """Who was led astray, and the sentence: by the faults about the worst moment, if it was never half as bad before.
+
+    What an estimator claimed too much all the time is not a fault's doing.
+    """
     faults = detection.faults(dataset)
     for name in accuracy.names(dataset):
         during = [one for one in faults if metrics.get(f"{name}.error_over_3sigma.{one.name}", 0.0) > 1.0]
         if not during:
             continue
         e = accuracy.errors(dataset, name)
-        rows = np.flatnonzero(e.valid & accuracy.inside(e.t, [detection.fault_window(one) for one in during]))
-        worst = rows[np.nanargmax(e.over_3sigma[rows])]
-        error = e.horizontal[worst]
+        known = e.valid & np.isfinite(e.over_3sigma)
+        rows = np.flatnonzero(known & accuracy.inside(e.t, [detection.fault_window(one) for one in during]))
+        if not len(rows):
+            continue
+        worst = rows[np.argmax(e.over_3sigma[rows])]
+        before = known & (e.t < min(one.start for one in during))
+        if WORSE * e.over_3sigma[before].max(initial=0.0) >= e.over_3sigma[worst]:
+            continue
+        t, error = e.t[worst], e.horizontal[worst]
+        about = ", ".join(one.name for one in during if accuracy.inside(e.t, [detection.fault_window(one)])[worst])
         yield (
-            f"{name} was led astray and doesn't know it: with {', '.join(one.name for one in during)} its position was "
-            f"{error:.3g} m wrong at {e.t[worst]:.0f} s, where it claims {error / e.over_3sigma[worst]:.3g} m (3 σ)"
+            name,
+            f"{name} was led astray and doesn't know it: with {about} its position was {error:.3g} m wrong at {t:.0f} "
+            f"s, where it claims {error / e.over_3sigma[worst]:.3g} m (3 σ)",
         )
 
 
-def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[str]:
+def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float], names: Sequence[str]) -> Iterator[str]:
     """From `SETTLING_S` after alignment on, but not while a fault lasts, nor `RECOVERY_WINDOW_S` after it."""
     faulty = [detection.fault_window(one) for one in detection.faults(dataset)]
-    for name in accuracy.names(dataset):
+    for name in names:
         start = metrics.get(f"{name}.aligned_s", np.inf) + accuracy.SETTLING_S
         for aid in accuracy.aids(dataset, name):
             looks = detection.judged(dataset, name, aid)
@@ -65,7 +80,7 @@ def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> It
             degrees = len(nis) * looks.components
             if not degrees:
                 continue
-            mean, bound = float(nis.sum()) / degrees, float(chdtri(degrees, 1.0 - CONFIDENCE)) / degrees
+            mean, bound = float(nis.sum()) / degrees, chi_square_threshold(1.0 - CONFIDENCE, degrees) / degrees
             if mean > max(FAR, bound):
                 yield (
                     f"{name} is too sure of {aid}: the mean NIS is {mean:.3g} per degree of freedom, where up to "

@@ -40,6 +40,11 @@ def test_a_leg_that_should_have_been_over_is_told(wind_mps: float, legs: list[st
     assert remark.startswith(f"leg 1/1 {said}")
 
 
+@pytest.mark.ci
+def test_a_long_leg_against_ordinary_wind_is_not_late() -> None:
+    assert told(8.0, 278.0, STRAIGHT % 5000) == []  # over after 294 s
+
+
 @pytest.mark.parametrize(
     ("wind_mps", "legs"),
     [

@@ -16,10 +16,10 @@ from testbed.score.remarks import remarks
 from testbed.sensors.faults import FaultTruth
 
 
-def flown(honest: float = 1.0) -> Any:
+def flown(honest: float = 1.0, window: tuple[float, float] = (100.0, 120.0)) -> Any:
     """A made-up run of 200 s with one fault and two estimators: one claims what is so, the other a part of it."""
     recorder = Recorder(None, scenario(200.0), 1)
-    recorder.faults([FaultTruth("jump", "gnss", "x", "step", 100.0, 120.0, 3.0, "m")])
+    recorder.faults([FaultTruth("jump", "gnss", "x", "step", *window, 3.0, "m")])
     estimators = {"ins": Errors(aligned_after=0.0), "other": Errors(aligned_after=0.0, truth_over_claim=honest)}
     synthetic_run.record(recorder, circle(200.0), estimators)
     recorder.close()
@@ -41,7 +41,9 @@ def test_an_honest_estimator_is_not_doubted() -> None:
 
 
 def test_who_is_led_astray_is_named() -> None:
-    run = flown(6.0)
+    run = flown()
+    own = run["estimators/other"]
+    own["lat"].values[(own["time"].values >= 100.0) & (own["time"].values < 130.0)] += 40.0 / 6.37e6
     found = metrics.compute(run)
     e = accuracy.errors(run, "other")
     rows = (e.t >= 100.0) & (e.t < 130.0)
@@ -54,6 +56,26 @@ def test_who_is_led_astray_is_named() -> None:
         f"other was led astray and doesn't know it: with jump its position was {e.horizontal[worst]:.3g} m wrong at "
         f"{e.t[worst]:.0f} s, where it claims {3 * np.hypot(*e.sigma_position[worst, :2]):.3g} m (3 σ)"
     ]
+
+
+def test_what_was_as_bad_before_a_fault_is_not_its_doing() -> None:
+    run = flown(6.0)
+    found = metrics.compute(run)
+    assert found["other.error_over_3sigma.jump"] > 1.0
+    before = accuracy.errors(run, "other")
+    assert (
+        np.nanmax(before.over_3sigma[before.valid & (before.t < 100.0)]) > 0.6 * found["other.error_over_3sigma.jump"]
+    )
+    assert doubts(run, found) == []
+
+
+def test_metrics_of_another_settling_time_are_no_error() -> None:
+    run = flown(window=(10.0, 20.0))
+    own = run["estimators/other"]
+    own["lat"].values[own["time"].values < 59.0] += 40.0 / 6.37e6
+    found = metrics.compute(run, settling_s=5.0)
+    assert found["other.error_over_3sigma.jump"] > 1.0
+    assert all("astray" not in told for told in doubts(run, found))
 
 
 def test_innovations_far_too_large_are_told_but_not_those_of_a_fault() -> None:

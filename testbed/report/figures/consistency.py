@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import chdtr, chdtri  # as scipy.stats, which takes half a second to import
+from scipy.special import chdtr  # as scipy.stats, which takes half a second to import
 
+from nav.detection import chi_square_threshold
 from nav.samples import Array, Outcome
 from testbed.report.figures.errors import LOG_LINE, SMOOTH_S, moving_rms
 from testbed.report.figures.plot import Plot
@@ -53,7 +54,7 @@ def consistency(run: Run) -> Figure | None:
         return None
     quantities = ("position", "velocity", "attitude") if run.positioned else ("attitude",)
     drawn = sheet(len(quantities), height=2.0, margins=(LEFT, 1.0))
-    low, high = (float(chdtri(3, 1 - p)) / 3 for p in (0.025, 0.975))
+    low, high = (chi_square_threshold(1 - p, 3) / 3 for p in (0.025, 0.975))
     for ax, what in zip(drawn.axes[:, 0], quantities, strict=True):
         shown = run.aligned if what == "attitude" else run.positioned
         values = {name: np.where(e.valid, getattr(e, f"{what}_nees"), np.nan) for name, e in shown.items()}
