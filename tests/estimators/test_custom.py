@@ -208,6 +208,7 @@ def test_complementary() -> None:
     assert "own.attitude_nees_mean" not in result.metrics
 
 
+@pytest.mark.ci
 def test_published() -> None:
     pytest.importorskip("vqf")
     result, _ = example("published.py", "Published", estimates="attitude")

@@ -203,6 +203,7 @@ def test_an_estimate_that_is_no_number_ends_the_run(monkeypatch: pytest.MonkeyPa
     assert "flight.bank_max_deg" in result.metrics
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("lasting", "survives"), [(0.7, True), (3.0, False)])
 def test_gyros_may_be_silent_for_a_moment(lasting: float, survives: bool) -> None:
     fault = f"fault=[{{sensor='imu',kind='dropout',window=[15,{15 + lasting}]}}]"

@@ -35,6 +35,7 @@ def test_live_and_batch_give_the_same_bits() -> None:
     assert not same(batch.dataset, run(scenario, seed=4).dataset)
 
 
+@pytest.mark.ci
 def test_a_known_mounting_is_undone_and_truth_is_taken_at_the_imu() -> None:
     quiet = ["sensors.imu.grade=perfect", "sensors.gnss.grade=rtk", "estimator[0].aids=['gnss']", "duration_s=100"]
     mounted = ["sensors.imu.mounting_deg=[20,-40,135]", "sensors.imu.lever_arm_m=[2,-1,0.5]"]
@@ -53,6 +54,7 @@ def in_one_chunk() -> RunResult:
     return run(LATE)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("batch_s", [0.065, 0.25, 7.0])
 def test_result_does_not_depend_on_the_chunk(
     in_one_chunk: RunResult, monkeypatch: pytest.MonkeyPatch, batch_s: float
@@ -140,6 +142,7 @@ def test_a_plan_that_ends_before_the_run_is_an_event(denied: list[list[float]], 
     assert result.dataset["events"]["severity"].values[-1] == severity
 
 
+@pytest.mark.ci
 def test_links_show_the_estimator_that_was_asked_for() -> None:
     class Naming(Watcher):
         def publish(self, truth, estimate, samples, imu, others, reports):  # type: ignore[no-untyped-def]
@@ -281,6 +284,7 @@ window = [90, 90.05]
     assert not [key for key in healthy.metrics if "detection" in key or "missed" in key]
 
 
+@pytest.mark.ci
 def test_a_faulty_run_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPatch) -> None:
     text = shipped()["u_turn"].read_text() + "".join(
         f'[[fault]]\nsensor = "{sensor}"\nkind = "{kind}"\nwindow = [20, 30]\n{rest}\n'
@@ -298,6 +302,7 @@ def test_a_faulty_run_does_not_depend_on_the_chunk(monkeypatch: pytest.MonkeyPat
     assert same(reference.dataset, run(scenario).dataset)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("broken", "refused"),
     [
@@ -314,6 +319,7 @@ def test_nonsense_is_refused_and_the_run_goes_on(broken: str, refused: str) -> N
     assert innovations is None or (innovations["weight"].values == 0).any()
 
 
+@pytest.mark.ci
 def test_an_unsound_sample_of_every_sensor_is_reported_and_not_fused(monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = Scenario.load("u_turn", ["duration_s=75", "sensors.gnss.denied=[]"])
     original = sensors.build

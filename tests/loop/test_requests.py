@@ -263,6 +263,7 @@ def test_a_setting_goes_back_and_leaves_failures_alone() -> None:
     assert data["requests/kind"].values.tolist() == ["change", "inject", "change", "change"], "nothing to clear"
 
 
+@pytest.mark.ci
 def test_a_silent_receiver_and_its_return_are_told_within_a_second() -> None:
     short = scenario(12)
     station = Station([*at(4.0, injection(short, "gnss", "off")), *at(8.0, injection(short, "gnss", "ok"))])
@@ -424,6 +425,7 @@ def test_a_paused_run_stands_still_goes_on_by_steps_and_loses_no_bit() -> None:
     assert station.when[-1] - station.when[40] > 0.3, "3.5 s at ten times the clock: the pause is not made good"
 
 
+@pytest.mark.ci
 def test_a_pause_ends_by_resume_and_by_end() -> None:
     short = scenario(6)
     for last, finished in ((Resume(), True), (End(), False)):
@@ -469,6 +471,7 @@ def test_faster_is_meant_of_the_speed_in_force_and_ends_where_speeds_do() -> Non
     assert speeds == [6.0, 8.0, 4.0, 1000.0, 0.01]
 
 
+@pytest.mark.ci
 def test_a_run_as_fast_as_it_can_is_slowed_down_on_request() -> None:
     short = scenario(9)
     station = Station([(4.0, Speed(8.0))])
@@ -508,6 +511,7 @@ def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
     assert told == ["500 times the wall clock", "begins anew"]
 
 
+@pytest.mark.ci
 def test_what_is_asked_with_a_restart_is_asked_of_the_run_that_begins() -> None:
     short = scenario(6)
     asked: list[Request] = [Restart(), Change("SIM_GPS1_JAM", 1.0)]

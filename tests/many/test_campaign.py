@@ -303,6 +303,7 @@ def test_failing_run_is_reported_and_stops_no_other(
     assert not result.failures
 
 
+@pytest.mark.ci
 def test_a_draw_has_seeds_of_its_own(at_rest: Path, threads: str, tmp_path: Path) -> None:
     result = campaign(at_rest, 2, draw=3, workers=threads, out=tmp_path / "third")
     assert [o.seed for o in result.outcomes] == [3_000_011, 3_000_012]
@@ -451,6 +452,7 @@ def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
 # --- what a user may get wrong
 
 
+@pytest.mark.ci
 def test_folder_of_another_campaign(at_rest: Path, tmp_path: Path, threads: str) -> None:
     out = tmp_path / "out"
     campaign(at_rest, 1, workers=threads, out=out)
@@ -574,6 +576,7 @@ def test_statistics(tmp_path: Path) -> None:
     assert "jump: detected after \\[s]" in shown
 
 
+@pytest.mark.ci
 def test_intervals_of_quantiles_hold_them() -> None:
     rng = np.random.default_rng(8)
     draws, held = 300, {0.5: 0, 0.95: 0}
@@ -608,6 +611,7 @@ def test_history_is_the_error_once_a_second() -> None:
     assert history["ins.sigma"][77] == pytest.approx(math.sqrt(2.0))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("values", [[""], ["0", "5"], ["0", "1", "2", "3", "4", "5", "6"]])
 def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
     result = made_up_campaign(tmp_path, values, runs=5)

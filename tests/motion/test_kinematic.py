@@ -51,6 +51,7 @@ def test_agrees_with_increments_formed_from_its_rows(where):
     assert np.abs(dv - block.dv).max() < 1e-12
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("where", PLACES)
 def test_error_free_strapdown_stays_for_ten_minutes(where):
     block = Kinematic(place(*where), 200).advance(120_001)
@@ -186,6 +187,7 @@ def error_free_strapdown_follows(block: TruthBlock, rate_hz: float) -> None:
     assert worst[2] < 1e-5
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", MOTIONS)
 def test_error_free_strapdown_follows(name: str) -> None:
     error_free_strapdown_follows(rows(name), 200)
@@ -199,6 +201,7 @@ def test_error_free_strapdown_follows_for_an_hour(name: str, rate_hz: float) -> 
     error_free_strapdown_follows(source(truth, f"speed_mps = {speed}", rate_hz).advance(round(3600 * rate_hz)), rate_hz)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("name", MOTIONS)
 def test_position_is_the_integral_of_velocity(name: str) -> None:
     block = rows(name)

@@ -471,6 +471,7 @@ def weights_of(reports, after):
     return found
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("ratios", "options", "expected"),
     [

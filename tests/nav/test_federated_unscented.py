@@ -61,6 +61,7 @@ def test_small_errors_give_the_linear_federation(structure):
             assert ratio < 5e-3
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("structure", ["no_reset", "partial"])
 @pytest.mark.parametrize(("period_s", "most"), [(0.0, 1e-6), (1.0, 0.01), (5.0, 0.03)])
 def test_one_filter_is_the_closed_ins_however_wrong_the_heading(structure, period_s, most):

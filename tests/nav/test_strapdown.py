@@ -55,6 +55,7 @@ def imu_at(stride, dtheta, dv):
     return ImuSamples(np.cumsum(dt), dt, dtheta, dv)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("place", PLACES)
 def test_ten_minutes_of_manoeuvres(place):
     rows = manoeuvres(600, *PLACES[place])

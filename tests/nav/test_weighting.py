@@ -22,6 +22,7 @@ from nav.weighting import (
 LIMIT2 = chi2.ppf(0.99, 2)
 
 
+@pytest.mark.ci
 def test_inflation_finds_the_root():
     """Two axes, H P H' and R of like size, lambda up to 5000."""
     rng = np.random.default_rng(1)

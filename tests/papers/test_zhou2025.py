@@ -139,6 +139,7 @@ def replays(results: list[Any], name: str) -> list[dict[str, Any]]:
     return [r for r in results if r.get("detector") == name and r["rate"] == zhou2025.MAIN_RATE]
 
 
+@pytest.mark.ci
 def test_claims_hold_and_fail_as_the_figures_do(tmp_path: Path) -> None:
     assert not missed(made_up())
     PAPER.draw(made_up(), tmp_path)

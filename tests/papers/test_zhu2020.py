@@ -159,6 +159,7 @@ def test_claims_can_be_missed(run: str, estimator: str, worse: Flown, quantity: 
     assert quantity in missed(found)
 
 
+@pytest.mark.ci
 def test_the_figure_is_drawn(tmp_path: Path) -> None:
     zhu2020.draw(results(), tmp_path)
     assert (tmp_path / "zhu2020.png").stat().st_size > 20_000

@@ -46,6 +46,7 @@ def test_each_component_has_its_own_unit(run_file: Path, tmp_path: Path) -> None
     assert {"commands.bank [rad]", "commands.altitude [m]", "commands.airspeed [m/s]"} <= set(truth.columns)
 
 
+@pytest.mark.ci
 def test_an_export_replaces_an_earlier_one_but_nothing_else(run_file: Path, tmp_path: Path) -> None:
     record = tmp_path / "run.nc"
     shutil.copy(run_file, record)

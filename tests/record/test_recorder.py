@@ -376,6 +376,7 @@ def test_many_killed_writers_leave_readable_records(tmp_path: Path) -> None:
         kill_and_read(tmp_path, k, draw.uniform(0.0, 1.5))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("step", range(0, 40, 5))
 def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int) -> None:
     """The process ends at its n-th write of a flush, wherever in the order of columns and groups that is."""

@@ -170,6 +170,7 @@ def test_refused_innovations_have_the_colour_of_their_outcome() -> None:
     assert "out of range" not in told
 
 
+@pytest.mark.ci
 def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
     run = synthetic_run.dataset(300.0)
     clean = imu._imu_error(Run(run), "ins")

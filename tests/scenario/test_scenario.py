@@ -237,6 +237,7 @@ def toml(value: Any) -> str:
     return str(value)
 
 
+@pytest.mark.ci
 @given(st.lists(st.dictionaries(st.sampled_from(["a", "b.c", '"d e"', "f"]), values, max_size=4), max_size=4))
 def test_line_numbers_cover_exactly_what_the_parser_finds(tables: list[dict[str, Any]]) -> None:
     text = "".join("[[t]]\n" + "".join(f"{k} = {toml(v)}\n" for k, v in table.items()) for table in tables)

@@ -366,6 +366,7 @@ def test_axes_left_out_of_a_sample_that_is_used_are_an_alarm() -> None:
     assert found["ins.nis_mean.gnss_position"] < 1.5  # what was isolated is in no mean
 
 
+@pytest.mark.ci
 def test_the_wrong_sensor_is_no_isolation() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0))
     refuse(run, "gnss_position", 110.0, 120.0)
@@ -428,6 +429,7 @@ def recovering(path: Path, bad_until: float, relapse: float | None = None) -> di
     return metrics.compute(recorder.dataset())
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("bad_until", "relapse", "expected"),
     [(95.0, None, 0.0), (107.0, None, 7.0), (107.0, 120.0, 21.0), (107.0, 170.0, 7.0)],
@@ -487,6 +489,7 @@ def test_a_receiver_that_falls_silent_has_no_fix() -> None:
     assert receivers({"left": lambda t: True}) == []
 
 
+@pytest.mark.ci
 def test_no_outage_no_outage_keys() -> None:
     for gnss in (True, False):
         found = metrics.compute(synthetic_run.dataset(100.0, gnss=gnss))
@@ -553,6 +556,7 @@ def shortened(run: Any, t: float, without: str) -> xarray.DataTree:
     return xarray.DataTree.from_dict(groups)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("t", [0.0, 0.1, 1.0, 3.0, 70.0])
 @pytest.mark.parametrize("without", ["/nothing", "/sensors", "/sensors/gnss", "/estimators", "/estimators/ins/inn"])
 def test_a_record_cut_anywhere_is_scored(flown: Any, t: float, without: str) -> None:

@@ -75,6 +75,7 @@ def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tm
 RIVER = [*overridden('{name="ins",aids=["dvl","ast","barometer"],' + KNOWN + "}"), "duration_s=100"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "silent",
     [

@@ -45,6 +45,7 @@ def test_a_long_leg_against_ordinary_wind_is_not_late() -> None:
     assert told(8.0, 278.0, STRAIGHT % 5000) == []  # over after 294 s
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("wind_mps", "legs"),
     [

@@ -33,6 +33,7 @@ def doubts(run: Any, found: dict[str, float]) -> list[str]:
     return others
 
 
+@pytest.mark.ci
 def test_an_honest_estimator_is_not_doubted() -> None:
     run = flown()
     found = metrics.compute(run)
@@ -58,6 +59,7 @@ def test_who_is_led_astray_is_named() -> None:
     ]
 
 
+@pytest.mark.ci
 def test_what_was_as_bad_before_a_fault_is_not_its_doing() -> None:
     run = flown(6.0)
     found = metrics.compute(run)
@@ -69,6 +71,7 @@ def test_what_was_as_bad_before_a_fault_is_not_its_doing() -> None:
     assert doubts(run, found) == []
 
 
+@pytest.mark.ci
 def test_metrics_of_another_settling_time_are_no_error() -> None:
     run = flown(window=(10.0, 20.0))
     own = run["estimators/other"]
@@ -78,6 +81,7 @@ def test_metrics_of_another_settling_time_are_no_error() -> None:
     assert all("astray" not in told for told in doubts(run, found))
 
 
+@pytest.mark.ci
 def test_innovations_far_too_large_are_told_but_not_those_of_a_fault() -> None:
     run = flown()
     nis = run["estimators/ins/innovations/barometer"]["nis"].values
@@ -94,6 +98,7 @@ def test_innovations_far_too_large_are_told_but_not_those_of_a_fault() -> None:
     )
 
 
+@pytest.mark.ci
 def test_a_few_large_innovations_tell_nothing() -> None:
     """The mean of 4 samples is above 1.5 once in 6 times."""
     run = flown()
