@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from worlds.innovations import cases, root, theta
+from worlds.innovations import cases, root, theta, two_axes
 
 from nav.detection import ChiSquare, Eraim
 from nav.weighting import (
@@ -25,14 +25,8 @@ LIMIT2 = chi2.ppf(0.99, 2)
 @pytest.mark.ci
 def test_inflation_finds_the_root():
     """Two axes, H P H' and R of like size, lambda up to 5000."""
-    rng = np.random.default_rng(1)
     taken = []
-    while len(taken) < 3000:
-        R = rng.uniform(0.1, 10, 2)
-        half = rng.normal(size=(2, 2))
-        HPH, nu = half @ half.T, rng.normal(size=2) * 10 ** rng.uniform(0, 2)
-        if not LIMIT2 < theta(nu, HPH, R, 1.0) < 2000 * LIMIT2:
-            continue
+    for nu, HPH, R in two_axes(3000, LIMIT2):
         lam, iterations = inflation(nu, HPH, R, LIMIT2)
         taken.append(iterations)
         exact = root(nu, HPH, R, LIMIT2)

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from worlds.ahrs import PAPER, fly, level_figures
 from worlds.covariances import lost_position
-from worlds.innovations import alarm_share, cases, positive, root, theta, within_binomial
+from worlds.innovations import alarm_share, cases, positive, root, theta, two_axes, within_binomial
 
 from nav.detection import ChiSquare, Event, Recursive, Reset, Sprt, exponential, plain
 from nav.error_model import POS
@@ -167,14 +167,8 @@ def test_inflation_with_its_fraction_upside_down():
 
 @pytest.mark.ci
 def test_inflation_with_its_fraction_put_right():
-    rng = np.random.default_rng(1)
     taken = []
-    while len(taken) < 3000:
-        R = rng.uniform(0.1, 10, 2)
-        half = rng.normal(size=(2, 2))
-        HPH, nu = half @ half.T, rng.normal(size=2) * 10 ** rng.uniform(0, 2)
-        if not LIMIT2 < theta(nu, HPH, R, 1.0) < 2000 * LIMIT2:
-            continue
+    for nu, HPH, R in two_axes(3000, LIMIT2):
         lam, iterations = inflation_by_newton(nu, HPH, R, LIMIT2)
         taken.append(iterations)
         exact = root(nu, HPH, R, LIMIT2)

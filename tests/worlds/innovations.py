@@ -36,6 +36,18 @@ def cases(n, seed=0):
             yield nu, HPH, R, limit
 
 
+def two_axes(n, limit, seed=1):
+    """Innovations of two axes beyond ``limit``, up to 2000 times; H P H' and R of like size."""
+    rng = np.random.default_rng(seed)
+    while n:
+        R = rng.uniform(0.1, 10, 2)
+        half = rng.normal(size=(2, 2))
+        HPH, nu = half @ half.T, rng.normal(size=2) * 10 ** rng.uniform(0, 2)
+        if limit < theta(nu, HPH, R, 1.0) < 2000 * limit:
+            n -= 1
+            yield nu, HPH, R
+
+
 def theta(nu, HPH, R, lam):
     return nu @ np.linalg.solve(HPH + lam * np.diag(R), nu)
 
