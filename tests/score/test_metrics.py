@@ -561,8 +561,10 @@ def shortened(run: Any, t: float, without: str) -> xarray.DataTree:
 @pytest.mark.parametrize("without", ["/nothing", "/sensors", "/sensors/gnss", "/estimators", "/estimators/ins/inn"])
 def test_a_record_cut_anywhere_is_scored(flown: Any, t: float, without: str) -> None:
     cut = shortened(flown, t, without)
-    metrics.compute(cut)
-    metrics.unscored(cut)
+    found = metrics.compute(cut)
+    assert np.isfinite(list(found.values())).all()
+    assert all(key in metrics.compute(flown) for key in found)  # a part of a run has no figure that the whole has not
+    assert all(metrics.unscored(cut))
     observability.of_run(cut)
 
 
