@@ -240,23 +240,38 @@ def campaign(
 def papers(
     ids: Annotated[list[str] | None, typer.Argument(metavar="[ID...]", help="Which papers; all of them.")] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for papers.json and figures.")] = RUNS / "papers",
+    draw: Annotated[
+        int | None, typer.Option(metavar="N", min=0, help="Seeds that no other draw has; that of the documentation.")
+    ] = None,
+    runs: Annotated[int | None, typer.Option(metavar="N", min=2, help="Draws of each claim: 100.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Ten draws of each claim.")] = False,
+    save: Annotated[bool, typer.Option("--save", help="Write table and figures into the documentation.")] = False,
 ) -> None:
     """Reproduce the papers: every claim beside what comes out here; exit code 1 if one is missed."""
     from testbed import papers as library
     from testbed.many import progress
+    from testbed.papers import saved
+    from testbed.papers.draws import draws
 
     found = library.find(ids or [])
-    require_own(out, [library.RESULTS, *(f"{name}.png" for name in found)])
+    drawn = draws(library.RECORDED_DRAW if draw is None else draw, runs, quick)
+    if save:
+        saved.require_checkout(ids or [])
+    require_own(out, [library.RESULTS, *(figure for paper in found.values() for figure in paper.figures)])
     with (
         output_folder(out),
         held(out),
         interrupts.leaving(lambda: "nothing was written"),
         progress.shown(console(stderr=True), "papers") as tell,
     ):
-        claims = library.reproduce(found, out, tell)
+        claims = library.reproduce(found, drawn, out, tell)
     for name, own in claims.items():
-        console().print(library.table(found[name].title, own))
+        for table in library.tables(found[name].title, own):
+            console().print(table)
+    print(library.counted(claims))
     print(printable(f"{out / library.RESULTS} and figures beside it"))
+    if save:
+        print(printable(str(saved.save(found, claims, drawn, out))))
     if any(claim.verdict == "missed" for own in claims.values() for claim in own):
         raise typer.Exit(EXIT_FAILED)
 

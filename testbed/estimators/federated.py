@@ -258,7 +258,7 @@ def lane(section: FederatedSection, rig: Rig, config: Config) -> Lane:
         FusionHorizon(federated, rig.lag_s(used), coning=imu.rate_hz < rig.tick_rate_hz),
         imus,
         used,
-        handover_errors(section.name, section.handover, imu.errors().lever_arm_b, rig.seed),
+        handover_errors(section.handover, imu.errors().lever_arm_b, rig.seed),
         voter,
     )
 

@@ -134,7 +134,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
         FusionHorizon(ins, rig.lag_s(used), coning=rig.imu(section.imu).rate_hz < rig.tick_rate_hz),
         imus,
         used,
-        handover_errors(section.name, section.handover, errors.lever_arm_b, rig.seed),
+        handover_errors(section.handover, errors.lever_arm_b, rig.seed),
         voter,
     )
 

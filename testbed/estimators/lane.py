@@ -134,13 +134,16 @@ def mountings(section: EstimatorSection, rig: Rig) -> tuple[dict[str, Array], Vo
     return mounted, Voter(imu_model(e), turn, level)
 
 
-def handover_errors(name: str, given: Handover | None, arm_b: Array, seed: int) -> HandoverErrors | None:
-    """The errors of a state handed over to the estimator ``name``, None when it aligns."""
+def handover_errors(given: Handover | None, arm_b: Array, seed: int) -> HandoverErrors | None:
+    """The errors of a state that is handed over, None to an estimator that aligns.
+
+    All estimators of a run draw the same, so that none has a better start than its rival.
+    """
     if given is None:
         return None
     level, heading = math.radians(given.level_deg), math.radians(given.heading_deg)
     sigma = np.array([level, level, heading, *[given.velocity_mps] * 3, *[given.position_m] * 3])
-    return HandoverErrors(arm_b, sigma, stream(seed, name, "handover"))
+    return HandoverErrors(arm_b, sigma, stream(seed, "start", "handover"))
 
 
 def _turned_back(C_sb: Array, x_s: Array) -> Array:

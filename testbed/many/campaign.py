@@ -55,6 +55,14 @@ LARGEST_DRAW = 1_000_000_000
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
 
 
+def require_draw(number: int, runs: int) -> None:
+    """Raises UserError when there is no such draw, or it has not so many seeds."""
+    if not 0 <= number <= LARGEST_DRAW:
+        raise UserError(f"--draw {number}: give a number from 0 to {LARGEST_DRAW}")
+    if runs > DRAW:
+        raise UserError(f"--runs {runs}: a draw has {DRAW} seeds")
+
+
 @dataclass(frozen=True, slots=True)
 class Combination:
     """One choice of the varied values, as given, and the scenario that it makes."""
@@ -250,10 +258,7 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     combinations = _combinations(plan)
     if plan.runs < 1:
         raise UserError(f"--runs {plan.runs}: give at least 1")
-    if not 0 <= plan.draw <= LARGEST_DRAW:
-        raise UserError(f"--draw {plan.draw}: give a number from 0 to {LARGEST_DRAW}")
-    if plan.draw and plan.runs > DRAW:
-        raise UserError(f"--runs {plan.runs}: a draw has {DRAW} seeds")
+    require_draw(plan.draw, plan.runs if plan.draw else 0)
     total = len(combinations) * plan.runs
     folder = plan.out.absolute()
     _claim(folder, _setup([one.scenario for one in combinations], plan))

@@ -1,23 +1,24 @@
 """What five papers claim, and what comes out here: ``testbed papers``. One module for each paper, and `misprints`.
 
-A paper gives jobs, each one run or replay with its seed, which are worked off in parallel; from their results it
-concludes its claims and draws its figures. The scenarios lie in ``scenarios/papers``, each with its assumptions.
+A paper gives jobs, each one run or replay of some `Draws` with its seed, which are worked off in parallel; from their
+results it concludes its claims (`testbed.papers.claims` has how they are judged) and draws its figures. The scenarios
+lie in ``scenarios/papers``, each with its assumptions; where and how a motion goes is drawn (`testbed.papers.draws`).
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.many import pool
+from testbed.papers.claims import Claim, Verdict
+from testbed.papers.draws import Draws
 from testbed.results import write_result
 from testbed.scenario import Scenario
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from testbed.many.progress import Tell
 
 RESULTS = "papers.json"
+RECORDED_DRAW = 0  # of the table in the documentation, and what is drawn when nobody says
 IDS = ("cheng2020", "cui2022", "jiang2021", "zhou2025", "zhu2020")
 
 
@@ -38,68 +40,14 @@ class Job(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
-    """One figure of a paper beside ours.
-
-    ``paper`` is what it prints, as text; ``ours`` the same quantity from each seed, judged by its median or, with
-    ``worst``, by its worst; ``bound`` what ours must keep, at most or, with ``at_least``, at least. Within ``target``
-    it is better than the paper. Where the paper's figure can't be had, ``impossible`` says why, and ``bound`` holds for
-    what can.
+class Paper:
+    """One paper: its jobs, what it concludes from their results (in the order of the jobs), and its figures: their
+    names, and what draws them into a folder.
     """
 
-    quantity: str
-    unit: str
-    paper: str
-    ours: Sequence[float]
-    bound: float
-    at_least: bool = False
-    worst: bool = False
-    target: float | None = None
-    impossible: str = ""
-
-    @property
-    def value(self) -> float:
-        """What is judged; NaN when there is none."""
-        if not len(self.ours):
-            return float("nan")
-        if not self.worst:
-            return float(np.median(self.ours))
-        return float(np.min(self.ours) if self.at_least else np.max(self.ours))
-
-    @property
-    def verdict(self) -> str:
-        """met, beaten, impossible or missed."""
-        if not self._keeps(self.bound):
-            return "missed"
-        if self.impossible:
-            return "impossible"
-        return "beaten" if self.target is not None and self._keeps(self.target) else "met"
-
-    def _keeps(self, bound: float) -> bool:
-        return self.value >= bound if self.at_least else self.value <= bound
-
-    def record(self) -> dict[str, Any]:
-        """The claim for `RESULTS`."""
-        spread = [float(np.min(self.ours)), float(np.max(self.ours))] if len(self.ours) else []
-        return {
-            "quantity": self.quantity,
-            "unit": self.unit,
-            "paper": self.paper,
-            "ours": self.value if len(self.ours) else None,
-            "spread": spread,
-            "seeds": len(self.ours),
-            "at least" if self.at_least else "at most": self.bound,
-            "verdict": self.verdict,
-            "because": self.impossible,
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class Paper:
-    """One paper: its jobs, what it concludes from their results (in the order of the jobs), and its figures."""
-
     title: str
-    jobs: Callable[[], Sequence[Job]]
+    figures: tuple[str, ...]
+    jobs: Callable[[Draws], Sequence[Job]]
     conclude: Callable[[Sequence[Any]], Sequence[Claim]]
     draw: Callable[[Sequence[Any], Path], None]
 
@@ -117,9 +65,11 @@ def find(ids: Sequence[str]) -> dict[str, Paper]:
     return {name: import_module(f"testbed.papers.{name}").PAPER for name in ids or IDS}
 
 
-def reproduce(papers: Mapping[str, Paper], out: Path, tell: Tell | None = None) -> dict[str, Sequence[Claim]]:
+def reproduce(
+    papers: Mapping[str, Paper], draws: Draws, out: Path, tell: Tell | None = None
+) -> dict[str, Sequence[Claim]]:
     """Work off the jobs of all ``papers`` on every core, conclude, draw; `RESULTS` and figures go to ``out``."""
-    jobs = [(name, k, job) for name, paper in papers.items() for k, job in enumerate(paper.jobs())]
+    jobs = [(name, k, job) for name, paper in papers.items() for k, job in enumerate(paper.jobs(draws))]
     results: dict[str, dict[int, Any]] = {name: {} for name in papers}
     done = 0
 
@@ -141,7 +91,8 @@ def reproduce(papers: Mapping[str, Paper], out: Path, tell: Tell | None = None) 
         in_order = [results[name][k] for k in sorted(results[name])]
         claims[name] = paper.conclude(in_order)
         paper.draw(in_order, out)
-    found = {name: [claim.record() for claim in own] for name, own in claims.items()}
+    found: dict[str, Any] = {"draw": draws.number, "runs": draws.runs}
+    found |= {name: [claim.record() for claim in own] for name, own in claims.items()}
     write_result(out / RESULTS, json.dumps(found, indent=1).encode())
     return claims
 
@@ -152,17 +103,47 @@ def _work(task: tuple[str, int, Job], tell: Callable[[float], None]) -> Any:
     return job.work(*job.arguments)
 
 
-def table(title: str, claims: Sequence[Claim]) -> Table:
-    """Every claim in a row: quantity, the paper's value, ours with its spread over the seeds, verdict."""
+def tables(title: str, claims: Sequence[Claim]) -> Iterator[Table]:
+    """Every claim of a paper in a row, and what it doesn't claim in a table of its own."""
     from rich.table import Table
 
-    rows = Table("quantity", "paper", "ours", "spread", "bound", "verdict", title=title, title_justify="left")
-    colours = {"met": "green", "beaten": "green", "impossible": "yellow", "missed": "red"}
-    for claim in claims:
-        spread = f"{min(claim.ours):.3g} … {max(claim.ours):.3g}" if len(claim.ours) > 1 else ""
-        verdict = f"[{colours[claim.verdict]}]{claim.verdict}[/]"
-        because = f", because {claim.impossible}" if claim.impossible else ""
-        what = f"{claim.quantity} [{claim.unit}]" if claim.unit else claim.quantity
-        bound = f"{'≥' if claim.at_least else '≤'} {claim.bound:.3g}"
-        rows.add_row(what.replace("[", r"\["), claim.paper, f"{claim.value:.3g}", spread, bound, verdict + because)
-    return rows
+    colours = {Verdict.MET: "green", Verdict.MISSED: "red", Verdict.OPEN: "yellow"}
+    for heading, own in parted(title, claims):
+        table = Table(*COLUMNS, title=heading, title_justify="left")
+        for claim in own:
+            *cells, verdict = row(claim)
+            said = verdict.replace(claim.verdict, f"[{colours.get(claim.verdict, 'cyan')}]{claim.verdict}[/]", 1)
+            table.add_row(*(cell.replace("[", r"\[") for cell in cells), said)
+        yield table
+
+
+COLUMNS = ("quantity", "paper", "ours, with its 95 % interval", "statistic", "bound", "verdict")
+
+
+def counted(claims: Mapping[str, Sequence[Claim]]) -> str:
+    """How many of the papers' claims have which verdict."""
+    every = [claim.verdict for own in claims.values() for claim in own if claim.paper]
+    parts = ", ".join(f"{every.count(verdict)} {verdict}" for verdict in Verdict if verdict in every)
+    return f"{len(every)} claims of the papers: {parts}"
+
+
+def parted(title: str, claims: Sequence[Claim]) -> Iterator[tuple[str, list[Claim]]]:
+    """(heading, claims) of those of the paper, and of the rest."""
+    for heading, own in (
+        (title, [claim for claim in claims if claim.paper]),
+        (f"{title}: what it does not claim", [claim for claim in claims if not claim.paper]),
+    ):
+        if own:
+            yield heading, own
+
+
+def row(claim: Claim) -> tuple[str, ...]:
+    """A claim in `COLUMNS`."""
+    return (
+        f"{claim.quantity} [{claim.unit}]" if claim.unit else claim.quantity,
+        claim.paper,
+        str(claim.interval),
+        claim.statistic.name if claim.draws == 1 else f"{claim.statistic.name} of {claim.draws}",
+        f"{'≥' if claim.at_least else '≤'} {claim.bound:.3g}",
+        f"{claim.verdict}: {claim.why}" if claim.why else claim.verdict.value,
+    )

@@ -246,6 +246,18 @@ def test_a_start_is_handed_over_with_its_errors() -> None:
     assert np.all((scaled.var(axis=0) > 0.4) & (scaled.var(axis=0) < 2.0))
 
 
+@pytest.mark.ci
+def test_all_estimators_of_a_run_start_with_the_same_errors() -> None:
+    keys = "aids=[], handover={level_deg=0.5, heading_deg=2, velocity_mps=0.3, position_m=8}"
+    scenario = Scenario.load(
+        "u_turn", ["duration_s=0.1", f"estimator=[{{name='ins', {keys}}}, {{name='rival', {keys}}}]", "expect={}"]
+    )
+    dataset = run(scenario, source=still()).dataset
+    ins, rival = (accuracy.errors(dataset, name) for name in ("ins", "rival"))
+    for one, other in ((ins.attitude, rival.attitude), (ins.velocity, rival.velocity), (ins.position, rival.position)):
+        np.testing.assert_array_equal(one, other)
+
+
 def still() -> Kinematic:
     return Kinematic(KinematicStart(lat_deg=34.0, lon_deg=108.0, alt_m=300.0, heading_deg=40.0), 200.0)
 

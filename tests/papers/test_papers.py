@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from testbed import papers, run
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.many.check import judge
-from testbed.papers import Claim, Job, Paper
+from testbed.papers import Job, Paper
+from testbed.papers.claims import EXACT, MEAN, Claim
+from testbed.papers.draws import Draws
 
 SCENARIOS = sorted(path.stem for path in (data_dir("scenarios") / "papers").glob("*.toml"))
 LONG = {"cheng2020", "zhu2020", "zhu2020_outage"}  # to run: more than 5 s
@@ -33,21 +35,8 @@ def test_the_scenario_keeps_its_promises(name: str) -> None:
     assert all(row.sound for row in rows), [str(row) for row in rows if not row.sound]
 
 
-def claim(ours: Sequence[float], bound: float, **keys: Any) -> Claim:
+def claim(ours: Any, bound: float, **keys: Any) -> Claim:
     return Claim("error", "m", "10", ours, bound, **keys)
-
-
-def test_verdicts() -> None:
-    assert claim([1.0, 2.0, 9.0], 3.0).verdict == "met"
-    assert claim([1.0, 2.0, 9.0], 3.0, worst=True).verdict == "missed"
-    assert claim([1.0, 2.0, 9.0], 1.0, worst=True, at_least=True).verdict == "met"
-    assert claim([0.5, 2.0, 9.0], 1.0, worst=True, at_least=True).verdict == "missed"
-    assert claim([2.0], 3.0, target=2.0).verdict == "beaten"
-    assert claim([2.1], 3.0, target=2.0).verdict == "met"
-    assert claim([2.0], 3.0, target=2.5, impossible="of noise").verdict == "impossible"
-    assert claim([4.0], 3.0, impossible="of noise").verdict == "missed"
-    assert claim([], 3.0).verdict == "missed"
-    assert claim([float("nan")], 3.0).verdict == "missed"
 
 
 def square(x: float) -> float:
@@ -57,8 +46,9 @@ def square(x: float) -> float:
 def toy(drawn: list[Path]) -> Paper:
     return Paper(
         "A toy",
-        lambda: [Job(square, (x,)) for x in (3.0, 1.0, 2.0)],
-        lambda results: [claim(results, 4.0, target=1.0), claim(results[:1], 4.0)],
+        ("toy.png",),
+        lambda draws: [Job(square, (float(seed),)) for seed in reversed(draws.seeds)],
+        lambda results: [claim(results, 4.0, statistic=MEAN), claim(results[:1], 4.0, statistic=EXACT)],
         lambda results, out: drawn.append(out / f"{len(results)}.png"),
     )
 
@@ -67,16 +57,16 @@ def toy(drawn: list[Path]) -> Paper:
 def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
     drawn: list[Path] = []
     told: list[float] = []
-    claims = papers.reproduce({"toy": toy(drawn)}, tmp_path, lambda fraction, text: told.append(fraction))
-    assert [list(one.ours) for one in claims["toy"]] == [[9.0, 1.0, 4.0], [9.0]]
-    assert [one.verdict for one in claims["toy"]] == ["met", "missed"]
+    claims = papers.reproduce({"toy": toy(drawn)}, Draws(0, 3), tmp_path, lambda fraction, text: told.append(fraction))
+    assert [np.asarray(one.ours).tolist() for one in claims["toy"]] == [[9.0, 4.0, 1.0], [9.0]]
+    assert [one.verdict for one in claims["toy"]] == ["open", "missed"]
     assert drawn == [tmp_path / "3.png"]
     assert sorted(set(told)) == pytest.approx([0.0, 1 / 3, 2 / 3, 1.0])
     assert told == sorted(told)
-    record = json.loads((tmp_path / papers.RESULTS).read_text())["toy"]
-    assert record[0]["ours"] == 4.0
-    assert record[0]["spread"] == [1.0, 9.0]
-    assert [row["verdict"] for row in record] == ["met", "missed"]
+    record = json.loads((tmp_path / papers.RESULTS).read_text())
+    assert (record["draw"], record["runs"]) == (0, 3)
+    assert record["toy"][0]["ours"] == pytest.approx(14 / 3)
+    assert [row["verdict"] for row in record["toy"]] == ["open", "missed"]
 
 
 @pytest.mark.ci
