@@ -132,7 +132,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         position=position,
         velocity=velocity,
         attitude=attitude,
-        angles=_wrapped(euler(estimated("q_nb")) - euler(true("q_nb"))),
+        angles=wrapped(euler(estimated("q_nb")) - euler(true("q_nb"))),
         sigma_position=estimated("sigma_position_n"),
         sigma_velocity=estimated("sigma_velocity_n"),
         sigma_attitude=estimated("sigma_attitude_n"),
@@ -184,10 +184,10 @@ def euler(q: Array) -> Array:
     return np.column_stack([roll, pitch, heading])
 
 
-def _wrapped(angle: Array) -> Array:
+def wrapped(angle: Array) -> Array:
     """The same angles in [-pi, pi)."""
-    wrapped: Array = np.mod(angle + np.pi, 2 * np.pi) - np.pi
-    return wrapped
+    same: Array = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return same
 
 
 def nees(error: Array, covariance: Array) -> Array:

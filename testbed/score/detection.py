@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -51,12 +52,18 @@ def refused(weight: Array, outcome: npt.NDArray[Any]) -> Mask:
     return (weight <= 0) | np.isin(outcome, (Outcome.OUTSIDE_GATE, Outcome.ISOLATED))
 
 
+def alarmed(weight: Array, outcome: npt.NDArray[Any]) -> Mask:
+    """Which samples (N,) were refused, in part at least, because they looked wrong."""
+    alarm: Mask = refused(weight, outcome) & (outcome != Outcome.WITHHELD)
+    return alarm
+
+
 def _reports(dataset: xarray.DataTree, estimator: str, aid: str) -> _Reports:
     own = f"estimators/{estimator}/innovations/{aid}"
     outcome, value = column(dataset, f"{own}/outcome"), column(dataset, f"{own}/nis")
     weight = column(dataset, f"{own}/weight")
     used = weight > 0
-    alarm = refused(weight, outcome) & (outcome != Outcome.WITHHELD)
+    alarm = alarmed(weight, outcome)
     return _Reports(
         t=column(dataset, f"{own}/sample_time"),
         sensor=column(dataset, f"{own}/sensor").astype(str),
@@ -163,26 +170,54 @@ def fault_window(fault: FaultTruth) -> Window:
     return fault.start, fault.end + RECOVERY_WINDOW_S
 
 
-def _by_sensor(dataset: xarray.DataTree, estimator: str) -> dict[str, tuple[Array, Mask, Mask]]:
-    """Times of the samples of each sensor, whether any part of one raised an alarm, whether it was not used whole."""
-    found = [_reports(dataset, estimator, aid) for aid in aids(dataset, estimator)]
+class SensorLooks(NamedTuple):
+    """Times (N,) of a sensor's samples, whether any part of one raised an alarm, whether it was not used whole."""
+
+    t: Array
+    alarm: Mask
+    unused: Mask
+
+
+def by_sensor(
+    t: Array, sensor: npt.NDArray[np.str_], weight: Array, outcome: npt.NDArray[Any]
+) -> dict[str, SensorLooks]:
+    """Of reports (N,) on the samples of any aids, what became of the samples of each sensor."""
+    alarms, used = alarmed(weight, outcome), weight > 0
     result = {}
-    for sensor in dict.fromkeys(name for reports in found for name in np.unique(reports.sensor).tolist()):
-        own = [(reports, reports.sensor == sensor) for reports in found]
-        t, row = np.unique(np.concatenate([reports.t[mine] for reports, mine in own]), return_inverse=True)
-        alarm, used = np.zeros(len(t), bool), np.zeros(len(t), bool)
-        np.logical_or.at(alarm, row, np.concatenate([reports.alarm[mine] for reports, mine in own]))
-        np.logical_or.at(used, row, np.concatenate([reports.used[mine] for reports, mine in own]))
-        result[sensor] = (t, alarm, ~used | alarm)
+    for name in np.unique(sensor).tolist():
+        mine = sensor == name
+        when, row = np.unique(t[mine], return_inverse=True)
+        alarm, taken = np.zeros(len(when), bool), np.zeros(len(when), bool)
+        np.logical_or.at(alarm, row, alarms[mine])
+        np.logical_or.at(taken, row, used[mine])
+        result[name] = SensorLooks(when, alarm, ~taken | alarm)
     return result
 
 
-def fault_scores(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[dict[str, float], list[Window]]:
-    """Scores of all faults, and the spans of time in which an alarm may be theirs."""
-    every = faults(dataset)
-    looks = _by_sensor(dataset, estimator) if every else {}
-    result: dict[str, float] = {}
-    spans: list[Window] = []
+def _recorded_looks(dataset: xarray.DataTree, estimator: str) -> dict[str, SensorLooks]:
+    groups = [f"estimators/{estimator}/innovations/{aid}" for aid in aids(dataset, estimator)]
+    if not groups:
+        return {}
+    t, sensor, weight, outcome = (
+        np.concatenate([column(dataset, f"{group}/{name}") for group in groups])
+        for name in ("sample_time", "sensor", "weight", "outcome")
+    )
+    return by_sensor(t, sensor.astype(str), weight, outcome)
+
+
+class FaultScore(NamedTuple):
+    """How a fault was detected, None when nobody looked; whether its sensor had the most alarms; and from when on an
+    alarm is the next fault's of the same sensor [s].
+    """
+
+    detection: DetectionScore | None
+    most: bool
+    until: float
+
+
+def score_faults(every: Sequence[FaultTruth], looks: Mapping[str, SensorLooks]) -> list[FaultScore]:
+    """A score of each fault, from what became of the samples of each sensor."""
+    found = []
     for fault in every:
         window, score = (fault.start, fault.end), None
         # From when on an alarm is another fault's of the same sensor.
@@ -193,20 +228,31 @@ def fault_scores(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[d
             t, alarm, unused = looks[fault.sensor]
             # What was refused as faulty may be on probation before it is used again.
             score = detection(t, alarm | unused & (t >= fault.end - SAME_TIME_S), window, until)
+        at_fault = {other.sensor for other in every if other.start < fault.end and other.end > fault.start}
+        others = [detection(t, alarm, window) for name, (t, alarm, _) in looks.items() if name not in at_fault]
+        most = max((other.coverage for other in others if other is not None), default=0.0)
+        found.append(FaultScore(score, score is not None and score.coverage > most, until))
+    return found
+
+
+def fault_scores(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[dict[str, float], list[Window]]:
+    """Scores of all faults, and the spans of time in which an alarm may be theirs."""
+    every = faults(dataset)
+    looks = _recorded_looks(dataset, estimator) if every else {}
+    result: dict[str, float] = {}
+    spans: list[Window] = []
+    for fault, (score, most, until) in zip(every, score_faults(every, looks), strict=True):
         if score is None:
             spans.append(fault_window(fault))
             continue
         ceased = until if np.isnan(score.end_lag) else fault.end + score.end_lag
         spans.append((fault.start, ceased + RECOVERY_WINDOW_S))
-        at_fault = {other.sensor for other in every if other.start < fault.end and other.end > fault.start}
-        others = [detection(t, alarm, window) for name, (t, alarm, _) in looks.items() if name not in at_fault]
-        most = max((other.coverage for other in others if other is not None), default=0.0)
         scored = {
             "detection_delay_s": score.delay,
             "end_lag_s": score.end_lag,
             "coverage": score.coverage,
             "missed": score.missed,
-            "isolation_correct": score.coverage > most,
+            "isolation_correct": most,
         }
         result |= {f"{key}.{fault.name}": value for key, value in scored.items() if np.isfinite(value)}
         if not e.attitude_only:

@@ -1,0 +1,130 @@
+"""A flight of a paper: its motion sensed once, then any estimator on the same samples; kept is what verdicts need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from nav.earth import position_difference_n
+from nav.samples import Array, Estimate, UpdateReport
+from testbed import sensors
+from testbed.estimators import registry
+from testbed.estimators.lane import Lane
+from testbed.feeds.known import handed_over
+from testbed.feeds.simulated import motion
+from testbed.motion.table import TruthBlock
+from testbed.scenario import Scenario
+from testbed.score import accuracy, detection
+from testbed.sensors.faults import Faults, FaultTruth
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """A motion, and by sensor what was made of it: samples, or an IMU's increments."""
+
+    truth: TruthBlock
+    samples: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, chosen: Scenario, seed: int) -> Sensed:
+        """The whole motion of a scenario and its sensors, without any of its faults."""
+        rate = chosen.truth.rate_hz
+        truth = motion(chosen, seed).advance(round(chosen.duration_s * rate) + 1)
+        return cls(
+            truth,
+            {
+                name: sensors.build(name, section, rate, seed, chosen.site()).sense(truth)
+                for name, section in chosen.sensors.items()
+            },
+        )
+
+    def with_faults(self, chosen: Scenario, seed: int) -> tuple[Sensed, list[FaultTruth]]:
+        """The same with a scenario's faults, and what they are."""
+        faults = Faults(chosen.fault, chosen.sensors, seed)
+        found = {name: faults.apply(name, samples) for name, samples in self.samples.items()}
+        return Sensed(self.truth, found), faults.truth
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """What became of the samples of one aid: times (N,) [s], weights (N,), outcomes (N,), NIS (N,)."""
+
+    t: Array
+    weight: Array
+    outcome: npt.NDArray[Any]
+    nis: Array
+
+    @property
+    def alarm(self) -> accuracy.Mask:
+        """Which were refused, in part at least, because they looked wrong."""
+        return detection.alarmed(self.weight, self.outcome)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """An estimator's errors (N, 3) and claimed 1-sigma (N, 9) at times (N,), and its reports.
+
+    ``position`` NED [m], ``velocity`` NED [m/s], ``attitude`` phi in n [rad], ``angles`` of roll, pitch, heading [rad].
+    """
+
+    t: Array
+    position: Array
+    velocity: Array
+    attitude: Array
+    angles: Array
+    sigma: Array
+    reports: Sequence[UpdateReport]
+
+    @property
+    def every(self) -> Array:
+        """Position, velocity and attitude (N, 9)."""
+        return np.column_stack([self.position, self.velocity, self.attitude])
+
+    def looks(self, aid: str) -> Looks:
+        """What became of the samples of one aid."""
+        own = [report for report in self.reports if report.aid == aid]
+        return Looks(
+            np.array([report.t for report in own]), np.array([report.weight for report in own]),
+            np.array([report.outcome for report in own]), np.array([report.nis for report in own]),
+        )  # fmt: skip
+
+    @property
+    def by_sensor(self) -> dict[str, detection.SensorLooks]:
+        """As `testbed.score.detection.score_faults` wants it: what became of the samples of each sensor."""
+        columns = zip(*((r.t, r.sensor, r.weight, r.outcome) for r in self.reports), strict=True)
+        return detection.by_sensor(*(np.array(column) for column in columns))
+
+
+def lanes(chosen: Scenario, seed: int) -> dict[str, Lane]:
+    """The scenario's estimators."""
+    return registry.build(chosen.estimator, chosen.rig(seed))
+
+
+def track(lane: Lane, sensed: Sensed, t: Array) -> Track:
+    """An estimator over a whole flight, begun with what is handed over, if anything is; at times ``t`` (N,) [s]."""
+    if lane.handover is not None:
+        lane.start(handed_over(lane.handover, sensed.truth))
+    handed = [sample for name in lane.sensors for sample in sensed.samples[name]]
+    reports, estimates = lane.horizon.track(lane.increments(sensed.samples)[0], handed, t.tolist())
+    return _errors(estimates, reports, sensed.truth, t)
+
+
+def _errors(
+    estimates: Sequence[Estimate], reports: Sequence[UpdateReport], truth: TruthBlock, t: Array
+) -> Track:  # fmt: skip
+    rows = np.searchsorted(truth.t, t - accuracy.SAME_TIME_S)
+    lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
+    q_nb, true = np.array([e.q_nb for e in estimates]), truth.q_nb[rows]
+    return Track(
+        t=t,
+        position=position_difference_n(lat, lon, h, truth.lat[rows], truth.lon[rows], truth.h[rows]),
+        velocity=np.array([e.v_n for e in estimates]) - truth.v_n[rows],
+        attitude=accuracy.attitude_error(q_nb, true),
+        angles=accuracy.wrapped(accuracy.euler(q_nb) - accuracy.euler(true)),
+        sigma=np.sqrt([e.covariance.diagonal() for e in estimates]),
+        reports=reports,
+    )
