@@ -51,6 +51,11 @@ class AhrsConfig:
     phi_limit: float = 0.2 * DEG  # largest correction of each level axis per period
     correction_sigma: float = 1 * DEG  # the attitude is corrected when both level axes are known this well
     gyro_bias_feedback: bool = False  # estimated biases are taken off the gyros
+    # Further error states, none where zero (`nav.ahrs.further.FurtherStates`).
+    gyro_misalignment_sigma: float = 0.0  # share of the yaw rate that each gyro feels beside its own
+    accel_bias_sigma: float = 0.0  # of the accelerometers' constant biases [m/s^2]
+    gust_sigma: float = 0.0  # of horizontal accelerations in straight flight, each axis [m/s^2]
+    gust_correlation_s: float = 0.5
 
     airspeed_sigma: float = 1.0  # what gusts, sideslip and angle of attack make of it in a turn [m/s]
     airspeed_smoothing_s: float = 5.0

@@ -8,7 +8,8 @@ import numpy as np
 
 from nav import aids
 from nav.ahrs.config import KINDS, AhrsConfig
-from nav.ahrs.state import BIAS, PHI, STATES, UNKNOWN, State, covariance_step, fresh, propagate
+from nav.ahrs.further import FurtherStates
+from nav.ahrs.state import BIAS, PHI, STATES, UNKNOWN, State, covariance_step, fresh, propagate, transition
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import PAPERS, ErrorModel
@@ -30,6 +31,8 @@ from nav.samples import (
 
 # What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
 LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
+JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what the last period was judged by
+SIX_STAY = np.ones(STATES)
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
@@ -59,14 +62,17 @@ class Ahrs:
         model = ErrorModel(imu)
         self._variance_rate = model.density[model.places(PAPERS["jiang2021"])] ** 2
         self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
-        self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2] * 2 + [0.0])
+        self.further = FurtherStates(config)
+        self._accel_bias = self.further.accel_bias
+        biased = self._accel_bias.start == self._accel_bias.stop  # accelerometers, by what no state stands for
+        self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2 if biased else 0.0] * 2 + [0.0])
         self._H_level = np.zeros((2, STATES))
         self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
-        H = np.zeros((1, STATES))
+        H = np.zeros((1, STATES + self.further.count))
         if field_n is not None:
             H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
         H[0, PHI + 2] = -1.0
-        self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, 6) and R (1,) of a heading
+        self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, n) and R (1,) of a heading
         self._last_bad = -math.inf
 
     @property
@@ -86,7 +92,7 @@ class Ahrs:
 
     def start(self, t: float, q_nb: Array) -> None:
         """Begin at a given attitude, known as well as the configuration's sigmas say, instead of levelling."""
-        self._state = state = fresh(t + self.config.period_s)
+        self._state = state = fresh(t + self.config.period_s, STATES + self.further.count)
         state.levelled = True
         state.q_nb = np.array(q_nb, dtype=float)
         state.P = self._initial_covariance()
@@ -114,7 +120,7 @@ class Ahrs:
             return reports
         if self._state is None:
             start = float(imu.t[0] - imu.dt[0])
-            self._state = fresh(start + self.config.levelling_s)
+            self._state = fresh(start + self.config.levelling_s, STATES + self.further.count)
             self._state.air_velocity_n = self._air_velocity_n(self._state, start)
         self._last_bad = max(self._last_bad, self._run(self._state, imu, reports))
         self.t = float(imu.t[-1])
@@ -241,7 +247,7 @@ class Ahrs:
         config = self.config
         sigma = np.repeat([config.tilt_sigma, config.imu.gyro_bias_sigma], 3)
         sigma[PHI + 2] = config.heading_sigma
-        return np.diag(sigma**2)
+        return np.diag(np.concatenate([sigma, self.further.sigma]) ** 2)
 
     def _level(self, s: State, t: float, reports: list[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
@@ -249,19 +255,24 @@ class Ahrs:
         f_n, compensated = self._steady_force(s, t)
         limits = config.compensated_motion if compensated else config.motion
         omega_b = s.angle / s.elapsed[1] - s.gyro_bias
-        if not limits.judge(f_n, omega_b, self._g, self._level_commanded(t - float(s.elapsed[1]), t)).low:
-            s.mode_counter = s.correction_counter = 0
+        motion = limits.judge(f_n, omega_b, self._g, self._level_commanded(t - float(s.elapsed[1]), t))
+        s.shown[:] = motion.acceleration, motion.yaw_rate, motion.roll_rate
+        if not motion.low:
+            s.correction_counter = 0
             return
         s.mode_counter += 1
-        reports.append(_fuse(s, *self.level_measurement(omega_b, compensated), f_n[:2], t, "accelerometer", LEVEL))
+        H, R = self.level_measurement(s.q_nb, omega_b, compensated)
+        reports.append(_fuse(s, H, R, f_n[:2], t, "accelerometer", LEVEL))
         self._feed_back(s)
 
-    def level_measurement(self, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
-        """H (2, 6) and R (2,) of a levelling, at the rate ``omega_b``, with the acceleration taken off or without."""
+    def level_measurement(self, q_nb: Array, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
+        """H (2, n) and R (2,) of a levelling at the attitude ``q_nb`` and the rate ``omega_b``, with the acceleration
+        taken off or without.
+        """
         variance = self.config.force_sigma**2
         if compensated:
             variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b)
-        return self._H_level, np.full(2, variance)
+        return np.hstack([self._H_level, self.further.columns(q_nb)]), np.full(2, variance)
 
     def _level_commanded(self, start: float, end: float) -> bool:
         """Whether nothing but level flight was commanded from ``start`` to ``end`` [s], as far as is known."""
@@ -305,7 +316,12 @@ class Ahrs:
     def _settle(self, s: State) -> None:
         """Bring error states and covariance up to the time of the attitude."""
         if s.elapsed[0] > 0:
-            covariance_step(s.x, s.P, s.turned, s.elapsed, self._earth_n, self._variance_rate)
+            T, period = s.elapsed.tolist()
+            kept, half_of_further = self.further.step(T)
+            whole = np.diag(np.concatenate([SIX_STAY, kept]))
+            whole[PHI : PHI + 3, :STATES] = transition(s.turned, self._earth_n, T)
+            self.further.turn(whole, s.turned, s.angle[2] / period)
+            covariance_step(s, whole, np.concatenate([0.5 * T * self._variance_rate, half_of_further]))
 
     def _estimate(self, s: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a state of its own.
@@ -323,7 +339,11 @@ class Ahrs:
         phi = s.x[PHI : PHI + 3]
         covariance = NO_COVARIANCE.copy()
         covariance[6:, 6:] = s.P[PHI : PHI + 3, PHI : PHI + 3] + phi[:, None] * phi + self._floor
-        zero = np.zeros(1)
+        zero, sigma = np.zeros(1), np.sqrt(s.P.diagonal())
+        judged = zip(JUDGED, s.shown[:, None], strict=True)
+        accel_bias, sigma_accel_bias = np.zeros(3), self._sigma_accel_bias
+        if self._accel_bias.start < self._accel_bias.stop:
+            accel_bias, sigma_accel_bias = -s.x[self._accel_bias], sigma[self._accel_bias]
         return Estimate(
             t=t,
             lat=math.nan,
@@ -331,15 +351,16 @@ class Ahrs:
             h=math.nan,
             v_n=UNKNOWN,
             q_nb=s.q_nb,
-            gyro_bias=s.gyro_bias - s.x[BIAS:],
-            accel_bias=np.zeros(3),
+            gyro_bias=s.gyro_bias - s.x[BIAS:STATES],
+            accel_bias=accel_bias,
             covariance=covariance,
-            sigma_gyro_bias=np.sqrt(s.P.diagonal()[BIAS:]),
-            sigma_accel_bias=self._sigma_accel_bias,
+            sigma_gyro_bias=sigma[BIAS:STATES],
+            sigma_accel_bias=sigma_accel_bias,
             status=Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY | bad,
             extra={
                 "mode_counter": (np.array([float(s.mode_counter)]), zero),
                 "correction_counter": (np.array([float(s.correction_counter)]), zero),
+                **{name: (value, zero) for name, value in judged},
             },
         )
 

@@ -11,8 +11,7 @@ from nav._jit import njit
 from nav.rotation import rotation_coefficients
 from nav.samples import Array
 
-PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are
-BIAS_STAYS = np.eye(STATES)
+PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 UNKNOWN = np.full(3, np.nan)
 
@@ -23,11 +22,12 @@ class State:
 
     levelled: bool
     period_end: float  # [s]
-    mode_counter: int  # periods of low dynamics without a break
-    correction_counter: int  # corrections among them
+    mode_counter: int  # periods of low dynamics
+    correction_counter: int  # corrections since the last period that was none
+    shown: Array  # (3,) acceleration, yaw rate and roll rate that the last period was judged by, as `nav.motion.Motion`
     q_nb: Array
-    x: Array  # (6,) estimated errors still in the attitude and the gyros
-    P: Array  # (6, 6)
+    x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
+    P: Array  # (n, n)
     gyro_bias: Array  # (3,) taken off the gyros
     air_velocity_n: Array  # (3,) at the start of the period, NaN when unknown
     field_n: Array  # (3,) sum of magnetic fields while levelling
@@ -43,16 +43,17 @@ class State:
         return State(*values)
 
 
-def fresh(period_end: float) -> State:
-    """Nothing is known but when the levelling ends."""
+def fresh(period_end: float, n: int) -> State:
+    """Nothing is known but when the levelling ends; ``n`` error states."""
     return State(
         levelled=False,
         period_end=period_end,
         mode_counter=0,
         correction_counter=0,
+        shown=UNKNOWN.copy(),
         q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
-        x=np.zeros(STATES),
-        P=np.zeros((STATES, STATES)),
+        x=np.zeros(n),
+        P=np.zeros((n, n)),
         gyro_bias=np.zeros(3),
         air_velocity_n=UNKNOWN,
         field_n=np.zeros(3),
@@ -71,24 +72,20 @@ def transition(turned: Array, earth_n: Array, T: float) -> Array:
     return np.array([[1.0, down, -east, *c_n], [-down, 1.0, north, *c_e], [east, -north, 1.0, *c_d]])
 
 
-def covariance_step(x: Array, P: Array, turned: Array, elapsed: Array, earth_n: Array, variance_rate: Array) -> None:
-    """Take error states and covariance over the time in ``elapsed``, and empty the integral.
+def covariance_step(s: State, whole: Array, half_noise: Array) -> None:
+    """Take error states and covariance through the transition ``whole`` (n, n), and begin the next.
 
-    Half of the noise before and half after, as in `kalman.predict`.
+    ``half_noise`` (n,) is half of the variance that comes in, which it does before and after, as in `kalman.predict`.
     """
-    T = float(elapsed[0])
-    whole = BIAS_STAYS.copy()
-    whole[PHI : PHI + 3] = transition(turned, earth_n, T)
-    half_noise = 0.5 * T * variance_rate
-    variances = P.ravel()[:: STATES + 1]
-    x[:] = whole @ x
+    variances = s.P.ravel()[:: len(s.x) + 1]
+    s.x[:] = whole @ s.x
     variances += half_noise
-    P[:] = whole @ P @ whole.T
+    s.P[:] = whole @ s.P @ whole.T
     variances += half_noise
-    P += P.T.copy()
-    P *= 0.5
-    turned[:] = 0.0
-    elapsed[0] = 0.0
+    s.P += s.P.T.copy()
+    s.P *= 0.5
+    s.turned[:] = 0.0
+    s.elapsed[0] = 0.0
 
 
 @njit

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from nav.ahrs import Ahrs, AhrsConfig
+from nav.earth import STANDARD_GRAVITY
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
 from nav.samples import Array
@@ -58,6 +59,22 @@ class LevelSection(Section):
     force_sigma_mps2: float = Field(default=0.1, gt=0, le=10, description="of a second's mean, as a sign of tilt")
     limit_deg: float = Field(default=0.2, gt=0, le=20, description="largest correction per second and axis")
     gyro_bias_feedback: bool = Field(default=False, description="biases of the level gyros are taken off as well")
+    gyro_misalignment_mrad: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="of axes that it estimates, in place of a bias that walks with every turn; 0: it does not",
+    )
+    accel_bias_mg: float = Field(
+        default=0.0, ge=0, le=100, description="of constant accelerometer biases that it estimates; 0: it does not"
+    )
+    gust_mps2: float = Field(
+        default=0.0,
+        ge=0,
+        le=10,
+        description="of horizontal accelerations by gusts, each axis, that it models beside the white rest; 0: none",
+    )
+    gust_correlation_s: float = Field(default=0.5, ge=0.01, le=100, description="how long one of them lasts")
 
 
 class AhrsSection(EstimatorSection):
@@ -127,6 +144,9 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
         force_sigma=LEVELLING_FORCE,
     )
     level = section.level
+    if level is not None and level.gyro_misalignment_mrad > 0:
+        aligned = replace(errors, gyro_misalignment=0.0, gyro_nonorthogonality=0.0, gyro_scale=0.0)
+        config = replace(config, imu=imu_model(aligned, usual=rig.usual))
     if level is not None:
         yaw_rate, roll_rate = math.radians(level.yaw_rate_degps), math.radians(level.roll_rate_degps)
         limits = LowDynamics(level.acceleration_mps2, yaw_rate, roll_rate, level.test)
@@ -137,6 +157,10 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
             force_sigma=level.force_sigma_mps2,
             phi_limit=math.radians(level.limit_deg),
             gyro_bias_feedback=level.gyro_bias_feedback,
+            gyro_misalignment_sigma=level.gyro_misalignment_mrad * 1e-3,
+            accel_bias_sigma=level.accel_bias_mg * 1e-3 * STANDARD_GRAVITY,
+            gust_sigma=level.gust_mps2,
+            gust_correlation_s=level.gust_correlation_s,
         )
     if not section.levelling:
         config = replace(config, motion=NEVER_LEVEL, compensated_motion=NEVER_LEVEL)

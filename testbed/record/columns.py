@@ -150,8 +150,11 @@ EXTRA = {
     "airspeed_scale": Variable("1", "estimated scale factor error of the airspeed sensor"),
     "body_velocity_scale": Variable("1", "estimated scale factor error of the body velocity sensor", ("body_axis",)),
     "body_velocity_error": Variable("m/s", "estimated correlated error of body velocity", ("body_axis",)),
-    "mode_counter": Variable("1", "periods of low dynamics without a break"),
-    "correction_counter": Variable("1", "corrections of the attitude among them"),
+    "mode_counter": Variable("1", "periods of low dynamics"),
+    "correction_counter": Variable("1", "corrections of the attitude since the last period that was none"),
+    "judged_acceleration": Variable("m/s^2", "acceleration by which low dynamics were judged"),
+    "judged_yaw_rate": Variable("rad/s", "rate about body z by which low dynamics were judged"),
+    "judged_roll_rate": Variable("rad/s", "rate about body x by which low dynamics were judged"),
 }
 
 

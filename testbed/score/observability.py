@@ -143,13 +143,18 @@ def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, in
 def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visibility:
     level, heading = (_used(dataset, name, way.t, part) for part in ((LEVEL, 2), (MAGNETIC_HEADING, 1)))
     compensated = "airspeed" in ahrs.config.aids
-    F, measurements = np.zeros((len(level), STATES, STATES)), []
+    further, n = ahrs.further, STATES + ahrs.further.count
+    F, measurements = np.tile(np.diag(np.concatenate([np.zeros(STATES), -further.decay_rate])), (len(level), 1, 1)), []
     for k, q_nb in enumerate(way.q_nb):
-        F[k, :3] = transition(dcm_from_quat(q_nb), earth_rate_n(float(way.lla[k, 0])), 1.0) - np.eye(3, STATES)
-        levelling = (*ahrs.level_measurement(way.omega_b[k], compensated), level[k])
-        measurements.append(_stacked([levelling, (*ahrs.heading_measurement, heading[k])], STATES))
+        earth_n = earth_rate_n(float(way.lla[k, 0]))
+        C_nb = dcm_from_quat(q_nb)
+        F[k, :3, :STATES] = transition(C_nb, earth_n, 1.0) - np.eye(3, STATES)
+        further.turn(F[k], C_nb, way.omega_b[k, 2])
+        levelling = (*ahrs.level_measurement(q_nb, way.omega_b[k], compensated), level[k])
+        measurements.append(_stacked([levelling, (*ahrs.heading_measurement, heading[k])], n))
     names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
-    prior = np.concatenate([way.sigma[:3], np.full(3, ahrs.config.imu.gyro_bias_sigma)])
+    names += further.names
+    prior = np.concatenate([way.sigma[:3], np.full(3, ahrs.config.imu.gyro_bias_sigma), further.sigma])
     return visibility(names, way.t, F, measurements, np.maximum(prior, KNOWN), TIME_S)
 
 

@@ -40,6 +40,7 @@ NEVER = LowDynamics(yaw_rate_limit=-1.0)
 INERTIAL = replace(PAPER, motion=NEVER, compensated_motion=NEVER)
 COMPENSATED = replace(PAPER, aids=("airspeed",))
 SLOW_TURN = (100.0, 500.0)
+WHAT_IS_JUDGED = ("acceleration", "yaw_rate", "roll_rate")
 
 
 def rms(values):
@@ -360,14 +361,25 @@ def test_an_unnoticed_slow_turn():
 def test_counters():
     times, _, estimates, reports = run(PAPER, level_flight(), imu(level_flight(), 0))
     low = {round(r.t) for r in reports}
-    corrected = 0
+    corrected = held = 0
     for t, estimate in zip(np.round(times).astype(int), estimates, strict=True):
         mode, corrections = (int(estimate.extra[f"{name}_counter"][0][0]) for name in ("mode", "correction"))
-        assert (mode > 0) == (t in low)
-        assert corrections <= mode
-        corrected = max(corrected, corrections)
+        assert mode == held + (t in low)  # outside low dynamics it is held, and the other one cleared
+        assert corrections <= mode if t in low else corrections == 0
+        corrected, held = max(corrected, corrections), mode
     assert corrected > 50
-    assert estimates[230].extra["mode_counter"][0][0] == 0
+    assert held == len(reports)
+
+
+def test_what_low_dynamics_were_judged_by_is_told():
+    """In a turn at 3 deg/s the yaw rate, as it is entered the roll rate, and of the acceleration its size beyond g."""
+    times, _, estimates, _ = run(PAPER, level_flight(), imu(level_flight(), 0))
+    judged = {name: np.array([e.extra[f"judged_{name}"][0][0] for e in estimates]) for name in WHAT_IS_JUDGED}
+    assert np.median(judged["yaw_rate"][(times > 210) & (times < 250)]) / DEG == pytest.approx(3, abs=0.3)
+    assert judged["roll_rate"][(times > 196) & (times < 204)].max() / DEG > 2
+    straight = times < 190
+    assert judged["yaw_rate"][straight].max() / DEG < 0.5
+    assert judged["acceleration"][straight].mean() == pytest.approx(0.09, abs=0.03)
 
 
 def test_the_autopilot_has_a_say():

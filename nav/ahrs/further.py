@@ -1,0 +1,78 @@
+"""Error states after the six, as far as they are asked for: misaligned gyros, biased accelerometers, gusts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nav.ahrs.config import AhrsConfig
+from nav.ahrs.state import PHI, STATES
+from nav.rotation import dcm_from_quat
+from nav.samples import Array
+
+NAMES = (
+    [f"gyro_misalignment {axis}" for axis in "xyz"],
+    [f"accel_bias {axis}" for axis in "xyz"],
+    ["gust north", "gust east"],
+)
+
+
+class FurtherStates:
+    """The error states after the six: k of them, estimate - truth where the estimate is zero.
+
+    Gyros (3,), a share m of the yaw rate that each feels beside its own, by misalignment or scale; constant:
+
+        phi' = ... + C_nb m omega_z
+
+    Accelerometers (3,) in b, a constant bias b_a, and gusts (2,), accelerations a of the body to north and east: the
+    mean over a period shows
+
+        f_N = g phi_E - (C_nb b_a + a)_N,    f_E = -g phi_N - (C_nb b_a + a)_E
+
+    Gusts are Gauss-Markov, of ``gust_sigma`` (s) and ``gust_correlation_s`` (tau). Their means over periods of T have
+    the variance
+
+        s_m^2 = 2 s^2 (tau / T) (1 - (tau / T) (1 - exp(-T / tau)))
+
+    and are taken for AR(1), a <- r a + noise, with r such that the long-term power of the gusts is kept:
+
+        s_m^2 (1 + r) / (1 - r) = p = 2 s^2 tau / T,    so  r = (p - s_m^2) / (p + s_m^2)
+    """
+
+    def __init__(self, config: AhrsConfig) -> None:
+        ratio = config.gust_correlation_s / config.period_s
+        power = 2 * config.gust_sigma**2 * ratio
+        variance = power * (1 + ratio * math.expm1(-1 / ratio))
+        sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance)
+        sizes = [len(names) if sigma > 0 else 0 for names, sigma in zip(NAMES, sigmas, strict=True)]
+        edges = STATES + np.cumsum([0, *sizes])
+        # where they lie in the state
+        self.misalignment, self.accel_bias, self.gust = (slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES)))
+        self.count = sum(sizes)
+        self.names = [name for names, size in zip(NAMES, sizes, strict=True) for name in names[:size]]
+        self.sigma = np.repeat(sigmas, sizes)  # (k,) at the start
+        fading = -math.log((power - variance) / (power + variance)) / config.period_s if sizes[2] else 0.0
+        self.decay_rate = np.repeat([0.0, 0.0, fading], sizes)  # (k,) [1/s]
+
+    def step(self, T: float) -> tuple[Array, Array]:
+        """What is left of each after ``T`` [s] (k,), and half of the variance that comes in (k,).
+
+        Half comes in before the decay and half after, and the variance of gusts stays.
+        """
+        kept = np.exp(-T * self.decay_rate)
+        return kept, self.sigma**2 * (1 - kept**2) / (1 + kept**2)
+
+    def turn(self, whole: Array, turned: Array, yaw_rate: float) -> None:
+        """Put what the misaligned gyros make of ``yaw_rate`` [rad/s] into the transition ``whole`` (n, n).
+
+        ``turned`` (3, 3) is the integral of C_nb.
+        """
+        whole[PHI : PHI + 3, self.misalignment] = turned[:, : self.misalignment.stop - STATES] * yaw_rate
+
+    def columns(self, q_nb: Array) -> Array:
+        """H (2, k) of them in the mean horizontal specific force of a body at the attitude ``q_nb``."""
+        H = np.zeros((2, STATES + self.count))
+        H[:, self.accel_bias] = -dcm_from_quat(q_nb)[:2, : self.accel_bias.stop - self.accel_bias.start]
+        H[:, self.gust] = -np.eye(2)[:, : self.gust.stop - self.gust.start]
+        return H[:, STATES:]
