@@ -83,6 +83,7 @@ def run(
     A record is run again with everything that was asked of it, bit for bit; --seed and --set make another run of it,
     of which the same is asked at the same times.
     """
+    from testbed.feeds.build import located
     from testbed.scenario import Scenario
 
     if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
@@ -93,6 +94,7 @@ def run(
         seed = recorded_seed if seed is None else seed
     else:
         loaded, folder = Scenario.load(scenario, overrides or ()), RUNS / Path(scenario).stem
+    loaded = located(loaded)
     folder = out or folder
     if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")

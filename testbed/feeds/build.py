@@ -10,11 +10,15 @@ from testbed.estimators.lane import Lane
 from testbed.feeds.autopilot import Autopilot, Steered
 from testbed.feeds.closed import Closed
 from testbed.feeds.feed import Feed
+from testbed.feeds.recorded import Recorded, located
 from testbed.feeds.simulated import Simulated, motion
 from testbed.motion.ahead import Ahead
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario
+
+__all__ = ["located", "open_feed"]
 
 
 def open_feed(
@@ -25,6 +29,8 @@ def open_feed(
     ``ahead`` (ticks of a chunk, ticks of the run) lets a motion that follows nothing fly in a process of its own.
     Raises UserError when the motion can't be started, or can't follow an estimate.
     """
+    if isinstance(scenario.truth, LogTruth):
+        return Recorded(scenario, seed)
     closed = bool(scenario.autopilot.feedback.estimators)  # on something else than truth
     by_itself = isinstance(scenario.truth, FlightTruth) and not closed and ahead is not None
     if source is None and by_itself and ahead is not None and Ahead.possible():

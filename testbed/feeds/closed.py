@@ -17,7 +17,7 @@ class Closed:
 
     def __init__(self, simulated: Simulated, autopilot: Autopilot) -> None:
         self.rate_hz, self.source = simulated.rate_hz, simulated.source
-        self.faults, self.aiding = simulated.faults, simulated.aiding
+        self.faults, self.receptions, self.origin = simulated.faults, simulated.receptions, simulated.origin
         self._autopilot, self._simulated = autopilot, simulated
 
     @property

@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 from nav.samples import ImuSamples, Sample
 from testbed.estimators.lane import Tracked
 from testbed.motion.table import MotionSource, TruthBlock
-from testbed.sensors import AidingSensor
 from testbed.sensors.faults import Faults
+from testbed.sensors.gnss import Reception
 
 
 class Turn(NamedTuple):
@@ -26,12 +26,15 @@ class Turn(NamedTuple):
 
 
 class Feed(Protocol):
-    """A source of turns. ``faults``, ``aiding`` and ``source`` are what requests act on (`testbed.loop.requests`)."""
+    """A source of turns. ``faults``, ``receptions`` (by receiver) and ``source`` are what requests act on
+    (`testbed.loop.requests`); ``origin`` is what a record says of a reference that is no truth, by attribute.
+    """
 
     rate_hz: float
     faults: Faults
-    aiding: dict[str, AidingSensor]
+    receptions: dict[str, Reception]
     source: MotionSource
+    origin: dict[str, str]
 
     @property
     def motion_s(self) -> float:

@@ -10,10 +10,11 @@ from nav.samples import ImuSamples, Sample
 from testbed import sensors
 from testbed.feeds.feed import Turn
 from testbed.motion.ahead import Ahead
-from testbed.motion.sections import FlightTruth
+from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.scenario import Scenario
 from testbed.sensors.faults import Faults
+from testbed.sensors.gnss import Gnss
 
 
 def motion(scenario: Scenario, seed: int) -> MotionSource:
@@ -25,6 +26,7 @@ def motion(scenario: Scenario, seed: int) -> MotionSource:
     from testbed.motion.kinematic import Kinematic
 
     truth = scenario.truth
+    assert isinstance(truth, KinematicTruth)  # a log has a feed of its own
     return Kinematic(truth.start, truth.rate_hz, truth.track(), truth.body)
 
 
@@ -43,6 +45,8 @@ class Simulated:
                 self.inertial[name] = sensor
             else:
                 self.aiding[name] = sensor
+        self.receptions = {name: one.reception for name, one in self.aiding.items() if isinstance(one, Gnss)}
+        self.origin: dict[str, str] = {}
         self.faults = Faults(scenario.fault, scenario.sensors, seed)
 
     @property

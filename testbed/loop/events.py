@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from nav.samples import Estimate, GnssSample, Sample, Status, UpdateReport
+from testbed.motion.logged import LogTruth
 from testbed.scenario import Scenario
 from testbed.sensors.faults import FaultTruth
 from testbed.sensors.imu import ImuConfig
@@ -118,7 +119,8 @@ def legs_unflown(scenario: Scenario, leg: float) -> str:
 
 def plan_flown(scenario: Scenario, end: float) -> tuple[str, str]:
     """Severity and text of a plan that ended before the run; a denial that it never reached is worth a warning."""
-    text = f"plan flown: the run ends at {end:.0f} s of {scenario.duration_s:g} s"
+    over = "the log is over" if isinstance(scenario.truth, LogTruth) else "plan flown"
+    text = f"{over}: the run ends at {end:.0f} s of {scenario.duration_s:g} s"
     missed = [
         f"{name} denied from {window[0]:g} s"
         for name, config in scenario.sensors.items()

@@ -19,7 +19,7 @@ from nav.samples import Estimate, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
-from testbed.feeds.build import open_feed
+from testbed.feeds.build import located, open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
 from testbed.loop.director import Director, Executor, Restarted
@@ -27,7 +27,6 @@ from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
 from testbed.loop.requests import Recorded, Request
 from testbed.loop.settings import Parts
-from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource
 from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
@@ -88,6 +87,7 @@ def run(
     with ExitStack() as ending:
         for link in links:
             ending.callback(link.close)
+        scenario = located(scenario)
         seed = scenario.seed if seed is None else seed
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
@@ -189,10 +189,9 @@ class _Passage:
         self.recorder = Recorder(setup.out / RECORD if setup.out else None, scenario, setup.seed)
         ending.callback(self.recorder.close)
         self.told = Listeners(setup.links, setup.progress, scenario.duration_s, self.recorder.event)
-        legs = scenario.plan if isinstance(scenario.truth, FlightTruth) else scenario.truth.segments
-        self.plan = [leg.leg for leg in legs]
+        self.recorder.attributes |= self.feed.origin
         self.watch = EventWatch.of(self.told.emit, self.feed.faults.truth, scenario)
-        plant = Parts(self.feed.faults, self.feed.aiding, self.lanes, self.feed.source)
+        plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)
         director.begin(Executor(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
         self.latest = _Latest()
         self.arrived: list[Sample] = []  # not looked at for events
@@ -283,7 +282,7 @@ class _Passage:
         for sample in self.arrived:
             self.watch.sample(sample)
         self.arrived.clear()
-        self.watch.row(t, leg, self.plan)
+        self.watch.row(t, leg, self.scenario.leg_names)
         for name, estimate in now:
             self.watch.estimate(name, estimate)
             for report in self.backlog[name].read_until(t):

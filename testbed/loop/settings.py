@@ -12,12 +12,11 @@ from testbed.estimators.ins import InsSection
 from testbed.motion.sections import FlightTruth
 from testbed.scenario import Scenario
 from testbed.sensors.faults import Faults
-from testbed.sensors.gnss import Gnss
 
 if TYPE_CHECKING:
     from testbed.estimators.lane import Lane
     from testbed.motion.table import MotionSource
-    from testbed.sensors import AidingSensor
+    from testbed.sensors.gnss import Reception
 
 from testbed.loop.injection import named
 from testbed.loop.requests import Refused
@@ -42,7 +41,7 @@ class Parts:
     """What requests act on: the parts of one run."""
 
     faults: Faults
-    aiding: Mapping[str, AidingSensor]
+    receptions: Mapping[str, Reception]
     filters: Mapping[str, Lane]
     source: MotionSource
 
@@ -115,9 +114,7 @@ def knobs(scenario: Scenario) -> dict[str, Knob]:
 
 def _jamming(sensor: str, setting: str) -> Callable[[Parts, Mapping[str, float]], None]:
     def act(parts: Parts, values: Mapping[str, float]) -> None:
-        receiver = parts.aiding[sensor]
-        assert isinstance(receiver, Gnss)
-        receiver.jammed = values[setting] > 0
+        parts.receptions[sensor].jammed = values[setting] > 0
 
     return act
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from testbed.errors import UserError
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import MotionSource, save_motion
 from testbed.scenario import Scenario
@@ -17,6 +18,8 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
     from testbed.feeds.simulated import motion
 
     first = scenarios[0]
+    if isinstance(first.truth, LogTruth):
+        return None  # it is read, not flown
     if not all(same_motion(first, scenario) for scenario in scenarios) or not seed_leaves_motion(first):
         return None
     truth = folder / "truth"

@@ -282,7 +282,8 @@ class Answers:
         """Height of home, as HOME_POSITION has it; before it is known, the start's."""
         if self.snapshot and self.snapshot.home:
             return self.snapshot.home[2]
-        return float(self._scenario.truth.start.alt_m) if self._scenario else 0.0
+        start = self._scenario.truth.start if self._scenario else None
+        return float(start.alt_m) if start else 0.0
 
     def _current(self) -> int:
         return messages.current_item(self.snapshot) if self.snapshot else 0

@@ -18,6 +18,7 @@ from nav.earth import position_difference_n
 from testbed.mavlink.encode import latitude_e7, longitude_e7
 from testbed.motion import guidance, legs, paths
 from testbed.motion.kinematic import Kinematic
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import Scenario
 from testbed.sensors.gnss import displaced
@@ -39,6 +40,8 @@ class Item:
 def items(scenario: Scenario, home_first: bool) -> list[Item]:
     """The plan's legs in order; with ``home_first`` after the start, as ArduPilot has it."""
     truth = scenario.truth
+    if isinstance(truth, LogTruth):
+        return []  # what it was to fly, nobody knows
     start = truth.start
     home = Item(
         mav.MAV_CMD_NAV_WAYPOINT,

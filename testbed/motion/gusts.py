@@ -11,7 +11,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from testbed.motion.legs import Leg
-from testbed.motion.sections import FlightTruth, KinematicTruth
+from testbed.motion.sections import FlightTruth
+from testbed.schema import Section
 
 FOOT = 0.3048  # [m]
 UNKNOWN_AIR = 1.0  # what is expected of air that nothing is said about [m/s]
@@ -43,7 +44,7 @@ def gust_sigma(level: str, alt_m: float) -> float:
     return (low + min((h - 1000.0) / 1000.0, 1.0) * (high - low)) * FOOT
 
 
-def expected_gust(truth: FlightTruth | KinematicTruth, plan: Sequence[Leg]) -> float:
+def expected_gust(truth: Section, plan: Sequence[Leg]) -> float:
     """The strongest gusts that a plan meets, rms [m/s]; `UNKNOWN_AIR` where no turbulence is asked for."""
     if not isinstance(truth, FlightTruth) or truth.wind.turbulence == "none":
         return UNKNOWN_AIR

@@ -117,6 +117,7 @@ def table_1() -> dict[str, Any]:
     are dV_E, over dL, and the smaller eps of a level gyro when the fix is in metres north but in radians east.
     """
     start = scenario("cheng2020").truth.start
+    assert start is not None  # a log's may be
     lat = math.radians(start.lat_deg)
     model = ErrorModel(ImuModel(1e-4, 1e-3, 1e-4, 0.05))
     places = model.places(PAPERS["cheng2020"])

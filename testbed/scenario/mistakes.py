@@ -11,6 +11,7 @@ from testbed.errors import UserError, unknown
 from testbed.estimators.ahrs import AhrsSection
 from testbed.estimators.section import EstimatorSection
 from testbed.motion import aircraft, guidance
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
@@ -31,7 +32,9 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     tick_hz = scenario.truth.rate_hz
     yield from _divides(("record", "rate_hz"), scenario.record.rate_hz, tick_hz)
     for name, config in scenario.sensors.items():
-        yield from _sensor_mistakes(("sensors", name), config, tick_hz, scenario.duration_s)
+        yield from _sensor_mistakes(("sensors", name), config, scenario.duration_s)
+        if not isinstance(scenario.truth, LogTruth):  # whose sensors have times of their own
+            yield from _tick_mistakes(("sensors", name), config, tick_hz)
     yield from _plan_mistakes(scenario)
     yield from _fault_mistakes(scenario)
     taken: set[str] = set()
@@ -47,24 +50,33 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     if not isinstance(scenario.truth, FlightTruth):
         if scenario.plan:
             yield ("plan",), f"a body of source {scenario.truth.source!r} flies no plan: leave it out"
-        yield from _track_mistakes(scenario.truth)
+        if isinstance(scenario.truth, KinematicTruth):
+            yield from _track_mistakes(scenario.truth)
+        elif scenario.truth.aircraft is not None:
+            yield from _aircraft_mistakes(scenario.truth.aircraft)
         return
     if not scenario.plan:
         yield ("plan",), "a flight needs a plan: add at least one [[plan]] leg"
         return
     named, wind = scenario.truth.aircraft, scenario.truth.wind
+    if complaints := list(_aircraft_mistakes(named)):
+        yield from complaints
+        return
+    envelope = aircraft.load(named)
+    strongest = max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
+    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, strongest):
+        yield keypath.read(key), what
+
+
+def _aircraft_mistakes(named: str) -> Iterator[tuple[KeyPath, str]]:
     if aircraft.find(named) is None:
         missing = unknown("aircraft", named, list(aircraft.shipped()))
         yield ("truth", "aircraft"), f"{missing}, or give the path of its folder, as seen from the scenario file"
         return
     try:
-        envelope = aircraft.load(named)
+        aircraft.load(named)
     except UserError as error:
         yield ("truth", "aircraft"), str(error)
-        return
-    strongest = max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
-    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, strongest):
-        yield keypath.read(key), what
 
 
 def _track_mistakes(truth: KinematicTruth) -> Iterator[tuple[KeyPath, str]]:
@@ -83,23 +95,24 @@ def _track_mistakes(truth: KinematicTruth) -> Iterator[tuple[KeyPath, str]]:
             yield keypath.read(key), what
 
 
-def _sensor_mistakes(
-    path: KeyPath, config: SensorConfig, tick_hz: float, duration_s: float
-) -> Iterator[tuple[KeyPath, str]]:
+def _sensor_mistakes(path: KeyPath, config: SensorConfig, duration_s: float) -> Iterator[tuple[KeyPath, str]]:
     name = str(path[-1])
     if not IDENTIFIER.fullmatch(name):
         yield path, "a sensor's name is made of letters, digits and _, and does not begin with a digit"
     elif len(name) > LONGEST_NAME:
         yield path, f"a sensor's name has at most {LONGEST_NAME} letters"
+    for start, end in getattr(config, "denied", ()):
+        if start >= duration_s:
+            window = f"window [{start:g}, {end:g}]"
+            yield (*path, "denied"), f"{window} starts after the end of the run: duration_s is {duration_s:g}"
+
+
+def _tick_mistakes(path: KeyPath, config: SensorConfig, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:
     yield from _divides((*path, "rate_hz"), config.rate_hz, tick_hz)
     offset_s = getattr(config, "offset_s", 0.0)
     if not _whole(offset_s * tick_hz):
         nearest = round(offset_s * tick_hz) / tick_hz
         yield (*path, "offset_s"), f"is not a multiple of the tick {1 / tick_hz:g} s: the nearest is {nearest:g}"
-    for start, end in getattr(config, "denied", ()):
-        if start >= duration_s:
-            window = f"window [{start:g}, {end:g}]"
-            yield (*path, "denied"), f"{window} starts after the end of the run: duration_s is {duration_s:g}"
 
 
 def _fault_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:

@@ -35,6 +35,7 @@ from testbed.estimators.rig import Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
 from testbed.motion import aircraft, legs
 from testbed.motion.gusts import expected_gust
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import keypath, messages, mistakes
 from testbed.schema import LONGEST_RUN_S, Section
@@ -158,7 +159,7 @@ class Scenario(Section):
     )
     duration_s: float = Field(gt=0, le=LONGEST_RUN_S, description="length of the run in simulated time")
     date: Date = Field(default=dt.date(2026, 1, 1), description="for the World Magnetic Model: of 2010 to 2029")
-    truth: FlightTruth | KinematicTruth = Field(discriminator="source", description="the motion")
+    truth: FlightTruth | KinematicTruth | LogTruth = Field(discriminator="source", description="the motion")
     plan: tuple[legs.Leg, ...] = Field(default=(), description="legs that a flight consists of, in order")
     sensors: dict[str, Annotated[SensorConfig, PlainValidator(_sensor)]] = Field(
         default_factory=dict, description="sensors by their names; a name is the kind unless `kind` says otherwise"
@@ -217,6 +218,8 @@ class Scenario(Section):
         truth, sensors = data.get("truth"), data.get("sensors")
         if isinstance(truth, dict) and isinstance(named := truth.get("aircraft"), str):
             truth["aircraft"] = _aircraft(named, path)
+        if isinstance(truth, dict) and truth.get("source") == "log" and isinstance(file := truth.get("file"), str):
+            truth["file"] = str((path.parent if path else Path()) / file)
         for name, table in sensors.items() if isinstance(sensors, dict) else ():
             if isinstance(table, dict):
                 table.setdefault("kind", name)
@@ -245,16 +248,28 @@ class Scenario(Section):
         overrides = json.loads(said.get("overrides", "[]"))
         return cls.parse(str(said["scenario"]), overrides, Path(path) if path else None)
 
+    @property
+    def leg_names(self) -> tuple[str, ...]:
+        """What the motion is made of, in order: the names of a flight's legs, or of a body's segments."""
+        match self.truth:
+            case FlightTruth():
+                return tuple(leg.leg for leg in self.plan)
+            case KinematicTruth():
+                return tuple(segment.leg for segment in self.truth.segments)
+        return ()
+
     def site(self) -> Site:
-        """Where and when the run starts."""
+        """Where and when the run starts. Raises UserError of a log that nobody has looked up yet."""
         start = self.truth.start
+        if start is None:
+            raise UserError("truth.start: is found in the log when it is run; to know it before, give it")
         return Site(self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m)
 
     def rig(self, seed: int) -> Rig:
         """What builders of estimators may know of a run with this seed."""
         folder = self._path.parent if self._path else Path()
         usual = aircraft.UNKNOWN_BODY
-        if isinstance(self.truth, FlightTruth):
+        if isinstance(self.truth, FlightTruth | LogTruth) and self.truth.aircraft is not None:
             usual = aircraft.load(self.truth.aircraft).usual
         gust_mps = expected_gust(self.truth, self.plan)
         return Rig(self.sensors, self.site(), self.truth.rate_hz, seed, folder, usual, gust_mps)

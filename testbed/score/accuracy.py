@@ -33,7 +33,8 @@ class Errors:
     ``angles`` (N, 3) differences of roll, pitch and heading [rad]; ``sigma_*`` (N, 3) what the estimator claimed;
     ``*_nees`` (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of
     alignment, None when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,)
-    rows that should be numbers and are not; ``valid`` (N,) rows that count.
+    rows that should be numbers and are not; ``valid`` (N,) rows that count. Of a recorded flight the reference stands
+    for truth: where it is unknown an error is NaN, which is not judged, and its own covariance is part of ``*_nees``.
     """
 
     t: Array
@@ -111,8 +112,10 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     velocity = estimated("v_n") - true("v_n")
     # Truth is of the centre of gravity, the estimate of the IMU. (The Earth's own rate does 1e-4 m/s per metre.)
     arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator])
-    position -= _rotate(true("q_nb"), np.broadcast_to(arm_b, position.shape))
-    velocity -= _rotate(true("q_nb"), np.cross(true("omega_b"), arm_b))
+    if arm_b.any():
+        lying = np.where(np.isfinite(true("q_nb")), true("q_nb"), estimated("q_nb"))  # as near as anybody knows
+        position -= _rotate(lying, np.broadcast_to(arm_b, position.shape))
+        velocity -= _rotate(lying, np.cross(true("omega_b"), arm_b))
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
     status = column(dataset, f"{own}/status")[rows]
@@ -120,13 +123,14 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     attitude_only = bool(np.any(aligned & ((status & Status.ATTITUDE_ONLY) != 0)))
     aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
     judged = slice(6 if attitude_only else 0, 9)
-    every = np.column_stack([position, velocity, attitude])[:, judged]
-    finite = np.isfinite(every).all(axis=1)
+    said = np.column_stack([estimated(name) for name in ("lat", "lon", "h", "v_n", "q_nb")])
+    finite = np.isfinite(said[:, 6 if attitude_only else 0 :]).all(axis=1)
     claimed = np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
     if claimed.any():  # one that never claims a covariance is judged by its errors alone
         finite &= claimed
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
     settled = since if aligned_s is None else t >= aligned_s + settling_s
+    own_n = np.array(json.loads(dataset.attrs.get("reference_sigma_n", "[0, 0, 0, 0, 0, 0]"))) ** 2
     return Errors(
         t=t,
         position=position,
@@ -136,8 +140,8 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         sigma_position=estimated("sigma_position_n"),
         sigma_velocity=estimated("sigma_velocity_n"),
         sigma_attitude=estimated("sigma_attitude_n"),
-        position_nees=nees(position, covariance[:, 0:3, 0:3]),
-        velocity_nees=nees(velocity, covariance[:, 3:6, 3:6]),
+        position_nees=nees(position, covariance[:, 0:3, 0:3] + np.diag(own_n[:3])),
+        velocity_nees=nees(velocity, covariance[:, 3:6, 3:6] + np.diag(own_n[3:])),
         attitude_nees=nees(attitude, covariance[:, 6:9, 6:9]),
         aligned_s=aligned_s,
         attitude_only=attitude_only,

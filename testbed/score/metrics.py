@@ -31,6 +31,8 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
   ``altitude_error`` from the altitude commanded; ``path_error``, across the circle of loiters that have a ``centre``,
   from `ON_CIRCLE_S` after it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the first
   `RETURN_S` after an outage.
+* A recorded flight is judged against its reference: the log's solution, or its GNSS, that kept back in a denial too.
+  What the reference doesn't know is not judged; its own covariance is added to the claimed one for NEES.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
 """
 
@@ -231,29 +233,27 @@ def _estimator(dataset: xarray.DataTree, name: str, windows: list[Window], settl
 
 
 def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
-    if not mask.any():
-        return {}
-    tilt, heading = np.rad2deg(e.tilt[mask]), np.rad2deg(e.attitude[mask, 2])
-    result = {}
-    if not e.attitude_only:
-        horizontal, speed = e.horizontal[mask], np.linalg.norm(e.velocity[mask], axis=1)
-        result = {
+    result: dict[str, float] = {}
+    axes: list[tuple[str, Array, str]] = []
+    positioned, moving, turned = (mask & np.isfinite(x).all(axis=1) for x in (e.position, e.velocity, e.attitude))
+    if not e.attitude_only and positioned.any():
+        horizontal = e.horizontal[positioned]
+        result |= {
             "position_horizontal_rms_m": _rms(horizontal),
             "position_horizontal_max_m": float(horizontal.max()),
-            "position_vertical_rms_m": _rms(e.position[mask, 2]),
-            "velocity_rms_mps": _rms(speed),
-            "velocity_max_mps": float(speed.max()),
-        } | worst_over_3sigma(e, mask, "position_horizontal_over_3sigma_max")
-    result |= {
-        "roll_pitch_rms_deg": _rms(tilt),
-        "roll_pitch_max_deg": float(tilt.max()),
-    }
-    axes = []
-    if not e.attitude_only:
-        axes += [(f"position_{axis}", e.position[mask, k], "m") for k, axis in enumerate(AXES)]
-        axes += [(f"velocity_{axis}", e.velocity[mask, k], "mps") for k, axis in enumerate(AXES)]
-    axes += [(axis, np.rad2deg(e.angles[mask, k]), "deg") for k, axis in enumerate(("roll", "pitch"))]
-    for axis, values, unit in [*axes, ("heading", heading, "deg")]:
+            "position_vertical_rms_m": _rms(e.position[positioned, 2]),
+        } | worst_over_3sigma(e, positioned, "position_horizontal_over_3sigma_max")
+        axes += [(f"position_{axis}", e.position[positioned, k], "m") for k, axis in enumerate(AXES)]
+    if not e.attitude_only and moving.any():
+        speed = np.linalg.norm(e.velocity[moving], axis=1)
+        result |= {"velocity_rms_mps": _rms(speed), "velocity_max_mps": float(speed.max())}
+        axes += [(f"velocity_{axis}", e.velocity[moving, k], "mps") for k, axis in enumerate(AXES)]
+    if turned.any():
+        tilt = np.rad2deg(e.tilt[turned])
+        result |= {"roll_pitch_rms_deg": _rms(tilt), "roll_pitch_max_deg": float(tilt.max())}
+        axes += [(axis, np.rad2deg(e.angles[turned, k]), "deg") for k, axis in enumerate(("roll", "pitch"))]
+        axes += [("heading", np.rad2deg(e.attitude[turned, 2]), "deg")]
+    for axis, values, unit in axes:
         result[f"{axis}_rms_{unit}"] = _rms(values)
         result[f"{axis}_max_{unit}"] = float(np.abs(values).max())
         result[f"{axis}_std_{unit}"] = float(values.std())
@@ -275,7 +275,7 @@ def _outage_marks(e: Errors, windows: list[Window]) -> dict[str, float]:
         found = []
         for start, end in windows:
             k = int(np.searchsorted(e.t, start + mark - SAME_TIME_S))
-            if start + mark < end and k < len(e.t) and e.valid[k]:
+            if start + mark < end and k < len(e.t) and e.valid[k] and np.isfinite(e.horizontal[k]):
                 found.append(e.horizontal[k])
         if found:
             result[f"outage_position_horizontal_at_{mark}s_m"] = float(max(found))
@@ -286,12 +286,13 @@ def _recovery(e: Errors, windows: list[Window]) -> dict[str, float]:
     """Seconds from reacquisition until the horizontal error is below `RECOVERED_M` for `RECOVERED_HOLD_S`.
 
     The worst of all outages. Outages after which it never is, before the next one or the end of the run, are counted
-    instead, and there is no such time; one that leaves less time than that is not judged. Non-finite rows count as bad.
+    instead, and there is no such time; one that leaves less time than that is not judged. Non-finite rows count as bad,
+    but for those that nobody knows the truth of.
     """
     found, never = [], 0
     for k, (start, end) in enumerate(windows):
         until = windows[k + 1][0] if k + 1 < len(windows) else np.inf
-        rows = np.flatnonzero((e.t >= end) & (e.t < until))
+        rows = np.flatnonzero((e.t >= end) & (e.t < until) & (np.isfinite(e.horizontal) | e.nonfinite))
         t = e.t[rows]
         if e.aligned_s is None or start < e.aligned_s or not len(t) or t[-1] - end < RECOVERED_HOLD_S - SAME_TIME_S:
             continue

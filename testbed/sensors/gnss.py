@@ -189,6 +189,48 @@ class GnssConfig(AidingTiming):
         )
 
 
+class Reception:
+    """Whether a receiver hears its signals: outside its windows of denial and its jammers, and some time after them.
+
+    ``has_fix`` is asked about every epoch, in order. While ``jammed`` is set, by who directs the run, it hears nothing
+    wherever it is. ``denied_until`` [s] is when it last could not.
+    """
+
+    def __init__(self, config: GnssConfig) -> None:
+        self.jammed = False
+        self.denied_until = -math.inf
+        self._denied, self._reacquire = config.denied, config.reacquire_s
+        self._jammers = [
+            (ecef_from_geodetic(j.lat_deg * DEG, j.lon_deg * DEG, 0.0), j.radius_m) for j in config.jammers
+        ]
+
+    def has_fix(self, t: float, lat: float, lon: float) -> bool:
+        """Signals are heard at ``t`` [s] by an antenna there, and have been for the time it takes to reacquire."""
+        for start, end in self._denied:
+            if start <= t:
+                self.denied_until = max(self.denied_until, end)
+        if self._is_jammed(lat, lon):
+            self.denied_until = max(self.denied_until, t)
+            return False
+        return t >= self.denied_until + self._reacquire
+
+    def _is_jammed(self, lat: float, lon: float) -> bool:
+        """Whether the point below the antenna is within a jammer's radius, as the crow flies."""
+        if self.jammed or not self._jammers:
+            return self.jammed
+        ground = ecef_from_geodetic(lat, lon, 0.0)
+        return any(math.dist(ground, centre) <= radius for centre, radius in self._jammers)
+
+
+def without_fix(t: float, t_arrival: float, sensor: str) -> GnssSample:
+    """What a receiver says that has no fix at ``t`` [s]."""
+    nothing = np.full(3, np.nan)
+    return GnssSample(
+        t, t_arrival, math.nan, math.nan, math.nan, nothing, nothing, nothing,
+        FixType.NO_FIX, 0, NO_FIX_DOP, NO_FIX_DOP, sensor,
+    )  # fmt: skip
+
+
 class Gnss:
     """One receiver on one run. ``sense`` is called with consecutive truth blocks of any length."""
 
@@ -211,11 +253,7 @@ class Gnss:
         self._sky = Process.gauss_markov(stream(seed, name, "sky"), [SATELLITES_SIGMA], SATELLITES_TAU, dt)
         self._sigma_position_n = np.maximum(np.hypot(e.position_white_n, e.position_correlated_n), REPORTED_AT_LEAST)
         self._sigma_velocity_n = np.maximum(np.hypot(e.velocity_white_n, e.velocity_correlated_n), REPORTED_AT_LEAST)
-        self._jammers = [
-            (ecef_from_geodetic(j.lat_deg * DEG, j.lon_deg * DEG, 0.0), j.radius_m) for j in config.jammers
-        ]
-        self._denied_until = -math.inf
-        self.jammed = False  # now, wherever it is; by who directs the run
+        self.reception = Reception(config)
 
     def sense(self, truth: TruthBlock) -> list[GnssSample]:
         """The epochs that fall inside this block; those without a fix are delivered too."""
@@ -242,11 +280,11 @@ class Gnss:
         return [self._sample(float(truth.t[k]), antenna[i], noise[i], sky[i, 0]) for i, k in enumerate(rows)]
 
     def _sample(self, t: float, antenna: Array, noise: Array, sky: float) -> GnssSample:
-        if not self._has_fix(t, antenna):
-            return self._no_fix(t)
         config = self._config
+        if not self.reception.has_fix(t, antenna[0], antenna[1]):
+            return without_fix(t, t + config.latency_s, self.name)
         unsettled = 1 + (config.settle_factor - 1) * math.exp(
-            -(t - self._denied_until - config.reacquire_s) / config.settle_s
+            -(t - self.reception.denied_until - config.reacquire_s) / config.settle_s
         )
         noise = noise * unsettled
         lat, lon, h = displaced(antenna[0], antenna[1], antenna[2], noise)
@@ -267,41 +305,6 @@ class Gnss:
             config.vdop * dilution,
             self.name,
         )
-
-    def _no_fix(self, t: float) -> GnssSample:
-        nothing = np.full(3, np.nan)
-        return GnssSample(
-            t,
-            t + self._config.latency_s,
-            math.nan,
-            math.nan,
-            math.nan,
-            nothing,
-            nothing,
-            nothing,
-            FixType.NO_FIX,
-            0,
-            NO_FIX_DOP,
-            NO_FIX_DOP,
-            self.name,
-        )
-
-    def _has_fix(self, t: float, antenna: Array) -> bool:
-        """Signals are heard, and have been for the time it takes to reacquire."""
-        for start, end in self._config.denied:
-            if start <= t:
-                self._denied_until = max(self._denied_until, end)
-        if self._is_jammed(antenna):
-            self._denied_until = max(self._denied_until, t)
-            return False
-        return t >= self._denied_until + self._config.reacquire_s
-
-    def _is_jammed(self, antenna: Array) -> bool:
-        """Whether the point below the antenna is within a jammer's radius, as the crow flies."""
-        if self.jammed or not self._jammers:
-            return self.jammed
-        ground = ecef_from_geodetic(antenna[0], antenna[1], 0.0)
-        return any(math.dist(ground, centre) <= radius for centre, radius in self._jammers)
 
 
 @njit

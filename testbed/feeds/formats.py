@@ -1,0 +1,91 @@
+"""Which formats of logs there are: a log is known by its first bytes, whatever its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple, TypeAlias
+
+from testbed.errors import UserError
+from testbed.feeds.log import Log
+from testbed.motion.logged import LogTruth, Stream
+
+LARGEST_BYTES = 1 << 30
+HEAD_BYTES = 4096
+
+Reader: TypeAlias = Callable[[Path, Mapping[str, Stream]], Log]
+
+
+class Format(NamedTuple):
+    """What a format is called, how a file of it begins, and the module beside this one that reads it."""
+
+    name: str
+    begins: tuple[bytes, ...]
+    module: str
+
+
+FORMATS = (
+    Format("run.nc", (b"\x89HDF\r\n\x1a\n",), "rerun"),
+    Format("npz", (b"PK\x03\x04",), "table"),
+    Format("MATLAB", (b"MATLAB 5.0 MAT-file",), "table"),
+)
+CSV = Format("CSV", (), "table")  # text, whatever it begins with
+
+
+def open_log(truth: LogTruth) -> Log:
+    """The log of a scenario, read once however often it is asked for.
+
+    Raises UserError when there is no such file, it is none of the known formats, or damaged.
+    """
+    path = Path(truth.file)
+    try:
+        stat = path.stat()
+    except OSError as error:
+        raise UserError(f"truth.file: {path}: {error.strerror}") from None
+    asked = truth.model_copy(update={"start": None, "start_s": 0.0})  # what the log is read by
+    return _read_once(asked.model_dump_json(), stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=2)
+def _read_once(truth: str, size: int, changed_ns: int) -> Log:
+    asked = LogTruth.model_validate_json(truth)
+    return read(Path(asked.file), asked.columns)
+
+
+def read(path: Path, columns: Mapping[str, Stream]) -> Log:
+    """A log by its path and, of a table, its ``columns``. Raises UserError as `open_log`."""
+    module = import_module(f"testbed.feeds.{known(path).module}")
+    made: Reader = module.read
+    return made(path, columns)
+
+
+def known(path: Path) -> Format:
+    """The format of a file. Raises UserError when it is none of those that are known."""
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder: give the log in it")
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror}") from None
+    if not head:
+        raise UserError(f"{path}: is empty: nothing was ever logged, or the copy failed")
+    if size > LARGEST_BYTES:
+        raise UserError(f"{path}: has {size / 2**30:.1f} GiB, of which at most 1 is read: cut it to the flight")
+    for one in FORMATS:
+        if head.startswith(one.begins):
+            return one
+    if head.startswith(b"PAR1"):
+        raise UserError(f"{path}: is Parquet, which is not read: write it as .npz or .csv")
+    if _is_text(head):
+        return CSV
+    names = ", ".join(one.name for one in (*FORMATS, CSV))
+    raise UserError(f"{path}: is no log of a known format: these are {names}")
+
+
+def _is_text(head: bytes) -> bool:
+    """Whether a file begins as a text of several columns does."""
+    return b"," in head and all(byte >= 32 or byte in b"\t\r\n" for byte in head)

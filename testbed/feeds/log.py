@@ -1,0 +1,109 @@
+"""A recorded flight, whatever its format: what each sensor delivered, and what is known of the motion.
+
+A format is one file beside this one, with ``read(path, columns) -> Log`` and a line in `testbed.feeds.formats`.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    BodyVelocitySample,
+    GnssSample,
+    ImuSamples,
+    MagnetometerSample,
+    PositionSample,
+    Sample,
+    StarSample,
+)
+from testbed.errors import UserError
+from testbed.motion.logged import Place
+
+# What a sensor of each kind delivers.
+SAMPLES: Mapping[str, type[Sample]] = {
+    "gnss": GnssSample,
+    "barometer": BarometerSample,
+    "magnetometer": MagnetometerSample,
+    "airspeed": AirspeedSample,
+    "body_velocity": BodyVelocitySample,
+    "star_tracker": StarSample,
+    "position_fix": PositionSample,
+}
+
+Samples: TypeAlias = Sequence[Sample]
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The motion as somebody else knew it: ``name`` says who; rows at ``t`` (N,) [s], ascending.
+
+    ``columns`` are those of the truth table that it has (`testbed.motion.table.COLUMNS`), NaN where it is silent.
+    ``sigma_position_n`` [m] and ``sigma_velocity_n`` [m/s] (3,) are how good it is, 0 where it is the truth.
+    """
+
+    name: str
+    t: Array
+    columns: Mapping[str, Array]
+    sigma_position_n: Array = field(default_factory=lambda: np.zeros(3))
+    sigma_velocity_n: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """What a log has: increments by IMU and samples by sensor, ascending in time, SI and body axes; times its own [s].
+
+    Without ``valid_times`` the times of samples are those at which they were told, and the sensor's latency is yet to
+    be taken off. Accuracies and velocities that a receiver does not report are NaN. ``t0`` is the first time of all,
+    ``start`` where the log itself says that it begins; ``messages`` the number of each kind that the file holds;
+    ``notes`` what was odd with it, a sentence each.
+    """
+
+    path: Path
+    format: str
+    imus: Mapping[str, ImuSamples]
+    samples: Mapping[str, Samples]
+    solution: Reference | None
+    t0: float
+    messages: Mapping[str, int]
+    notes: Sequence[str] = ()
+    valid_times: bool = False
+    date: dt.date | None = None
+    start: Place | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """Its sensors."""
+        return [*self.imus, *self.samples]
+
+    @property
+    def receiver(self) -> str | None:
+        """The first GNSS receiver with a fix, None when there is none."""
+        for name, own in self.samples.items():
+            if any(isinstance(one, GnssSample) and one.has_fix for one in own):
+                return name
+        return None
+
+
+def beginning(imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None) -> float:
+    """The first time [s] of a log: of its samples, of the reference, or one increment's length before the first."""
+    times = [float(imu.t[0]) for imu in imus.values() if len(imu)]
+    times += [own[0].t for own in samples.values() if own]
+    if reference is not None and len(reference.t):
+        times.append(float(reference.t[0]))
+    return min(times)
+
+
+def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, int], needed: str) -> None:
+    """Raise UserError when a log has no inertial data, with what it has and what would be needed."""
+    if not any(len(imu) > 1 for imu in imus.values()):
+        there = ", ".join(f"{name} ({count})" for name, count in sorted(found.items())) or "nothing at all"
+        raise UserError(f"{path}: has no inertial data: needed are {needed}; it has {there}")

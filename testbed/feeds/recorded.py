@@ -1,0 +1,265 @@
+"""The recorded feed: a log's samples in place of simulated ones; denial, jammers and faults act on them all alike."""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from nav.samples import Array, GnssSample, ImuSamples, Sample
+from testbed.errors import UserError
+from testbed.feeds import formats
+from testbed.feeds.feed import Turn
+from testbed.feeds.log import SAMPLES, Log, Reference
+from testbed.feeds.reference import ReferenceMotion, of_receiver, with_rates
+from testbed.feeds.stamps import at_times, bridged
+from testbed.motion.logged import LogTruth, Place
+from testbed.motion.table import MotionSource
+from testbed.scenario import Scenario
+from testbed.sensors.faults import Faults
+from testbed.sensors.gnss import REPORTED_AT_LEAST, GnssConfig, Reception, without_fix
+from testbed.sensors.imu import ImuConfig
+from testbed.sensors.timing import InterruptedTiming, Interruptions
+
+EDGE_S = 1e-6  # a sample this close to a row comes with it
+DIGITS = 3  # of a rate that is found
+SLOWEST_IMU_HZ = 5.0
+NOBODY = Reference("none: nothing is judged", np.empty(0), {})
+
+
+def located(scenario: Scenario) -> Scenario:
+    """A scenario of a log with what only the log can tell: where it begins, and the rates that it doesn't give.
+
+    Raises UserError when the log can't be read, or has not the sensors that the scenario asks for.
+    """
+    if not isinstance(scenario.truth, LogTruth):
+        return scenario
+    log = formats.open_log(scenario.truth)
+    _require_sensors(scenario, log)
+    start = scenario.truth.start or log.start or _start(log, scenario.truth.start_s)
+    sensors = {
+        name: section if "rate_hz" in section.model_fields_set else section.model_copy(update={"rate_hz": rate_hz})
+        for name, section in scenario.sensors.items()
+        for rate_hz in (rate(log, name),)
+    }
+    truth = scenario.truth.model_copy(update={"start": start})
+    return scenario.model_copy(update={"truth": truth, "sensors": sensors})
+
+
+def rate(log: Log, name: str) -> float:
+    """How often a sensor of a log reports [Hz], to `DIGITS` digits."""
+    t = log.imus[name].t if name in log.imus else np.array([one.t for one in log.samples[name]])
+    steps = np.diff(t)
+    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    return float(f"{1 / usual:.{DIGITS}g}")
+
+
+def _require_sensors(scenario: Scenario, log: Log) -> None:
+    """Raise UserError when a sensor of the scenario is not in its log, or of another kind."""
+    for name, section in scenario.sensors.items():
+        kind = section.kind
+        there = log.imus.get(name) if kind == "imu" else log.samples.get(name)
+        if there is None or not len(there):
+            known = ", ".join(log.names)
+            raise UserError(f"sensors.{name}: {log.path} has no {kind} of that name: it has {known}")
+        if kind != "imu" and not isinstance(there[0], SAMPLES.get(kind, object)):  # type: ignore[index]
+            raise UserError(f"sensors.{name}: {log.path} has something else than a {kind} under that name")
+        if kind == "imu" and rate(log, name) < SLOWEST_IMU_HZ:
+            slow = f"reports {rate(log, name):g} times a second: at least {SLOWEST_IMU_HZ:g} are needed"
+            raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
+
+
+def _start(log: Log, start_s: float) -> Place:
+    """Where a log begins: by its solution, or else by its GNSS."""
+    solution = log.solution.columns if log.solution is not None else {}
+    if log.solution is not None and "lat" in solution:
+        known = np.flatnonzero(np.isfinite(solution["lat"]) & (log.solution.t >= log.t0 + start_s))
+        if len(known):
+            return _place(*(float(solution[key][known[0]]) for key in ("lat", "lon", "h")))
+    for own in log.samples.values():
+        for one in own:
+            if isinstance(one, GnssSample) and one.has_fix and one.t >= log.t0 + start_s:
+                return _place(one.lat, one.lon, one.h)
+    raise UserError(f"{log.path}: says nowhere where it is: give truth.start with lat_deg, lon_deg and alt_m")
+
+
+def _place(lat: float, lon: float, h: float) -> Place:
+    return Place(lat_deg=math.degrees(lat), lon_deg=math.degrees(lon), alt_m=h)
+
+
+class Recorded:
+    """A log as a feed (`testbed.feeds.feed.Feed`): nothing in it depends on how it is asked for."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        truth = scenario.truth
+        assert isinstance(truth, LogTruth)
+        log = formats.open_log(truth)
+        self.rate_hz = truth.rate_hz
+        self.motion_s = 0.0
+        self.failure = ""
+        self.notes = log.notes
+        self._start = log.t0 + truth.start_s
+        self._imus = _increments(scenario, log, self._start)
+        self._samples = {
+            name: _told(section, log, name, self._start)
+            for name, section in scenario.sensors.items()
+            if not isinstance(section, ImuConfig)
+        }
+        self._times = {name: [one.t for one in own] for name, own in self._samples.items()}
+        rows = self._rows(scenario, log)
+        reference = self._reference(truth, log)
+        self._motion = ReferenceMotion(reference, truth.rate_hz, rows)
+        self.source: MotionSource = self._motion
+        self.origin = {
+            "reference": reference.name,
+            "reference_sigma_n": json.dumps([*reference.sigma_position_n, *reference.sigma_velocity_n]),
+            "log": f"{log.path.name} ({log.format})",
+        }
+        sections = scenario.sensors
+        self.receptions = {name: Reception(one) for name, one in sections.items() if isinstance(one, GnssConfig)}
+        self._interruptions = {
+            name: Interruptions(name, one, seed) for name, one in sections.items() if isinstance(one, InterruptedTiming)
+        }
+        self.faults = Faults(scenario.fault, sections, seed)
+        self._told = False
+
+    def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
+        """The next rows, and what came with them."""
+        block = self._motion.advance(ticks)
+        if not len(block):
+            return Turn(block, {}, {})
+        first, last = float(block.t[0]) - 1 / self.rate_hz, float(block.t[-1])
+        after = -math.inf if block.tick == 0 else first
+        imu = {name: self.faults.apply(name, _cut(own, max(after, 0.0), last)) for name, own in self._imus.items()}
+        samples = {name: self.faults.apply(name, self._heard(name, after, last)) for name in self._samples}
+        return Turn(block, imu, samples)
+
+    def activity(self) -> str:
+        """How far it has come."""
+        return self._motion.activity()
+
+    def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
+        """What was odd with the log, once."""
+        told, self._told = self._told, True
+        return [] if told else [(0.0, "info", f"log: {note}") for note in self.notes]
+
+    def remark(self) -> str:
+        """Nothing."""
+        return ""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _rows(self, scenario: Scenario, log: Log) -> int:
+        """How many rows there can be: estimates go as far as the inertial units do."""
+        ends = [float(own.t[-1]) for own in self._imus.values() if len(own)]
+        end = min(ends, default=scenario.duration_s)
+        if len(ends) < len(self._imus) or end <= 0:
+            lasts = max(float(own.t[-1]) for own in log.imus.values() if len(own)) - log.t0
+            raise UserError(f"truth.start_s: {log.path} is over by then: it lasts {lasts:.1f} s")
+        return math.floor(end * self.rate_hz + EDGE_S) + 1
+
+    def _reference(self, truth: LogTruth, log: Log) -> Reference:
+        """What is judged against."""
+        if truth.reference == "none":
+            return NOBODY
+        solution = log.solution
+        if solution is not None and truth.reference == "solution":
+            found = replace(solution, t=solution.t - self._start)
+        elif (receiver := log.receiver) is None:
+            return NOBODY
+        else:
+            told = self._samples.get(receiver)
+            if told is None:
+                told = _told(GnssConfig.model_validate({}), log, receiver, self._start)
+            found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver)
+            if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
+                found = _with_attitude(found, solution, self._start)
+        return with_rates(found, next(iter(self._imus.values()))) if self._imus else found
+
+    def _heard(self, name: str, after: float, until: float) -> Sequence[Sample]:
+        """The samples of one sensor in (``after``, ``until``] [s], as denial leaves them."""
+        times = self._times[name]
+        first = bisect_right(times, after + EDGE_S)
+        own = self._samples[name][first : bisect_right(times, until + EDGE_S)]
+        if name in self.receptions:
+            return [self._received(self.receptions[name], one) for one in own]
+        if name in self._interruptions and own:
+            kept = self._interruptions[name].kept(np.array([one.t for one in own]))
+            return [one for one, keep in zip(own, kept, strict=True) if keep]
+        return own
+
+    @staticmethod
+    def _received(reception: Reception, sample: Any) -> Sample:
+        if reception.has_fix(sample.t, sample.lat, sample.lon):
+            return sample  # type: ignore[no-any-return]
+        return without_fix(sample.t, sample.t_arrival, sample.sensor)
+
+
+def _with_attitude(found: Reference, solution: Reference, start: float) -> Reference:
+    """The receiver's reference with the attitude that the log's solution has at its times."""
+    rows = ReferenceMotion(replace(solution, t=solution.t - start), 1.0, 0)
+    q = rows.at(found.t).q_nb
+    name = f"{found.name}; attitude: {solution.name}"
+    return replace(found, name=name, columns={**found.columns, "q_nb": q})
+
+
+def _increments(scenario: Scenario, log: Log, start: float) -> dict[str, ImuSamples]:
+    """The increments of each unit from the start on, those of spares at the times of the unit that they stand in for.
+
+    A unit whose increments are not all of one length is given in pieces none of which is longer than the first.
+    """
+    found = {}
+    for name, section in scenario.sensors.items():
+        if isinstance(section, ImuConfig):
+            own = log.imus[name]
+            moved = own if start == 0.0 else replace(own, t=own.t - start)
+            found[name] = bridged(_cut(moved, 0.0, math.inf))
+    for estimator in scenario.estimator:
+        for spare in estimator.spare_imus:
+            if spare in found and not np.array_equal(found[spare].t, found[estimator.imu].t):
+                found[spare] = at_times(found[spare], found[estimator.imu])
+    return found
+
+
+def _cut(imu: ImuSamples, after: float, until: float) -> ImuSamples:
+    """The increments that end in (``after``, ``until``] [s]."""
+    first, stop = np.searchsorted(imu.t, [after + EDGE_S, until + EDGE_S], side="right")
+    rows = slice(int(first), int(stop))
+    return ImuSamples(imu.t[rows], imu.dt[rows], imu.dtheta[rows], imu.dv[rows])
+
+
+def _told(section: Any, log: Log, name: str, start: float) -> list[Sample]:
+    """The samples of one sensor in the order of their times, from the start on, with what the log leaves out.
+
+    A log that has one time only tells when a sample arrived: it was valid a ``latency_s`` before.
+    """
+    late = 0.0 if log.valid_times else section.latency_s
+    told: list[Sample] = []
+    for one in log.samples[name]:
+        t, arrival = one.t - start - late, one.t_arrival - start
+        if t < -EDGE_S:
+            continue
+        changed: Any = one if t == one.t and arrival == one.t_arrival else replace(one, t=t, t_arrival=arrival)
+        told.append(_with_sigmas(changed, section) if isinstance(changed, GnssSample) else changed)
+    return told
+
+
+def _with_sigmas(fix: GnssSample, section: GnssConfig) -> GnssSample:
+    """A fix with the accuracies that the scenario declares where the log has none: they grow with dilution."""
+    given: dict[str, Array] = {}
+    errors = section.errors()
+    if fix.has_fix and not np.isfinite(fix.sigma_position_n).all():
+        told = np.maximum(np.hypot(errors.position_white_n, errors.position_correlated_n), REPORTED_AT_LEAST)
+        worse = [one / usual for one, usual in ((fix.hdop, section.hdop), (fix.vdop, section.vdop))]
+        horizontal, vertical = (max(1.0, one) if math.isfinite(one) else 1.0 for one in worse)
+        given["sigma_position_n"] = told * np.array([horizontal, horizontal, vertical])
+    if fix.has_fix and not np.isfinite(fix.sigma_velocity_n).all() and np.isfinite(fix.v_n).all():
+        told = np.hypot(errors.velocity_white_n, errors.velocity_correlated_n)
+        given["sigma_velocity_n"] = np.maximum(told, REPORTED_AT_LEAST)
+    return replace(fix, **given) if given else fix  # type: ignore[arg-type]

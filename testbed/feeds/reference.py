@@ -1,0 +1,141 @@
+"""The reference of a recorded flight as a motion: rows at every tick, unknown where nobody knew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nav.earth import position_difference_n, radii, wrap_longitude
+from nav.samples import Array, GnssSample, ImuSamples
+from testbed.feeds.log import Reference
+from testbed.feeds.stamps import Rows
+from testbed.motion.table import COLUMNS, TruthBlock
+
+SAME_TIME_S = 1e-6
+LONGEST_STEP_S = 1.5  # between rows that are joined: a receiver of 1 Hz may be late
+STEPS = 3.0  # or so many of its own, where it is slower
+KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
+
+
+class ReferenceMotion:
+    """A motion source (`testbed.motion.table.MotionSource`) that gives ``rows`` rows of what is known of a flight.
+
+    At the times of the reference its own rows; between two that are near each other, position on the cubic through both
+    with their velocities, or the straight line where they have none, the attitude turned evenly and all else in
+    proportion. NaN where there is nothing.
+    """
+
+    def __init__(self, reference: Reference, rate_hz: float, rows: int) -> None:
+        self.rate_hz = rate_hz
+        self.failure = ""
+        self._reference, self._rows, self._tick = reference, rows, 0
+        steps = np.diff(reference.t)
+        usual = float(np.median(steps)) if len(steps) else 0.0
+        self._longest = max(LONGEST_STEP_S, STEPS * usual)
+
+    def advance(self, ticks: int) -> TruthBlock:
+        """The next rows, fewer when the log ends."""
+        n = max(min(ticks, self._rows - self._tick), 0)
+        t = (self._tick + np.arange(n)) / self.rate_hz
+        block = self.at(t, self._tick)
+        self._tick += n
+        return block
+
+    def at(self, t: Array, tick: int = 0) -> TruthBlock:
+        """What is known at the times ``t`` (N,) [s]."""
+        block = TruthBlock.empty(tick, len(t))
+        self._fill(block, t)
+        return block
+
+    def activity(self) -> str:
+        """How far it has come."""
+        return f"log {self._tick / self.rate_hz:.0f}/{(self._rows - 1) / self.rate_hz:.0f} s"
+
+    def _fill(self, block: TruthBlock, t: Array) -> None:
+        """Write the rows at ``t``."""
+        block.t[:] = t
+        for name in COLUMNS:
+            if name != "t":
+                getattr(block, name)[:] = KNOWN.get(name, np.nan)
+        own = self._reference.t
+        if not len(own) or not len(t):
+            return
+        after = np.clip(np.searchsorted(own, t - SAME_TIME_S), 0, len(own) - 1)
+        at = np.abs(own[after] - t) <= SAME_TIME_S
+        before = np.maximum(after - 1, 0)
+        step = own[after] - own[before]
+        between = ~at & (own[before] < t) & (t < own[after]) & (step <= self._longest)
+        rows, i, j = np.flatnonzero(between), before[between], after[between]
+        share = (t[between] - own[i]) / step[between]
+        for name, values in self._reference.columns.items():
+            if name in ("dtheta", "dv"):
+                continue  # sums over the steps of the record, not of ticks
+            column = getattr(block, name)
+            column[at] = values[after[at]]
+            column[rows] = values[i] if name == "leg" else _between(values[i], values[j], share)
+        _turn(block, self._reference, rows, (i, j), share)
+        _move(block, self._reference, rows, (i, j), share)
+
+
+def _between(first: Array, second: Array, share: Array) -> Array:
+    """The part ``share`` (N,) of the way from one (N, ...) to the other."""
+    part = share.reshape(-1, *[1] * (first.ndim - 1))
+    value: Array = first + part * (second - first)
+    return value
+
+
+def _turn(block: TruthBlock, reference: Reference, rows: Rows, ends: tuple[Rows, Rows], share: Array) -> None:
+    """Attitude between two rows, the short way."""
+    if "q_nb" not in reference.columns or not len(rows):
+        return
+    first, second = (reference.columns["q_nb"][end] for end in ends)
+    near = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
+    q = _between(first, near, share)
+    block.q_nb[rows] = q / np.linalg.norm(q, axis=1, keepdims=True)
+
+
+def _move(block: TruthBlock, reference: Reference, rows: Rows, ends: tuple[Rows, Rows], share: Array) -> None:
+    """Position between two rows: on Hermite's cubic where velocities are known."""
+    if "lat" not in reference.columns or not len(rows):
+        return
+    (lat, lat_1), (lon, lon_1), (h, h_1) = (
+        [reference.columns[name][end] for end in ends] for name in ("lat", "lon", "h")
+    )
+    way = position_difference_n(lat_1, lon_1, h_1, lat, lon, h)
+    s = share[:, None]
+    moved = s * way
+    if "v_n" in reference.columns:
+        v, v_1 = (reference.columns["v_n"][end] for end in ends)
+        step = (reference.t[ends[1]] - reference.t[ends[0]])[:, None]
+        cubic = (3 - 2 * s) * s * s * way + step * s * (1 - s) * ((1 - s) * v - s * v_1)
+        moved = np.where(np.isfinite(cubic), cubic, moved)
+    R_M, R_N = radii(lat)
+    block.lat[rows] = lat + moved[:, 0] / (R_M + h)
+    block.lon[rows] = wrap_longitude(lon + moved[:, 1] / ((R_N + h) * np.cos(lat)))
+    block.h[rows] = h - moved[:, 2]
+
+
+def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:
+    """A receiver's own fixes as the reference, as good as it says."""
+    fixes = [one for one in samples if one.has_fix]
+
+    def rows(key: str) -> Array:
+        return np.array([getattr(one, key) for one in fixes], float)
+
+    columns = {key: rows(key) for key in ("lat", "lon", "h")} | {"v_n": rows("v_n").reshape(-1, 3)}
+    sigma = [rows(key).reshape(-1, 3) for key in ("sigma_position_n", "sigma_velocity_n")]
+    position, velocity = (np.nanmedian(s, axis=0) if np.isfinite(s).any() else np.zeros(3) for s in sigma)
+    return Reference(f"{name} of the log, kept back where it is denied", rows("t"), columns, position, velocity)
+
+
+def with_rates(reference: Reference, imu: ImuSamples) -> Reference:
+    """The same with the angular rates of an IMU, body axes, where it has none of its own: levers swing by them."""
+    if "omega_b" in reference.columns or not len(reference.t):
+        return reference
+    at = np.clip(np.searchsorted(imu.t, reference.t), 0, len(imu) - 1)
+    rates = imu.dtheta[at] / imu.dt[at, None]
+    columns = {**reference.columns, "omega_b": rates}
+    return Reference(
+        reference.name, reference.t, columns, reference.sigma_position_n, reference.sigma_velocity_n
+    )  # fmt: skip

@@ -1,0 +1,101 @@
+"""Columns of a log as the samples that estimators take; what a log leaves out is NaN."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from nav.earth import SEA_LEVEL_DENSITY
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    BarometerSample,
+    FixType,
+    GnssSample,
+    MagnetometerSample,
+    Sample,
+)
+from testbed.sensors.gnss import NO_FIX_DOP, without_fix
+
+UNKNOWN = np.full(3, np.nan)
+
+
+class Fixes:
+    """What a receiver said at times ``t`` (N,) [s]: latitude, longitude [rad], height [m], all (N,).
+
+    What else it says is given afterwards, and NaN until then: velocity and 1-sigmas (N, 3) NED, type of fix,
+    satellites, dilutions (N,). Without a type there is a fix where there is a position.
+    """
+
+    def __init__(self, t: Array, lat: Array, lon: Array, h: Array) -> None:
+        n = len(t)
+        self.t, self.lat, self.lon, self.h = t, lat, lon, h
+        self.v_n, self.sigma_position_n, self.sigma_velocity_n = (np.full((n, 3), np.nan) for _ in range(3))
+        known = np.isfinite(lat) & np.isfinite(lon) & np.isfinite(h)
+        self.fix = np.where(known, int(FixType.FIX_3D), int(FixType.NO_FIX)).astype(float)
+        self.satellites, self.hdop, self.vdop = np.zeros(n), np.full(n, np.nan), np.full(n, np.nan)
+
+    def samples(self, name: str) -> list[Sample]:
+        """The same as samples of the receiver ``name``."""
+        return [self._sample(k, name) for k in range(len(self.t))]
+
+    def _sample(self, k: int, name: str) -> Sample:
+        t, fix = float(self.t[k]), self.fix[k]
+        if not fix >= FixType.FIX_3D:  # NaN is no fix either
+            return without_fix(t, t, name)
+        hdop, vdop = (float(x) if x < NO_FIX_DOP else math.nan for x in (self.hdop[k], self.vdop[k]))
+        return GnssSample(
+            t, t, float(self.lat[k]), float(self.lon[k]), float(self.h[k]), self.v_n[k].copy(),
+            _positive(self.sigma_position_n[k]), _positive(self.sigma_velocity_n[k]), FixType.FIX_3D,
+            int(np.nan_to_num(self.satellites[k])), hdop, vdop, name,
+        )  # fmt: skip
+
+
+def _positive(sigma: Array) -> Array:
+    """The same, or NaN where a receiver says something that is no accuracy."""
+    return sigma.copy() if (sigma > 0).all() else UNKNOWN
+
+
+def barometers(name: str, t: Array, pressure: Array) -> list[Sample]:
+    """Static pressures [Pa]."""
+    return [BarometerSample(s, s, p, name) for s, p in zip(t.tolist(), pressure.tolist(), strict=True)]
+
+
+def magnetometers(name: str, t: Array, field_b: Array) -> list[Sample]:
+    """Magnetic fields (N, 3) [T], body axes."""
+    return [MagnetometerSample(s, s, field_b[k].copy(), name) for k, s in enumerate(t.tolist())]
+
+
+def airspeeds(name: str, t: Array, eas: Array) -> list[Sample]:
+    """Equivalent airspeeds [m/s]."""
+    return [AirspeedSample(s, s, v, name) for s, v in zip(t.tolist(), eas.tolist(), strict=True)]
+
+
+def eas_of(dynamic_pressure: npt.ArrayLike) -> Array:
+    """Equivalent airspeed [m/s] of a dynamic pressure [Pa]: none where it is negative."""
+    eas: Array = np.sqrt(2 * np.maximum(dynamic_pressure, 0.0) / SEA_LEVEL_DENSITY)
+    return eas
+
+
+def spread(horizontal: npt.ArrayLike, vertical: npt.ArrayLike) -> Array:
+    """Accuracies along north, east, down (N, 3) of those in the horizontal, per axis, and the vertical (N,)."""
+    level = np.asarray(horizontal, float)
+    sigma: Array = np.column_stack([level, level, np.asarray(vertical, float)])
+    return sigma
+
+
+def quaternions(roll: npt.ArrayLike, pitch: npt.ArrayLike, heading: npt.ArrayLike) -> Array:
+    """Attitudes q_nb (N, 4) of angles (N,) [rad], as `nav.rotation.quat_from_euler`."""
+    half = [0.5 * np.asarray(angle, float) for angle in (roll, pitch, heading)]
+    (cr, cp, ch), (sr, sp, sh) = (np.cos(half), np.sin(half))
+    q: Array = np.column_stack(
+        [
+            cr * cp * ch + sr * sp * sh,
+            sr * cp * ch - cr * sp * sh,
+            cr * sp * ch + sr * cp * sh,
+            cr * cp * sh - sr * sp * ch,
+        ]
+    )
+    return q

@@ -1,0 +1,164 @@
+"""Times as logs have them: jittered, repeated, out of order, wrapped, with gaps. What is done about each is told.
+
+A counter that wraps goes on; a time that comes twice, or is no number, is left out; out of order is put in order. Where
+time goes back for good, the clock was set or the vehicle started again: the longer part is kept.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from nav.samples import Array, ImuSamples
+
+Rows: TypeAlias = npt.NDArray[np.intp]
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+# After which counters begin anew [s]: 32 bits of microseconds, of milliseconds; 16 of milliseconds; a GPS week.
+WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0)
+WRAP_SHARE = 0.02  # of it, by which a jump may miss it
+STRAY = 8  # rows by which times may be out of order
+GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
+PIECE = 1.5  # usual increments: the longest that there may be
+
+
+def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, Rows]:
+    """Ascending times [s] of the stamps (N,) of a stream, and the rows that they belong to; what was odd to ``notes``.
+
+    ``notes`` gets a sentence for each kind of thing, beginning with the stream's ``name``.
+    """
+    t = np.array(stamps, float)
+    rows: Rows = np.arange(len(t))
+    sound = np.isfinite(t)
+    if not sound.all():
+        notes.append(f"{name}: {np.sum(~sound)} times are no numbers, and left out")
+        t, rows = t[sound], rows[sound]
+    t = _unwrapped(name, t, notes)
+    t, rows = _longest_part(name, t, rows, notes)
+    order = np.argsort(t, kind="stable")
+    moved = int(np.sum(np.diff(t) < 0))
+    if moved:
+        notes.append(f"{name}: {moved} times are out of order, and put in order")
+    t, rows = t[order], rows[order]
+    new = np.diff(t, prepend=-np.inf) > 0
+    if not new.all():
+        notes.append(f"{name}: {np.sum(~new)} times come again, and are left out")
+    t, rows = t[new], rows[new]
+    _note_gaps(name, t, notes)
+    return t, rows
+
+
+def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
+    """The same with counters that began anew going on."""
+    steps = np.diff(t)
+    for wrap in WRAPS:
+        back = np.abs(steps + wrap) < WRAP_SHARE * wrap
+        if back.any():
+            notes.append(f"{name}: the clock began anew after {wrap:g} s, {np.sum(back)} times, and goes on")
+            t = t + wrap * np.concatenate([[0.0], np.cumsum(back)])
+            steps = np.diff(t)
+    return t
+
+
+def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Array, Rows]:
+    """The longest stretch in which time does not go back for good: by more than `STRAY` rows' worth."""
+    if len(t) <= STRAY:
+        return t, rows
+    newest = np.maximum.accumulate(t)
+    behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
+    begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
+    if not len(begins):
+        return t, rows
+    edges = [0, *begins.tolist(), len(t)]
+    longest = max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
+    part = slice(edges[longest], edges[longest + 1])
+    left = len(t) - (part.stop - part.start)
+    notes.append(f"{name}: time goes back {len(begins)} times: the longest part is kept, {left} rows are left out")
+    return t[part], rows[part]
+
+
+def _note_gaps(name: str, t: Array, notes: list[str]) -> None:
+    steps = np.diff(t)
+    if not len(steps):
+        return
+    gaps = np.flatnonzero(steps > _gap(float(np.median(steps))))
+    if len(gaps):
+        worst = gaps[np.argmax(steps[gaps])]
+        after = t[worst] - t[0]
+        said = f"{len(gaps)} gaps, the longest" if len(gaps) > 1 else "a gap"
+        notes.append(f"{name}: {said} of {steps[worst]:.3g} s, {after:.1f} s after its beginning")
+
+
+def _gap(usual: float) -> float:
+    """What is a gap, where steps are usually so long [s]."""
+    return max(GAP_PERIODS * usual, GAP_S)
+
+
+def integrated(t: Array, gyro: Array, accel: Array, form: str) -> ImuSamples:
+    """Increments from rates (N, 3) [rad/s] and specific forces [m/s^2] at ascending times (N,).
+
+    ``form``: means over the step before (``averaged``), values at the time (``instantaneous``: the trapezoid), or
+    ``increments`` themselves, in rad and m/s. The step before the first is taken to be the usual one.
+    """
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
+    dt = np.diff(t, prepend=t[:1] - usual)
+    if form == "increments":
+        return ImuSamples(t, dt, gyro, accel)
+    if form == "instantaneous":
+        gyro, accel = (np.vstack([x[:1], 0.5 * (x[1:] + x[:-1])]) if len(x) else x for x in (gyro, accel))
+    return ImuSamples(t, dt, gyro * dt[:, None], accel * dt[:, None])
+
+
+def bridged(imu: ImuSamples) -> ImuSamples:
+    """The same without steps longer than `PIECE` times the usual one.
+
+    What is longer comes in equal pieces, all at its rates; over a gap nothing is known, and increments are NaN up to
+    the usual step before its end. The first is as long as any, so that no wait for the next comes as a surprise.
+    """
+    if len(imu) < 2:
+        return imu
+    usual = float(np.median(imu.dt))
+    most = PIECE * usual
+    if float(imu.dt.max()) <= float(imu.dt[0]):
+        return imu
+    gap: Mask = np.asarray(imu.dt > _gap(usual))
+    pieces = np.where(imu.dt > most, np.ceil(imu.dt / most), 1.0).astype(int)
+    row = np.repeat(np.arange(len(imu)), pieces)
+    number = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1
+    dt = (imu.dt / pieces)[row]
+    t = np.where(number == pieces[row], imu.t[row], imu.t[row] - imu.dt[row] + number * dt)
+    rates = np.hstack([imu.dtheta, imu.dv]) / imu.dt[:, None]
+    rates = rates[row]
+    rates[gap[row] & (number < pieces[row])] = np.nan
+    dt[0] = max(float(dt.max()), dt[0])
+    whole = rates * dt[:, None]
+    one: Mask = np.repeat(pieces == 1, pieces)
+    one[0] = False
+    whole[one] = np.hstack([imu.dtheta, imu.dv])[row[one]]  # as they are, to the last bit
+    return ImuSamples(t, dt, np.ascontiguousarray(whole[:, :3]), np.ascontiguousarray(whole[:, 3:]))
+
+
+def at_times(imu: ImuSamples, other: ImuSamples) -> ImuSamples:
+    """Increments of one unit over the intervals of another: what was integrated by their ends, in proportion."""
+    rows = np.hstack([imu.dtheta, imu.dv])
+    known: Mask = np.asarray(np.isfinite(rows).all(axis=1))
+    whole = np.cumsum(np.where(known[:, None], rows, 0.0), axis=0)
+    ends = np.concatenate([other.t[:1] - other.dt[:1], other.t])
+    parts = np.diff(np.column_stack([np.interp(ends, imu.t, column) for column in whole.T]), axis=0)
+    after = np.clip(np.searchsorted(imu.t, other.t), 0, len(imu) - 1)
+    outside: Mask = (other.t > imu.t[-1]) | (other.t - other.dt < imu.t[0] - imu.dt[0])
+    parts[outside | ~known[after]] = np.nan
+    return ImuSamples(other.t, other.dt, np.ascontiguousarray(parts[:, :3]), np.ascontiguousarray(parts[:, 3:]))
+
+
+def joined(name: str, t: Array, other: Array, most: float) -> tuple[Rows, Rows]:
+    """Rows of two ascending series of times that belong together: for each of ``t`` the nearest within ``most`` [s]."""
+    if not len(other):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    right = np.clip(np.searchsorted(other, t), 0, len(other) - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(np.abs(other[left] - t) <= np.abs(other[right] - t), left, right)
+    rows = np.flatnonzero(np.abs(other[nearest] - t) <= most)
+    return rows, nearest[rows]

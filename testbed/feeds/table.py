@@ -1,0 +1,227 @@
+"""A table as a log: .npz, .csv or .mat, of which the scenario says what each column is (`testbed.motion.logged`)."""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from nav.earth import isa_pressure
+from nav.samples import Array, ImuSamples
+from testbed.errors import UserError, choice, unknown
+from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
+from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, quaternions
+from testbed.feeds.stamps import integrated, ordered
+from testbed.motion.logged import Column, Stream
+from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
+
+Table: TypeAlias = Mapping[str, Array]
+
+TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": 1e-7 * DEG}
+LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048}
+SPEED = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6, "kn": 1852 / 3600, "ft/s": 0.3048}
+PRESSURE = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1000.0}
+ONE = {"1": 1.0}
+# The units that a quantity may be in, the SI unit first.
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": TIME,
+    "gyro": {"rad/s": 1.0, "deg/s": DEG, "deg/h": DEG_PER_H, "rad": 1.0, "deg": DEG},
+    "accel": {"m/s^2": 1.0, "g": G, "mg": MG, "m/s": 1.0},
+    "lat": ANGLE,
+    "lon": ANGLE,
+    "height": LENGTH,
+    "velocity": SPEED,
+    "sigma_position": LENGTH,
+    "sigma_velocity": SPEED,
+    "fix": ONE,
+    "satellites": ONE,
+    "hdop": ONE,
+    "vdop": ONE,
+    "pressure": PRESSURE,
+    "field": {"T": 1.0, "uT": MICROTESLA, "nT": 1e-9, "G": 1e-4, "mG": 1e-7},
+    "airspeed": SPEED,
+    "attitude": ANGLE,
+}
+VECTORS = frozenset({"gyro", "accel", "velocity", "sigma_position", "sigma_velocity", "field"})
+# What each kind needs, one of each tuple, and what it may have.
+NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
+    "imu": (("gyro",), ("accel",)),
+    "gnss": (("lat",), ("lon",), ("height",)),
+    "barometer": (("pressure", "height"),),
+    "magnetometer": (("field",),),
+    "airspeed": (("airspeed", "pressure"),),
+    "reference": (),
+}
+OPTIONAL: Mapping[str, tuple[str, ...]] = {
+    "gnss": ("velocity", "sigma_position", "sigma_velocity", "fix", "satellites", "hdop", "vdop"),
+    "reference": ("lat", "lon", "height", "velocity", "attitude"),
+}
+
+
+def read(path: Path, columns: Mapping[str, Stream]) -> Log:
+    """Read a table by the ``columns`` of its sensors. Raises UserError when it, or what is said of it, is wrong."""
+    table = load(path)
+    found = {name: len(values) for name, values in table.items()}
+    if not columns:
+        there = ", ".join(f"{name} {values.shape}" for name, values in table.items())
+        raise UserError(
+            f"{path}: is a table: say in [truth.columns.<sensor>] what its columns are. It has {there or 'none'}"
+        )
+    notes: list[str] = []
+    imus: dict[str, ImuSamples] = {}
+    samples: dict[str, Samples] = {}
+    reference = None
+    for name, stream in columns.items():
+        kind = stream.kind or name
+        t, values = _stream(table, name, kind, stream, notes)
+        if kind == "imu":
+            imus[name] = integrated(t, values["gyro"], values["accel"], stream.form)
+        elif kind == "reference":
+            reference = _reference(t, values)
+        else:
+            samples[name] = _samples(name, kind, t, values)
+    require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
+    return Log(path, "table", imus, samples, reference, beginning(imus, samples, reference), found, notes)
+
+
+def load(path: Path) -> dict[str, Array]:
+    """The columns of a file by name, each (N,) or (N, k) of numbers. Raises UserError when it can't be read."""
+    with path.open("rb") as file:
+        head = file.read(16)
+    try:
+        if head.startswith(b"PK"):
+            with np.load(path, allow_pickle=False) as arrays:
+                return dict(_numbers(arrays.items()))
+        if head.startswith(b"MATLAB"):
+            from scipy.io import loadmat
+
+            return dict(_numbers(_flat(loadmat(path, simplify_cells=True))))
+        import pandas
+
+        frame = pandas.read_csv(path, skipinitialspace=True)
+        return dict(_numbers((str(name), frame[name].to_numpy()) for name in frame.columns))
+    except (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
+    except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
+        raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
+
+
+def _numbers(columns: Any) -> Iterator[tuple[str, Array]]:
+    """Those that hold numbers, as floats."""
+    for name, values in columns:
+        array = np.asarray(values)
+        if array.dtype.kind in "fiub" and array.ndim in (1, 2):
+            yield name, array.astype(float)
+
+
+def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Variables of a MATLAB file, those in structs as ``struct.field``."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{name}.")
+        elif not name.startswith("__"):
+            yield before + name, value
+
+
+def _stream(
+    table: Table, name: str, kind: str, stream: Stream, notes: list[str]
+) -> tuple[Array, dict[str, Array]]:  # fmt: skip
+    """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs."""
+    where = f"truth.columns.{name}"
+    if kind not in NEEDED:
+        raise UserError(f"{where}: {unknown('kind', kind, list(NEEDED))}")
+    usual = {key for keys in NEEDED[kind] for key in keys} | set(OPTIONAL.get(kind, ()))
+    given = {key: getattr(stream, key) for key in UNITS if key != "time" and getattr(stream, key) is not None}
+    for key in given:
+        if key not in usual:
+            raise UserError(f"{where}.{key}: is nothing that a sensor of kind {kind} has: {choice(key, sorted(usual))}")
+    for keys in NEEDED[kind]:
+        if not any(key in given for key in keys):
+            raise UserError(f"{where}.{keys[0]}: is missing: a sensor of kind {kind} needs {' or '.join(keys)}")
+    values = {key: _quantity(table, f"{where}.{key}", key, column) for key, column in given.items()}
+    stamps = _quantity(table, f"{where}.time", "time", stream.time)
+    for key, array in values.items():
+        if len(array) != len(stamps):
+            raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")
+    blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
+    rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
+    t, kept = ordered(name, stamps[rows], notes)
+    return t, {key: array[rows[kept]] for key, array in values.items()}
+
+
+def _quantity(table: Table, where: str, key: str, column: Column) -> Array:
+    """One quantity in SI units and house axes: (N,), or (N, 3), of an attitude (N, 4)."""
+    units = UNITS[key]
+    unit = next(iter(units)) if column.unit is None else column.unit
+    if unit not in units:
+        raise UserError(f"{where}: {unknown('unit', unit, list(units))}")
+    names = (column.column,) if isinstance(column.column, str) else column.column
+    parts = [_column(table, where, one) for one in names]
+    if len({len(part) for part in parts}) > 1:
+        raise UserError(f"{where}: its columns differ in length")
+    values = parts[0] if len(parts) == 1 else np.column_stack(parts)
+    width = 1 if values.ndim == 1 else values.shape[1]
+    wanted = (3, 4) if key == "attitude" else (3,) if key in VECTORS else (1,)
+    if width not in wanted:
+        raise UserError(f"{where}: has {width} columns: {' or '.join(map(str, wanted))} are needed")
+    if width == 4:
+        return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
+    values = (values * column.scale) * units[unit] + column.offset * units[unit]
+    if key == "attitude":
+        return quaternions(*values.T)
+    if width == 3:
+        order, signs = column.order
+        return np.ascontiguousarray(values[:, order] * (np.abs(signs) if key.startswith("sigma") else signs))
+    return values.reshape(len(values))
+
+
+def _column(table: Table, where: str, name: str) -> Array:
+    """A column by its name, or one of an array's by ``name:number``."""
+    if name in table:
+        return table[name]
+    whole, _, number = name.rpartition(":")
+    if whole in table and number.isdecimal() and table[whole].ndim == 2 and int(number) < table[whole].shape[1]:
+        return table[whole][:, int(number)]
+    raise UserError(f"{where}: {unknown('column', name, list(table))}")
+
+
+def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array]) -> Samples:
+    """The samples of one aiding sensor."""
+    match kind:
+        case "barometer":
+            pressure = values.get("pressure")
+            return barometers(name, t, isa_pressure(values["height"]) if pressure is None else pressure)
+        case "magnetometer":
+            return magnetometers(name, t, values["field"])
+        case "airspeed":
+            eas = values.get("airspeed")
+            return airspeeds(name, t, eas_of(values["pressure"]) if eas is None else eas)
+    fixes = Fixes(t, values["lat"], values["lon"], values["height"])
+    for key, own in (
+        ("velocity", "v_n"),
+        ("sigma_position", "sigma_position_n"),
+        ("sigma_velocity", "sigma_velocity_n"),
+    ):
+        if key in values:
+            setattr(fixes, own, values[key])
+    for key in ("fix", "satellites", "hdop", "vdop"):
+        if key in values:
+            setattr(fixes, key, values[key])
+    return fixes.samples(name)
+
+
+def _reference(t: Array, values: Mapping[str, Array]) -> Reference:
+    """What the table says of the motion."""
+    named = {"height": "h", "velocity": "v_n", "attitude": "q_nb"}
+    columns = {named.get(key, key): array for key, array in values.items()}
+    if not {"lat", "lon", "h"} <= columns.keys():
+        for key in ("lat", "lon", "h"):
+            columns.pop(key, None)
+    if "lon" in columns:
+        columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
+    return Reference("reference of the log", t, columns)

@@ -1,0 +1,112 @@
+"""``[truth] source = "log"``: a flight that was recorded, and how the columns of a table are to be read."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import Field, field_validator, model_validator
+
+from testbed.motion.sections import Altitude, Latitude, Longitude, TickRate
+from testbed.schema import Section
+
+COMPONENT = re.compile(r"(?P<minus>-?)(?P<axis>[xyz])")
+AXES = "xyz"
+
+Component: TypeAlias = Annotated[str, Field(description="x, y or z: first, second or third column; - turns it round")]
+
+
+class Place(Section):
+    """Where a recorded flight begins, known within kilometres; its height tells nothing but the site's."""
+
+    lat_deg: Latitude
+    lon_deg: Longitude
+    alt_m: Altitude
+
+
+class Column(Section):
+    """Where one quantity stands in a table. In the file a name, or a list of three names, may stand for all of it."""
+
+    column: str | tuple[str, ...] = Field(
+        description="its name, of a vector that of an array or those of three; `name:2` is one column of an array"
+    )
+    unit: str | None = Field(default=None, description="what it is in; none: the SI unit")
+    axes: tuple[Component, Component, Component] = Field(
+        default=("x", "y", "z"), description="of a vector, which column is forward, right, down, or north, east, down"
+    )
+    scale: float = Field(default=1.0, description="what it is multiplied by, before the unit")
+    offset: float = Field(default=0.0, description="what is added then, in the unit")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_alone(cls, value: Any) -> Any:
+        return {"column": value} if isinstance(value, str | tuple | list) else value
+
+    @field_validator("axes")
+    @classmethod
+    def _each_once(cls, axes: tuple[str, str, str]) -> tuple[str, str, str]:
+        found = [COMPONENT.fullmatch(axis) for axis in axes]
+        if not all(found) or {match["axis"] for match in found if match} != set(AXES):
+            raise ValueError('must name each of x, y and z once, with - where it is turned round, such as "-y"')
+        return axes
+
+    @property
+    def order(self) -> tuple[list[int], list[float]]:
+        """Of each axis, the number of its column and its sign."""
+        found = [COMPONENT.fullmatch(axis) for axis in self.axes]
+        pairs = [(AXES.index(match["axis"]), -1.0 if match["minus"] else 1.0) for match in found if match]
+        return [k for k, _ in pairs], [sign for _, sign in pairs]
+
+
+class Stream(Section):
+    """The columns of one sensor in a table, or of the ``reference``; which it needs depends on its kind.
+
+    Sensors of other kinds than their names say it with ``kind``.
+    """
+
+    kind: str | None = Field(default=None, description="of the sensor; none: its name")
+    time: Column = Field(description="time, at which a sample is valid, or was told of after the sensor's latency")
+    form: Literal["averaged", "instantaneous", "increments"] = Field(
+        default="averaged",
+        description="what gyro and accel are: means since the row before, values at its time, or integrals since then",
+    )
+    gyro: Column | None = Field(default=None, description="angular rate, body axes, or its integral")
+    accel: Column | None = Field(default=None, description="specific force, body axes, or its integral")
+    lat: Column | None = Field(default=None, description="geodetic latitude")
+    lon: Column | None = Field(default=None, description="longitude")
+    height: Column | None = Field(default=None, description="above the ellipsoid; of a barometer its altitude")
+    velocity: Column | None = Field(default=None, description="over ground, north, east, down")
+    sigma_position: Column | None = Field(default=None, description="1-sigma of position, north, east, down")
+    sigma_velocity: Column | None = Field(default=None, description="1-sigma of velocity, north, east, down")
+    fix: Column | None = Field(default=None, description="type of fix, 3 or more being one in three dimensions")
+    satellites: Column | None = Field(default=None, description="number in use")
+    hdop: Column | None = Field(default=None, description="horizontal dilution of precision")
+    vdop: Column | None = Field(default=None, description="vertical dilution of precision")
+    pressure: Column | None = Field(default=None, description="static; of an airspeed sensor dynamic")
+    field: Column | None = Field(default=None, description="magnetic flux density, body axes")
+    airspeed: Column | None = Field(default=None, description="equivalent (indicated)")
+    attitude: Column | None = Field(default=None, description="roll, pitch, heading; or four of a quaternion, w first")
+
+
+class LogTruth(Section):
+    """Motion that was recorded: its sensors' samples are the log's, and what is known of the motion is a reference."""
+
+    source: Literal["log"]
+    file: str = Field(
+        description="the log, seen from this file: ArduPilot .bin or .log, PX4 .ulg, run.nc, or a table: "
+        ".npz, .csv, .mat"
+    )
+    aircraft: str | None = Field(
+        default=None, description="an aircraft that flies as this one did, for what estimators expect; none: any body"
+    )
+    rate_hz: TickRate = 200.0
+    start_s: float = Field(default=0.0, ge=0, description="seconds of the log that are left out before the run begins")
+    reference: Literal["solution", "gnss", "none"] = Field(
+        default="solution",
+        description="what errors are formed against: the best solution that the log has (truth, the autopilot's own), "
+        "or its GNSS where it has none; that GNSS, kept back where it is denied; or nothing",
+    )
+    start: Place | None = Field(default=None, description="where it begins; none: where the log's GNSS says")
+    columns: dict[str, Stream] = Field(
+        default_factory=dict, description="of a table: the columns of each sensor, by name, and of the `reference`"
+    )
