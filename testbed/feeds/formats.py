@@ -28,6 +28,8 @@ class Format(NamedTuple):
 
 FORMATS = (
     Format("run.nc", (b"\x89HDF\r\n\x1a\n",), "rerun"),
+    Format("ArduPilot DataFlash", (b"\xa3\x95", b"FMT,"), "ardupilot"),
+    Format("PX4 ULog", (b"ULog\x01\x12\x35",), "px4"),
     Format("npz", (b"PK\x03\x04",), "table"),
     Format("MATLAB", (b"MATLAB 5.0 MAT-file",), "table"),
 )

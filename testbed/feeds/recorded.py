@@ -169,10 +169,10 @@ class Recorded:
         if truth.reference == "none":
             return NOBODY
         solution = log.solution
-        if solution is not None and truth.reference == "solution":
+        if solution is not None and truth.reference == "solution" and "lat" in solution.columns:
             found = replace(solution, t=solution.t - self._start)
         elif (receiver := log.receiver) is None:
-            return NOBODY
+            return NOBODY if solution is None else replace(solution, t=solution.t - self._start)
         else:
             told = self._samples.get(receiver)
             if told is None:

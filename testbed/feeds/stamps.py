@@ -153,7 +153,7 @@ def at_times(imu: ImuSamples, other: ImuSamples) -> ImuSamples:
     return ImuSamples(other.t, other.dt, np.ascontiguousarray(parts[:, :3]), np.ascontiguousarray(parts[:, 3:]))
 
 
-def joined(name: str, t: Array, other: Array, most: float) -> tuple[Rows, Rows]:
+def joined(t: Array, other: Array, most: float) -> tuple[Rows, Rows]:
     """Rows of two ascending series of times that belong together: for each of ``t`` the nearest within ``most`` [s]."""
     if not len(other):
         return np.zeros(0, np.intp), np.zeros(0, np.intp)

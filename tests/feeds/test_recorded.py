@@ -6,13 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from worlds import log_writers, real_flights
 from worlds.loop import same
 from worlds.recordings import log_of
 
 from testbed import Scenario, run
 from testbed.loop.loop import RunResult
 from testbed.score import metrics
+from testbed.score.accuracy import column
 
 FLIGHT = {
     "duration_s": 30,
@@ -89,3 +92,47 @@ def test_denial_and_faults_act_on_a_log_as_on_a_simulation(
     assert not same(first.dataset["estimators"], simulated.dataset["estimators"])
     assert same(simulated.dataset["estimators"], recorded.dataset["estimators"])
     assert same(simulated.dataset["sensors"], recorded.dataset["sensors"])
+
+
+def written(name: str, dataset: Any, folder: Path) -> Path:
+    match name:
+        case "bin":
+            return log_writers.dataflash(log_writers.dataflash_rows(dataset), folder / "00000001.BIN")
+        case "log":
+            return log_writers.dataflash_text(log_writers.dataflash_rows(dataset), folder / "1.log")
+        case "ulg":
+            return log_writers.ulog(log_writers.ulog_rows(dataset), folder / "flight")  # known by content
+    return log_writers.csv(dataset, folder / "flight.csv")
+
+
+# DataFlash and ULog have one accuracy for three axes of velocity, places in 1e-7 deg and heights in centimetres.
+COARSE = {"lat": 2e-9, "lon": 4e-9, "h": 0.02, "v_n": 0.02, "q_nb": 0.005}
+FINE = {"lat": 1e-12, "lon": 1e-12, "h": 1e-4, "v_n": 1e-4, "q_nb": 1e-4}
+
+
+@pytest.mark.parametrize(("name", "near"), [("bin", COARSE), ("log", COARSE), ("ulg", COARSE), ("csv", FINE)])
+def test_a_flight_written_in_another_format_gives_the_same_within_its_resolution(
+    flown: tuple[str, RunResult], tmp_path: Path, name: str, near: Mapping[str, float]
+) -> None:
+    text, first = flown
+    columns = log_writers.csv_columns() if name == "csv" else ""
+    file = written(name, first.dataset, tmp_path)
+    again = fly(log_of(text, file, f'aircraft = "loiter"\n{columns}'), FLIGHT, tmp_path)
+    for key, most in near.items():
+        before, after = (column(one.dataset, f"estimators/ins/{key}") for one in (first, again))
+        np.testing.assert_allclose(after, before, rtol=0, atol=most, err_msg=key)
+    true, known = (column(one.dataset, "truth/lat") for one in (first, again))
+    judged = np.isfinite(known)
+    assert judged.mean() > 0.95
+    assert np.abs(known - true)[judged].max() < (1e-6 if name == "csv" else 1e-8)  # GNSS, or the solution
+
+
+@pytest.mark.ci
+@pytest.mark.skipif(not real_flights.available(), reason="TESTBED_RECORDINGS names no folder of recordings")
+@pytest.mark.parametrize("name", real_flights.FLIGHTS)
+def test_real_flights_run(name: str, tmp_path: Path) -> None:
+    result = fly(real_flights.FLIGHTS[name], {"duration_s": 120}, tmp_path)
+    assert {"ins.aligned_s", "ahrs.aligned_s", "ins.nis_mean.gnss_position"} <= result.metrics.keys()
+    assert result.metrics["ins.aligned_s"] < 10
+    assert all(np.isfinite(value) for value in result.metrics.values())
+    assert result.failure == ""

@@ -1,0 +1,229 @@
+"""ArduPilot's DataFlash log, binary (.bin) or text (.log), by pymavlink's reader.
+
+What is taken: IMU (or GYR and ACC where that is missing), GPS with GPA, MAG as corrected on board, BARO, ARSP; each of
+several as a sensor of its own, such as ``imu2``. The reference is what the first core of the EKF said, with POS. Times
+are the autopilot's, at which it logged. Heights are above the sea's level as the receiver has it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import io
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from nav.samples import Array, ImuSamples
+from testbed.errors import UserError
+from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
+from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
+from testbed.feeds.stamps import integrated, joined, ordered
+from testbed.motion.logged import Stream
+
+NEEDED = "IMU, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
+GAUSS = 1e-7  # of the milligauss that MAG is in [T]
+GPS_EPOCH = dt.datetime(1980, 1, 6)
+ACCURACY_WITHIN_S = 0.3  # GPA comes right after the GPS that it belongs to
+
+# The messages by what they become, old names for the second and third unit among them.
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "imu": ("IMU", "IMU2", "IMU3"),
+    "gyr": ("GYR", "GYR1", "GYR2", "GYR3"),
+    "acc": ("ACC", "ACC1", "ACC2", "ACC3"),
+    "gnss": ("GPS", "GPS2"),
+    "accuracy": ("GPA", "GPA2"),
+    "magnetometer": ("MAG", "MAG2", "MAG3"),
+    "barometer": ("BARO", "BAR2", "BAR3"),
+    "airspeed": ("ARSP", "ASP2"),
+}
+SOLUTIONS = ("XKF1", "NKF1", "EKF1")
+PLACES = ("POS", "AHR2")
+
+Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
+
+
+def read(path: Path, columns: Mapping[str, Stream]) -> Log:
+    """Read a DataFlash log. Raises UserError when it is damaged, or has no inertial data."""
+    messages = _messages(path)
+    units = _units(messages)
+    notes: list[str] = []
+    imus: dict[str, ImuSamples] = {}
+    for name, rows in units.get("imu", {}).items():
+        t, kept = _times(name, rows, notes)
+        imus[name] = integrated(t, _vector(rows, "Gyr", kept), _vector(rows, "Acc", kept), "averaged")
+    if not imus:
+        imus = _raw_units(units, notes)
+    found = {name: len(rows) for name, rows in messages.items()}
+    require_imu(path, imus, found, NEEDED)
+    samples = _aiding(units, notes)
+    solution = _solution(messages)
+    return Log(
+        path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
+        date=_date(units),
+    )  # fmt: skip
+
+
+def _messages(path: Path) -> dict[str, list[Any]]:
+    """All messages by their names. Raises UserError when there are none."""
+    from pymavlink import DFReader  # type: ignore[import-untyped]
+
+    with path.open("rb") as file:
+        text = file.read(4) == b"FMT,"
+    found: dict[str, list[Any]] = {}
+    wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES}
+    try:
+        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):  # of bad bytes
+            reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
+            with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
+                while (message := reader.recv_msg()) is not None:
+                    name = message.get_type()
+                    own = found.setdefault(name, [])
+                    own.append(message if name in wanted else None)
+    except Exception as error:  # whatever a damaged file makes the reader raise
+        if not found:
+            raise UserError(f"{path}: can't be read as a DataFlash log: {type(error).__name__} {error}") from None
+    if not found:
+        raise UserError(f"{path}: a DataFlash log without a single message: it was cut off, or never written")
+    return found
+
+
+def _units(messages: Mapping[str, list[Any]]) -> dict[str, dict[str, Rows]]:
+    """The fields of the messages that are sensors', by kind and name of the unit."""
+    units: dict[str, dict[str, Rows]] = {}
+    for kind, names in KINDS.items():
+        for k, name in enumerate(names):
+            own = messages.get(name, [])
+            numbers = {getattr(one, "I", None) for one in own}
+            for number in sorted(numbers, key=lambda n: -1 if n is None else n):
+                of_unit = [one for one in own if getattr(one, "I", None) == number]
+                count = (k if number is None else int(number)) + 1
+                if kind in ("gyr", "acc") and number is None:
+                    count = max(k, 1)
+                named = "imu" if kind in ("gyr", "acc") else "gnss" if kind == "accuracy" else kind
+                unit = named if count == 1 else f"{named}{count}"
+                units.setdefault(kind, {}).setdefault(unit, _rows(of_unit))
+    return units
+
+
+def _rows(messages: list[Any]) -> Rows:
+    """Fields of numbers as arrays; a field that one message lacks, or that is text, is left out."""
+    rows = {}
+    for key in messages[0].get_fieldnames():
+        values = [getattr(one, key, None) for one in messages]
+        if all(isinstance(value, int | float) for value in values):
+            rows[key] = np.array(values, float)
+    return rows
+
+
+def _stamps(rows: Rows) -> Array:
+    """When messages were logged [s]; old GPS messages have the week's time first, and the autopilot's as T."""
+    for key, factor in (("SampleUS", 1e6), ("TimeUS", 1e6), ("T", 1e3), ("TimeMS", 1e3)):
+        if key in rows and (key != "T" or "Week" in rows):
+            return rows[key] / factor
+    return np.full(len(next(iter(rows.values()), ())), np.nan)
+
+
+def _times(name: str, rows: Rows, notes: list[str]) -> tuple[Array, Any]:
+    return ordered(name, _stamps(rows), notes)
+
+
+def _vector(rows: Rows, of: str, kept: Any) -> Array:
+    """Three fields as vectors; NaN where a log has none of them."""
+    missing = np.full(len(next(iter(rows.values()))), np.nan)
+    return np.ascontiguousarray(np.column_stack([rows.get(f"{of}{axis}", missing)[kept] for axis in "XYZ"]))
+
+
+def _raw_units(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[str, ImuSamples]:
+    """Units that are logged raw: accelerometers at the times of the gyros."""
+    imus = {}
+    for name, gyr in units.get("gyr", {}).items():
+        acc = units.get("acc", {}).get(name)
+        if acc is None:
+            continue
+        t, kept = _times(name, gyr, notes)
+        t_acc, kept_acc = _times(name, acc, notes)
+        if len(t) > 1 and len(t_acc) > 1:
+            force = _vector(acc, "Acc", kept_acc)
+            at = np.column_stack([np.interp(t, t_acc, column) for column in force.T])
+            imus[name] = integrated(t, _vector(gyr, "Gyr", kept), at, "averaged")
+    return imus
+
+
+def _aiding(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[str, Samples]:
+    """The samples of all other sensors."""
+    samples: dict[str, Samples] = {}
+    for name, rows in units.get("gnss", {}).items():
+        samples[name] = _fixes(name, rows, units.get("accuracy", {}).get(name), notes)
+    for name, rows in units.get("magnetometer", {}).items():
+        t, kept = _times(name, rows, notes)
+        samples[name] = magnetometers(name, t, _vector(rows, "Mag", kept) * GAUSS)
+    for kind, key, made in (("barometer", "Press", barometers), ("airspeed", "Airspeed", airspeeds)):
+        for name, rows in units.get(kind, {}).items():
+            if key in rows:
+                t, kept = _times(name, rows, notes)
+                samples[name] = made(name, t, rows[key][kept])
+    return {name: own for name, own in samples.items() if own}
+
+
+def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Samples:
+    t, kept = _times(name, rows, notes)
+    own = {key: values[kept] for key, values in rows.items()}
+    fixes = Fixes(t, np.radians(own["Lat"]), np.radians(own["Lng"]), own["Alt"])
+    course = np.radians(own["GCrs"])
+    down = own.get("VZ", np.full(len(t), np.nan))
+    fixes.v_n = np.column_stack([own["Spd"] * np.cos(course), own["Spd"] * np.sin(course), down])
+    fixes.fix, fixes.satellites, fixes.hdop = own["Status"], own["NSats"], own["HDop"]
+    if accuracy is not None:
+        t_acc, kept_acc = _times(f"{name} accuracy", accuracy, [])
+        at, of = joined(t, t_acc, ACCURACY_WITHIN_S)
+        told = {key: accuracy[key][kept_acc][of] for key in ("HAcc", "VAcc", "SAcc", "VDop")}
+        fixes.vdop[at] = told["VDop"]
+        # of the whole horizontal error and of the whole velocity, in parts that are alike
+        fixes.sigma_position_n[at] = spread(told["HAcc"] / math.sqrt(2), told["VAcc"])
+        fixes.sigma_velocity_n[at] = spread(told["SAcc"] / math.sqrt(3), told["SAcc"] / math.sqrt(3))
+    return fixes.samples(name)
+
+
+def _solution(messages: Mapping[str, list[Any]]) -> Reference | None:
+    """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position."""
+    source = next((name for name in SOLUTIONS if name in messages), None)
+    if source is None:
+        return None
+    rows = _rows([one for one in messages[source] if getattr(one, "C", 0) == 0] or messages[source])
+    t, kept = _times(source, rows, [])
+    angles = [np.radians(rows[key][kept]) for key in ("Roll", "Pitch", "Yaw")]
+    columns = {
+        "q_nb": quaternions(*angles),
+        "v_n": np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")]),
+    }
+    for name in PLACES:
+        if name not in messages:
+            continue
+        place = _rows(messages[name])
+        at, own = _times(name, place, [])
+        lat, lon = (np.radians(place[key][own]) for key in ("Lat", "Lng"))
+        known = (lat != 0) | (lon != 0)
+        if known.sum() > 1:
+            at, values = at[known], (lat[known], np.unwrap(lon[known]), place["Alt"][own][known])
+            for key, column in zip(("lat", "lon", "h"), values, strict=True):
+                columns[key] = np.interp(t, at, column, left=np.nan, right=np.nan)
+            columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
+            break
+    return Reference(f"the autopilot's own solution ({source})", t, columns)
+
+
+def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:
+    """The day of the flight, by the receiver."""
+    for rows in units.get("gnss", {}).values():
+        for week, ms in (("GWk", "GMS"), ("Week", "TimeMS")):
+            if week in rows and ms in rows:
+                known = np.flatnonzero(rows[week] > 0)
+                if len(known):
+                    k = known[-1]
+                    since = dt.timedelta(weeks=float(rows[week][k]), milliseconds=float(rows[ms][k]))
+                    return (GPS_EPOCH + since).date()
+    return None
