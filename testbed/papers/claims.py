@@ -101,12 +101,18 @@ def _exact(values: Array) -> Interval:
 
 
 def _share(values: Array) -> Interval:
-    """Clopper and Pearson's interval; ``values`` are yes (1) and no (0), or (hits, trials) of each draw."""
+    """Of yes (1) and no (0), Clopper and Pearson's; of (hits, trials) of each draw a bootstrap's as well, since what is
+    hit in one draw may be hit in a row: the wider of the two.
+    """
     from scipy.stats import binomtest
 
     hits, trials = np.sum(values, axis=0) if values.ndim == 2 else (np.sum(values), len(values))
-    found = binomtest(round(float(hits)), round(float(trials))).proportion_ci(CONFIDENCE)
-    return Interval(float(hits / trials), float(found.low), float(found.high))
+    exact = binomtest(round(float(hits)), round(float(trials))).proportion_ci(CONFIDENCE)
+    low, high = float(exact.low), float(exact.high)
+    if values.ndim == 2 and len(values) > 1:
+        drawn = bootstrapped("", lambda rows: float(rows[:, 0].sum() / rows[:, 1].sum())).of(values)
+        low, high = min(low, drawn.low), max(high, drawn.high)
+    return Interval(float(hits / trials), low, high)
 
 
 def _ratio_of_rms(values: Array) -> float:

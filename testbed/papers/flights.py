@@ -10,9 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from nav.earth import position_difference_n
-from nav.samples import Array, Estimate, UpdateReport
+from nav.ins import Ins
+from nav.samples import Array, Estimate, Outcome, UpdateReport
 from testbed import sensors
 from testbed.estimators import registry
+from testbed.estimators.federated import FederatedSection
+from testbed.estimators.ins import InsSection
 from testbed.estimators.lane import Lane
 from testbed.feeds.known import handed_over
 from testbed.feeds.simulated import motion
@@ -63,6 +66,12 @@ class Looks:
         """Which were refused, in part at least, because they looked wrong."""
         return detection.alarmed(self.weight, self.outcome)
 
+    @property
+    def isolated(self) -> accuracy.Mask:
+        """Which were refused because their sensor, or an axis of it, is isolated."""
+        mask: accuracy.Mask = self.outcome == Outcome.ISOLATED
+        return mask
+
 
 @dataclass(frozen=True, slots=True)
 class Track:
@@ -97,6 +106,33 @@ class Track:
         """As `testbed.score.detection.score_faults` wants it: what became of the samples of each sensor."""
         columns = zip(*((r.t, r.sensor, r.weight, r.outcome) for r in self.reports), strict=True)
         return detection.by_sensor(*(np.array(column) for column in columns))
+
+
+@dataclass(frozen=True, slots=True)
+class KnownFaults:
+    """A measurement policy that leaves out what it was told is wrong: (axis, from, to) of one kind of measurement."""
+
+    wrong: Sequence[tuple[int, float, float]]
+
+    def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
+        """See `nav.weighting.Policy`."""
+        out = [axis for axis, start, end in self.wrong if start <= t + accuracy.SAME_TIME_S < end]
+        told = R.copy()
+        told[out] = np.inf
+        return told
+
+
+def told(chosen: Scenario, seed: int, section: FederatedSection, wrong: Mapping[str, KnownFaults] | None) -> Lane:
+    """What no filter of the same sensors could better, as linear as the problem is: one Kalman filter with all of them
+    and no gate, of the states, noise and initial errors of a federation, that is told what is ``wrong`` by aid.
+    """
+    same = ("name", "imu", "states", "turn_degps", "gust_mps", "handover", "nonholonomic_mps")
+    aids = tuple(dict.fromkeys(aid for local in section.locals for aid in local.aids))
+    alone = InsSection(aids=aids, false_rejection=0.0, **{key: getattr(section, key) for key in same})
+    lane = registry.build((alone,), chosen.rig(seed))[section.name]
+    assert isinstance(lane.horizon.estimator, Ins)
+    lane.horizon.estimator = Ins(lane.horizon.estimator.config, policies=wrong)
+    return lane
 
 
 def lanes(chosen: Scenario, seed: int) -> dict[str, Lane]:
