@@ -32,7 +32,6 @@ from nav.samples import (
 # What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
 LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
 JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what the last period was judged by
-SIX_STAY = np.ones(STATES)
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
@@ -60,15 +59,18 @@ class Ahrs:
         self._earth_n = earth_rate_n(config.lat)
         imu = config.imu
         model = ErrorModel(imu)
-        self._variance_rate = model.density[model.places(PAPERS["jiang2021"])] ** 2
-        self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
         self.further = FurtherStates(config)
+        n = STATES + self.further.count
+        self._stays = np.eye(n)
+        self._variance_rate = np.zeros(n)
+        self._variance_rate[:STATES] = model.density[model.places(PAPERS["jiang2021"])] ** 2
+        self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
         self._accel_bias = self.further.accel_bias
         biased = self._accel_bias.start == self._accel_bias.stop  # accelerometers, by what no state stands for
         self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2 if biased else 0.0] * 2 + [0.0])
-        self._H_level = np.zeros((2, STATES))
+        self._H_level = np.zeros((2, n))
         self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
-        H = np.zeros((1, STATES + self.further.count))
+        H = np.zeros((1, n))
         if field_n is not None:
             H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
         H[0, PHI + 2] = -1.0
@@ -272,7 +274,9 @@ class Ahrs:
         variance = self.config.force_sigma**2
         if compensated:
             variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b)
-        return np.hstack([self._H_level, self.further.columns(q_nb)]), np.full(2, variance)
+        H = self._H_level.copy()
+        self.further.columns(H, q_nb)
+        return H, np.full(2, variance)
 
     def _level_commanded(self, start: float, end: float) -> bool:
         """Whether nothing but level flight was commanded from ``start`` to ``end`` [s], as far as is known."""
@@ -317,11 +321,11 @@ class Ahrs:
         """Bring error states and covariance up to the time of the attitude."""
         if s.elapsed[0] > 0:
             T, period = s.elapsed.tolist()
-            kept, half_of_further = self.further.step(T)
-            whole = np.diag(np.concatenate([SIX_STAY, kept]))
+            whole, half_noise = self._stays.copy(), 0.5 * T * self._variance_rate
             whole[PHI : PHI + 3, :STATES] = transition(s.turned, self._earth_n, T)
-            self.further.turn(whole, s.turned, s.angle[2] / period)
-            covariance_step(s, whole, np.concatenate([0.5 * T * self._variance_rate, half_of_further]))
+            self.further.step(whole, half_noise, T)
+            self.further.turn(whole, s.turned, float(s.angle[2]) / period)
+            covariance_step(s, whole, half_noise)
 
     def _estimate(self, s: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a state of its own.

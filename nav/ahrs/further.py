@@ -50,29 +50,34 @@ class FurtherStates:
         # where they lie in the state
         self.misalignment, self.accel_bias, self.gust = (slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES)))
         self.count = sum(sizes)
+        self._places = np.arange(STATES, STATES + self.count)
         self.names = [name for names, size in zip(NAMES, sizes, strict=True) for name in names[:size]]
         self.sigma = np.repeat(sigmas, sizes)  # (k,) at the start
         fading = -math.log((power - variance) / (power + variance)) / config.period_s if sizes[2] else 0.0
         self.decay_rate = np.repeat([0.0, 0.0, fading], sizes)  # (k,) [1/s]
 
-    def step(self, T: float) -> tuple[Array, Array]:
-        """What is left of each after ``T`` [s] (k,), and half of the variance that comes in (k,).
+    def step(self, whole: Array, half_noise: Array, T: float) -> None:
+        """Put what fades in ``T`` [s] into the transition ``whole`` (n, n), and half of what comes in into (n,).
 
         Half comes in before the decay and half after, and the variance of gusts stays.
         """
+        if not self.count:
+            return
         kept = np.exp(-T * self.decay_rate)
-        return kept, self.sigma**2 * (1 - kept**2) / (1 + kept**2)
+        whole[self._places, self._places] = kept
+        half_noise[STATES:] = self.sigma**2 * (1 - kept**2) / (1 + kept**2)
 
     def turn(self, whole: Array, turned: Array, yaw_rate: float) -> None:
         """Put what the misaligned gyros make of ``yaw_rate`` [rad/s] into the transition ``whole`` (n, n).
 
         ``turned`` (3, 3) is the integral of C_nb.
         """
-        whole[PHI : PHI + 3, self.misalignment] = turned[:, : self.misalignment.stop - STATES] * yaw_rate
+        if self.misalignment.stop > self.misalignment.start:
+            whole[PHI : PHI + 3, self.misalignment] = turned * yaw_rate
 
-    def columns(self, q_nb: Array) -> Array:
-        """H (2, k) of them in the mean horizontal specific force of a body at the attitude ``q_nb``."""
-        H = np.zeros((2, STATES + self.count))
-        H[:, self.accel_bias] = -dcm_from_quat(q_nb)[:2, : self.accel_bias.stop - self.accel_bias.start]
-        H[:, self.gust] = -np.eye(2)[:, : self.gust.stop - self.gust.start]
-        return H[:, STATES:]
+    def columns(self, H: Array, q_nb: Array) -> None:
+        """Put theirs into ``H`` (2, n) of the mean horizontal specific force of a body at the attitude ``q_nb``."""
+        if self.accel_bias.stop > self.accel_bias.start:
+            H[:, self.accel_bias] = -dcm_from_quat(q_nb)[:2]
+        if self.gust.stop > self.gust.start:
+            H[:, self.gust] = -np.eye(2)

@@ -32,7 +32,7 @@ MISALIGNED = replace(MODELLED, gyro_misalignment_sigma=2e-3)
 def test_none_is_there_unless_asked_for():
     none = FurtherStates(PAPER)
     assert (none.count, none.names) == (0, [])
-    assert none.columns(np.array([1.0, 0, 0, 0])).shape == (2, 0)
+    assert Ahrs(PAPER).level_measurement(np.array([1.0, 0, 0, 0]), np.zeros(3), False)[0].shape == (2, STATES)
     every = FurtherStates(MISALIGNED)
     assert every.count == len(every.names) == 8
     assert (every.misalignment, every.accel_bias, every.gust) == (slice(6, 9), slice(9, 12), slice(12, 14))
@@ -70,7 +70,7 @@ def test_force_columns_against_finite_differences():
     """The mean force that a biased accelerometer and a gust show, at any attitude; the estimate of both is zero."""
     q_nb = tilted([1.0, 0, 0, 0], 4.0, 70.0)
     to_n = Rotation.from_quat(q_nb, scalar_first=True)
-    H = FurtherStates(MODELLED).columns(q_nb)
+    H = Ahrs(MODELLED).level_measurement(q_nb, np.zeros(3), False)[0][:, STATES:]
     for axis in range(3):
         np.testing.assert_allclose(H[:, axis], to_n.apply(np.eye(3)[axis])[:2] * -1.0, atol=1e-12)
     np.testing.assert_array_equal(H[:, 3:], -np.eye(2))
