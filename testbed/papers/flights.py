@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from nav.earth import position_difference_n
 from nav.ins import Ins
-from nav.samples import Array, Estimate, Outcome, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Outcome, UpdateReport
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.estimators.federated import FederatedSection
@@ -45,11 +45,22 @@ class Sensed:
             },
         )
 
+    def until(self, t: float) -> Sensed:
+        """The samples up to ``t`` [s]."""
+        return Sensed(self.truth, {name: _until(samples, t) for name, samples in self.samples.items()})
+
     def with_faults(self, chosen: Scenario, seed: int) -> tuple[Sensed, list[FaultTruth]]:
         """The same with a scenario's faults, and what they are."""
         faults = Faults(chosen.fault, chosen.sensors, seed)
         found = {name: faults.apply(name, samples) for name, samples in self.samples.items()}
         return Sensed(self.truth, found), faults.truth
+
+
+def _until(samples: Any, t: float) -> Any:
+    if isinstance(samples, ImuSamples):
+        rows = int(np.searchsorted(samples.t, t + accuracy.SAME_TIME_S))
+        return ImuSamples(samples.t[:rows], samples.dt[:rows], samples.dtheta[:rows], samples.dv[:rows])
+    return [sample for sample in samples if sample.t <= t]
 
 
 @dataclass(frozen=True, slots=True)

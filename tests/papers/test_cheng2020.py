@@ -18,7 +18,7 @@ from testbed.papers import cheng2020
 def test_the_scenario_tells_the_filters_what_it_says() -> None:
     built = lanes(papers.scenario("cheng2020"), 0)
     filters = {name: one.horizon.estimator for name, one in built.items()}
-    assert set(filters) == set(cheng2020.ALL)
+    assert set(filters) == {"improved", "ungated", "no_course", "told"}
     for name, ins in filters.items():
         assert isinstance(ins, Ins)
         assert ins.config.scaling is not None
@@ -37,101 +37,68 @@ def course_of(ins: Ins) -> Course | None:
 
 
 @pytest.fixture(scope="module")
-def first_turn() -> dict[str, Any]:
-    return cheng2020.road(cheng2020.SEEDS[1], 360, ("improved", "ungated"))
+def drawn() -> cheng2020.Draw:
+    """What a job gives."""
+    return cheng2020.drive(2, True)
+
+
+@pytest.fixture(scope="module")
+def table() -> dict[str, Any]:
+    return cheng2020.table_1()
 
 
 @pytest.mark.ci
-def test_a_turn_disturbs_only_who_takes_course_for_heading_in_it(first_turn: dict[str, Any]) -> None:
-    improved, ungated = first_turn["improved"], first_turn["ungated"]
-    assert len(first_turn["turns"]) == 1
-    assert improved["heading_turn"] < 0.3
-    assert ungated["heading_turn"] > 1.5
-    assert improved["heading_straight"] < 0.1
-    assert improved["level_before"] < 0.3
-    assert improved["course_amiss"] == 0
-    assert ungated["course_amiss"] > 0
-    assert 250 < improved["course_looks"] < 300 - 20  # of 300 s under way there are 20 s of rest, and a turn
-    assert improved["least_R"] > 0.25
+def test_a_turn_disturbs_only_who_takes_course_for_heading_in_it(drawn: cheng2020.Draw) -> None:
+    improved, ungated = drawn.drives["improved"], drawn.drives["ungated"]
+    assert len(drawn.series["turns"]) >= 2
+    assert improved.turn < 0.3
+    assert ungated.turn > 2 * improved.turn
+    assert improved.straight < 0.15
+    assert improved.amiss == 0
+    assert drawn.drives["told"].position_rms == pytest.approx(improved.position_rms, rel=0.5)
 
 
 @pytest.mark.ci
-def test_more_noise_is_found() -> None:
-    assert cheng2020.noisier(2)["gnss_position"] < 0.25
-
-
-def test_table_1() -> None:
-    table = cheng2020.table_1()
-    assert table["ranks"] == [7, 9, 10, 12]
-    for column in ("velocity", "position", "both"):
-        found = table[column]
-        assert found["phi"] == pytest.approx([9.86, 9.86], abs=0.005)
-        assert found["eps"] == pytest.approx([9.806, 9.806], abs=0.005)
-        assert found["dv"] == pytest.approx([1, 1], abs=1e-6)
-        assert found["dp"] == pytest.approx([] if column == "velocity" else [1, 1], abs=1e-6)
-        assert found["eps_down"] == pytest.approx(5.06e-4, rel=1e-2)
-        assert found["unseen"] < 1e-9
-    # 1 / (R_N cos L R_M), where the paper has 3.14e-14; and sqrt(5) g w_ie, 1.79e-3
-    assert table["radians"] == pytest.approx([1 / (6.388838e6 * 0.7071068 * 6.367382e6), 1.599e-3], rel=1e-3)
-
-
-@pytest.mark.ci
-def test_table_1_has_a_row_for_each_column(first_turn: dict[str, Any]) -> None:
-    claims = [one for one in cheng2020.PAPER.conclude(results(first_turn)) if one.quantity.startswith("Table 1")]
+def test_table_1_has_a_row_for_each_column(drawn: cheng2020.Draw, table: dict[str, Any]) -> None:
+    rows = [one for one in cheng2020.claims([drawn, table]) if one.quantity.startswith("Table 1")]
     for column in ("velocity", "position", "velocity and position"):
-        own = [one for one in claims if one.quantity.startswith(f"Table 1, {column}:")]
+        own = [one for one in rows if one.quantity.startswith(f"Table 1, {column}:")]
         assert {one.verdict for one in own} == {"met", "impossible"}
-        assert all(
-            "5.06e-4" in one.impossible or "velocity" in one.impossible for one in own if "eps_U" in one.quantity
-        )
-    (other,) = (one for one in claims if "3.14e-14" in one.paper)
-    assert "3.5e-14" in other.impossible
-    assert "1.6e-03" in other.impossible
+        assert all("0.000506" in one.why for one in own if "eps_U" in one.quantity)
+    (other,) = (one for one in rows if one.misprint)
+    assert other.verdict == "misprint"
+    assert other.interval.value == pytest.approx(10.7, abs=0.5)
 
 
-def results(road: dict[str, Any]) -> list[Any]:
-    """As the jobs give them, with one run in the place of all."""
-    n = len(cheng2020.SEEDS)
-    road = {"told": road["improved"]} | road | {"no_course": road["improved"]}
-    off = {"gnss_position": 0.1, "gnss_velocity": 0.1}
-    return [road] * (n + 1) + [off] * n + [(1.5, 1.2)] * n + [cheng2020.table_1()]
-
-
-def verdicts(found: list[Any]) -> dict[str, str]:
-    return {claim.quantity: claim.verdict for claim in cheng2020.PAPER.conclude(found)}
+def verdicts(drawn: cheng2020.Draw, table: dict[str, Any]) -> dict[str, str]:
+    """Judged over a hundred times the same, so that every interval is as narrow as it can be."""
+    return {claim.quantity: claim.verdict for claim in cheng2020.claims([*[drawn] * 100, table])}
 
 
 @pytest.mark.ci
-def test_claims_can_fail(first_turn: dict[str, Any]) -> None:
-    sound = verdicts(results(first_turn))
-    bad: dict[str, Any] = copy.deepcopy(first_turn)
-    bad["told"] = first_turn["improved"]
-    bad["improved"] |= {
-        "heading_straight": 0.2,
-        "level_nearly_all": 0.05,
-        "level_rms": 0.03,
-        "position_rms": 0.9,
-        "course_amiss": 1,
-    }
-    bad["improved"] |= {"heading_turn": 0.4, "velocity": 0.03, "least_R": -0.1}
-    bad["ungated"] |= {"heading_turn": 1.0}
-    failed = verdicts(results(bad))
-    turned = {quantity for quantity in sound if sound[quantity] != "missed" and failed[quantity] == "missed"}
-    assert len(turned) >= 11, turned
-    assert sum("any seed" in quantity for quantity in turned) == 3, turned
-    wrong = copy.deepcopy(results(first_turn))
+def test_claims_can_fail(drawn: cheng2020.Draw, table: dict[str, Any]) -> None:
+    sound = verdicts(drawn, table)
+    worse = drawn.drives["improved"]._replace(
+        straight=0.2, turn=0.4, level=0.5, velocity=0.3, position=9.0, position_rms=9.0, heading_rms=1.0, amiss=1
+    )
+    still = drawn.drives["ungated"]._replace(turn=0.1)
+    learned = dict.fromkeys(drawn.learned, 0.5)
+    bad = drawn._replace(drives=drawn.drives | {"improved": worse, "ungated": still}, learned=learned, drift=(0.1, 1.2))
+    failed = verdicts(bad, table)
+    turned = {quantity for quantity in sound if failed[quantity] == "missed" != sound[quantity]}
+    assert {quantity.partition(",")[0] for quantity in turned} >= {
+        "heading on straights", "position", "courses used in a turn or below 1 m/s",
+        "heading after 300 s of straight",
+        "R as it is: RMS of position", "R as it is: RMS of heading", "position variance x 4: learned within",
+    }  # fmt: skip
+    wrong = copy.deepcopy(table)
     for column in ("velocity", "position", "both"):
-        wrong[-1][column] |= {
-            "phi": [9.88, 9.88],
-            "unseen": 1e-3,
-            "eps_down": 9e-9 if column == "position" else 5.66e-4,
-        }
-    failed = verdicts(wrong)
-    assert len({quantity for quantity in failed if "Table 1" in quantity and failed[quantity] == "missed"}) == 10
+        wrong[column] |= {"phi": [9.88, 9.88], "unseen": 1e-3}
+    failed = verdicts(drawn, wrong)
+    assert sum(failed[quantity] == "missed" != sound[quantity] for quantity in failed) == 7
 
 
-@pytest.mark.slow
-def test_every_claim_is_kept(tmp_path: Path) -> None:
-    claims = papers.reproduce({"cheng2020": cheng2020.PAPER}, tmp_path)["cheng2020"]
-    assert {claim.quantity for claim in claims if claim.verdict == "missed"} == set()
+@pytest.mark.ci
+def test_the_figure_is_drawn(drawn: cheng2020.Draw, tmp_path: Path) -> None:
+    cheng2020.PAPER.draw([drawn], tmp_path)
     assert (tmp_path / "cheng2020.png").stat().st_size > 10_000
