@@ -4,42 +4,21 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nav.samples import (
-    AirspeedSample,
-    BarometerSample,
-    BodyVelocitySample,
-    FixType,
-    GnssSample,
-    ImuSamples,
-    MagnetometerSample,
-    PositionSample,
-    Sample,
-    StarSample,
-)
+from nav.samples import FixType, ImuSamples, Sample
 from testbed.errors import UserError
-from testbed.feeds.log import Log, Reference, Samples, require_imu
+from testbed.feeds.log import SAMPLES, Log, Reference, Samples, require_imu
 from testbed.motion.logged import Place, Stream
 from testbed.motion.table import COLUMNS
 from testbed.record.reader import load, scenario_of
 
 if TYPE_CHECKING:
     import xarray
-
-# What the samples are of, by a column that no others have, most telling first; the rest of the columns are as fields.
-KINDS: tuple[tuple[str, type[Sample]], ...] = (
-    ("fix_type", GnssSample),
-    ("pressure", BarometerSample),
-    ("field_b", MagnetometerSample),
-    ("eas", AirspeedSample),
-    ("v_b", BodyVelocitySample),
-    ("q_ib", StarSample),
-    ("lat", PositionSample),
-)
 
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
@@ -55,7 +34,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             t, dt, dtheta, dv = (np.array(dataset[key].values) for key in ("time", "dt", "dtheta", "dv"))
             imus[name] = ImuSamples(t, dt, dtheta, dv)
         else:
-            made = next((made for column, made in KINDS if column in dataset), None)
+            recorded = {"t", "sensor", *map(str, dataset.data_vars)}
+            made = next((made for made in SAMPLES.values() if {own.name for own in fields(made)} == recorded), None)
             if made is None:
                 notes.append(f"{name} is a sensor of the user's, whose samples can't be given again")
             else:
@@ -85,12 +65,12 @@ def _place(tree: xarray.DataTree) -> tuple[dt.date | None, Place | None]:
 
 def _samples(name: str, made: type[Sample], dataset: xarray.Dataset) -> list[Sample]:
     """The rows of one sensor as it delivered them."""
-    fields = {str(key): _column(dataset[key].values) for key in dataset.data_vars}
-    fields["t"] = dataset["time"].values.tolist()
-    if "fix_type" in fields:
-        fields["fix_type"] = [FixType(k) for k in fields["fix_type"]]
-    keys = list(fields)
-    return [made(**dict(zip(keys, row, strict=True)), sensor=name) for row in zip(*fields.values(), strict=True)]
+    columns = {str(key): _column(dataset[key].values) for key in dataset.data_vars}
+    columns["t"] = dataset["time"].values.tolist()
+    if "fix_type" in columns:
+        columns["fix_type"] = [FixType(k) for k in columns["fix_type"]]
+    keys = list(columns)
+    return [made(**dict(zip(keys, row, strict=True)), sensor=name) for row in zip(*columns.values(), strict=True)]
 
 
 def _column(values: Any) -> list[Any]:

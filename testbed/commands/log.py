@@ -1,0 +1,56 @@
+"""``testbed log``: what is in a recorded flight, and a scenario that runs it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from testbed.commands.shared import Force, console
+from testbed.errors import UserError, printable
+
+LogFile = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", help="A log, or a scenario of one, which says what a table's columns are."),
+]
+Target = Annotated[
+    Path | None, typer.Option("--scenario", metavar="OUT.toml", help="Write a scenario that runs the log.")
+]
+
+
+def log(file: LogFile, scenario: Target = None, force: Force = False) -> None:
+    """Show what is in a recorded flight: rates, gaps, phases, noise, vibration, latencies; propose grades."""
+    from testbed.data import write_file
+    from testbed.feeds import draft, formats
+    from testbed.feeds.survey import survey
+    from testbed.motion.logged import LogTruth
+    from testbed.report import log as pages
+
+    truth = None
+    if file.suffix == ".toml":
+        from testbed.scenario import Scenario
+
+        loaded = Scenario.load(file).truth
+        if not isinstance(loaded, LogTruth):
+            raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.source!r}")
+        truth = loaded
+    if scenario is not None and scenario.exists() and not force:
+        raise UserError(f"{scenario}: is there already: choose another name, or replace it with --force")
+    place = file if truth is None else Path(truth.file)
+    if truth is None and formats.known(place).module == "table":
+        from testbed.feeds.table import load
+
+        console().print(pages.columns(load(place), f"{place.name}: a table"))
+        if scenario is not None:
+            raise UserError(
+                f"{file}: is a table: begin with a scenario that says what its columns are, and give that in its place"
+            )
+        print("Say in [truth.columns.<sensor>] of a scenario what they are, and give that in place of the table.")
+        return
+    found = survey(formats.read(place, {}) if truth is None else formats.open_log(truth))
+    for table in pages.tables(found):
+        console().print(table)
+    if scenario is not None:
+        write_file(scenario, draft.scenario(found, scenario, truth).encode())
+        print(printable(f"scenario: {scenario}"))

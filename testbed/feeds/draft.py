@@ -1,0 +1,130 @@
+"""From what was measured in a log to a scenario that runs it: a grade for each sensor, and what differs from it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
+from testbed.feeds.recorded import rate
+from testbed.feeds.survey import Noise, Survey
+from testbed.motion.logged import LogTruth
+from testbed.sensors import imu
+from testbed.sensors.magnetometer import GRADES as MAGNETOMETERS
+from testbed.sensors.magnetometer import WMM_YEARS
+from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
+
+NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its noise, and biases within so many sigmas
+DIGITS = 3
+AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
+ROWS_HZ, RECORD_HZ = 100.0, 10.0
+
+
+def sections(found: Survey) -> dict[str, dict[str, Any]]:
+    """The keys of each sensor: kind, grade, rate, and what was measured to be otherwise."""
+    log = found.log
+    made: dict[str, dict[str, Any]] = {
+        name: {"kind": "imu", **imu_keys(found.noise.get(name)), "rate_hz": rate(log, name)} for name in log.imus
+    }
+    for name, own in log.samples.items():
+        keys: dict[str, Any] = {"rate_hz": rate(log, name)}
+        match own[0]:
+            case GnssSample():
+                keys = {"kind": "gnss", "grade": "standalone", **keys}
+                if not log.valid_times:
+                    keys["latency_s"] = found.latency_s.get(name, 0.2)
+            case MagnetometerSample():
+                keys = {"kind": "magnetometer", "grade": "mems", **keys}
+                residual = found.field_residual.get(name, (0.0, 0.0))[0] / MICROTESLA
+                if residual > MAGNETOMETERS["mems"]["hard_iron_ut"]:
+                    keys["hard_iron_ut"] = _rounded(residual)
+            case BarometerSample():
+                keys = {"kind": "barometer", "grade": "mems", **keys}
+            case AirspeedSample():
+                keys = {"kind": "airspeed", "grade": "mems", **keys}
+                off = 200 * abs(found.airspeed_scale.get(name, 1.0) - 1)  # of pressure: twice that of speed
+                if off > 1.0:
+                    keys["scale_percent"] = min(_rounded(off), 50.0)
+            case _:
+                continue
+        made[name] = keys
+    return made
+
+
+def imu_keys(noise: Noise | None) -> dict[str, Any]:
+    """The best grade that covers what an inertial unit shows at rest; of one that no grade covers, the last with that.
+
+    Without a rest nothing is known, and the last grade is the safest.
+    """
+    grades = [name for name in imu.GRADES if name != "perfect"]
+    if noise is None:
+        return {"grade": grades[-1]}
+    shown = {
+        "angle_random_walk_degprth": noise.gyro_walk / DEG_PER_ROOT_H,
+        "velocity_random_walk_mpsprth": noise.accel_walk / MPS_PER_ROOT_H,
+        "gyro_turn_on_degph": float(abs(noise.gyro_bias).max()) / DEG_PER_H,
+        "accel_turn_on_mg": abs(noise.force_error) / MG,
+    }
+    for name in grades:
+        told = imu.GRADES[name]
+        if all(value <= _margin(key) * told[key] for key, value in shown.items()):
+            return {"grade": name}
+    told = imu.GRADES[grades[-1]]
+    return {"grade": grades[-1]} | {key: _rounded(value) for key, value in shown.items() if value > told[key]}
+
+
+def _margin(key: str) -> float:
+    return BIAS_SIGMAS if key.endswith(("turn_on_degph", "turn_on_mg")) else NOISE_MARGIN
+
+
+def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
+    """The text of a scenario file at ``out``; of a table, ``truth`` has its columns."""
+    log = found.log
+    end = min(float(own.t[-1]) for own in log.imus.values()) - log.t0
+    own = sections(found)
+    aids = [name for name, keys in own.items() if keys["kind"] != "imu"]
+    first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
+    lines = [
+        f"title = {json.dumps(log.path.name)}",
+        f"duration_s = {math.floor(10 * end) / 10:.1f}",
+    ]
+    if log.date is not None and WMM_YEARS[0] <= log.date.year < WMM_YEARS[1]:
+        lines.append(f"date = {log.date.isoformat()}")
+    else:
+        lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
+    place = os.path.relpath(log.path.resolve(), out.resolve().parent)
+    lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
+    if truth is not None and truth.columns:
+        lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]
+    for name, keys in own.items():
+        lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
+    main = next(iter(log.imus))
+    for kind, needs in (("ins", "gnss"), ("ahrs", "magnetometer")):
+        if needs in first:
+            used = [first[one] for one in AIDS[kind] if one in first]
+            lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
+            lines.append(f"aids = {_inline(used)}")
+    lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
+    return "\n".join(lines)
+
+
+def _columns(truth: LogTruth) -> Mapping[str, Any]:
+    """What the scenario said of a table's columns, without what it left out."""
+    return {name: stream.model_dump(exclude_unset=True) for name, stream in truth.columns.items()}
+
+
+def _inline(value: Any) -> str:
+    """A value as TOML has it on one line."""
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {_inline(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_inline, value)) + "]"
+    return json.dumps(value)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")

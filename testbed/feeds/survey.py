@@ -1,0 +1,301 @@
+"""What is in a log, measured: rates and gaps, phases of the flight, noise at rest, vibration, latencies, calibrations.
+
+Nothing of it needs an estimate of attitude: the velocity that the inertial unit gains from fix to fix, in axes that do
+not turn, is as long as the change of GNSS velocity less gravity, however the vehicle lies.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import optimize, signal
+
+from nav._jit import njit
+from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density
+from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
+from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
+from testbed.feeds.log import Log
+from testbed.feeds.stamps import GAP_PERIODS, GAP_S
+
+WINDOW_S = 1.0  # over which a vehicle is judged to be at rest
+REST_RATE, REST_FORCE = 0.02, 0.3  # deviation from the mean within a window [rad/s, m/s^2]
+REST_SPEED, FLYING_SPEED, FLYING_HEIGHT = 1.0, 6.0, 8.0  # of GNSS [m/s, m/s, m]
+LEAST_REST_S = 20.0  # to say anything of noise
+LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
+CLEARER = 1.1  # times as bad must no latency be, to believe in one
+LEAST_LINE = 6.0  # times the median of the spectrum about it
+LEAST_FIXES = 60
+LEAST_SPREAD = 0.05  # of a field about its mean, over its size, in the direction of the least
+SCALE_SIGMA, WORST_CONDITION = 0.05, 1e6  # of an airspeed scale that is worth saying
+LEAST_AIR = 10.0  # an airspeed says something of its scale from here on [m/s]
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """How a sensor reports: count, samples per second, deviation of their steps [s], gaps and the longest [s]."""
+
+    count: int
+    rate_hz: float
+    jitter_s: float
+    gaps: int
+    longest_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A stretch of the flight: ``rest``, ``moving`` or ``flying``; from the log's beginning [s]."""
+
+    name: str
+    start: float
+    end: float
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Of one inertial unit at rest for ``seconds``: gyros in rad/s, accelerometers in m/s^2, the worst axis.
+
+    ``*_walk`` is the Allan deviation at one second, which is what white noise leaves there per root second, and
+    ``*_floor`` its least, of averages over ``*_floor_s``; ``gyro_bias`` (3,) the mean; ``force_error`` the size of the
+    mean specific force less gravity.
+    """
+
+    seconds: float
+    gyro_walk: float
+    gyro_floor: float
+    gyro_floor_s: float
+    accel_walk: float
+    accel_floor: float
+    accel_floor_s: float
+    gyro_bias: Array
+    force_error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Vibration:
+    """Of the specific force while it moves: rms above 5 Hz [m/s^2], and the lines (frequency [Hz], amplitude)."""
+
+    rms: float
+    lines: Sequence[tuple[float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """All that was found; what could not be is None or missing."""
+
+    log: Log
+    rates: Mapping[str, Rate]
+    phases: Sequence[Phase]
+    noise: Mapping[str, Noise]
+    vibration: Mapping[str, Vibration]
+    latency_s: Mapping[str, float]
+    field_residual: Mapping[str, tuple[float, float]]  # rms about the sphere that fits, and its radius [T]
+    airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
+
+
+def survey(log: Log) -> Survey:
+    """Measure what is in a log."""
+    phases = _phases(log)
+    resting = max((p for p in phases if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
+    moving = [p for p in phases if p.name != "rest"]
+    noise = {name: still for name, imu in log.imus.items() if (still := _noise(log, imu, resting)) is not None}
+    vibration = {name: felt for name, imu in log.imus.items() if (felt := _vibration(log, imu, moving)) is not None}
+    times = {name: imu.t for name, imu in log.imus.items()}
+    times |= {name: np.array([one.t for one in own]) for name, own in log.samples.items()}
+    main = next(iter(log.imus.values()))
+    latency, spheres, scales = {}, {}, {}
+    for name, own in log.samples.items():
+        if isinstance(own[0], GnssSample) and (lag := _latency(main, own)) is not None:
+            latency[name] = lag
+        elif isinstance(own[0], MagnetometerSample):
+            field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
+            if (sphere := _sphere(field)) is not None:
+                spheres[name] = sphere
+        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
+            scales[name] = scale
+    rates = {name: _rate(t) for name, t in times.items()}
+    return Survey(log, rates, phases, noise, vibration, latency, spheres, scales)
+
+
+def _rate(t: Array) -> Rate:
+    steps = np.diff(t)
+    if not len(steps):
+        return Rate(len(t), math.nan, math.nan, 0, 0.0)
+    usual = float(np.median(steps))
+    ordinary = steps[steps <= max(GAP_PERIODS * usual, GAP_S)]
+    jitter = float(np.std(ordinary)) if len(ordinary) else math.nan
+    return Rate(len(t), 1 / usual, jitter, len(steps) - len(ordinary), float(steps.max()))
+
+
+def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
+    """Times (N,), velocities (N, 3) and places (N, 3) of the samples of a receiver that have a fix."""
+    found = [one for one in own if one.has_fix]
+    t = np.array([one.t for one in found])
+    v_n = np.array([one.v_n for one in found]).reshape(-1, 3)
+    return t, v_n, np.array([(one.lat, one.lon, one.h) for one in found]).reshape(-1, 3)
+
+
+def _phases(log: Log) -> list[Phase]:
+    """Rest by the inertial unit, flight by GNSS speed or height."""
+    imu = next(iter(log.imus.values()))
+    count = max(int((imu.t[-1] - log.t0) / WINDOW_S), 1)
+    edges = log.t0 + WINDOW_S * np.arange(count + 1)
+    rows = np.searchsorted(imu.t, edges)
+    rates, forces = imu.dtheta / imu.dt[:, None], imu.dv / imu.dt[:, None]
+    names = []
+    receiver = log.receiver
+    t, v_n, place = fixes(log.samples[receiver]) if receiver else (np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+    speed = np.hypot(v_n[:, 0], v_n[:, 1])
+    for k in range(count):
+        part = slice(rows[k], rows[k + 1])
+        still = rows[k + 1] - rows[k] > 1
+        still = still and bool((rates[part].std(axis=0) < REST_RATE).all())
+        still = still and bool((forces[part].std(axis=0) < REST_FORCE).all())
+        near = slice(*np.searchsorted(t, edges[k : k + 2]))
+        fast = float(np.nanmax(speed[near], initial=0.0))
+        high = float(np.max(place[near, 2] - np.median(place[:5, 2]), initial=0.0)) if len(place) else 0.0
+        if fast > FLYING_SPEED or (high > FLYING_HEIGHT and not still):
+            names.append("flying")
+        else:
+            names.append("rest" if still and fast < REST_SPEED else "moving")
+    changes = [0, *[k for k in range(1, count) if names[k] != names[k - 1]], count]
+    return [Phase(names[a], a * WINDOW_S, b * WINDOW_S) for a, b in itertools.pairwise(changes)]
+
+
+def _between(log: Log, imu: ImuSamples, phase: Phase) -> slice:
+    first, last = np.searchsorted(imu.t, [log.t0 + phase.start, log.t0 + phase.end])
+    return slice(int(first), int(last))
+
+
+def allan(rates: Array, dt: float) -> tuple[Array, Array]:
+    """Averaging times (M,) [s] and the overlapping Allan deviation (M, k) of rates (N, k) every ``dt`` [s]."""
+    angle = np.vstack([np.zeros((1, rates.shape[1])), np.cumsum(rates, axis=0)]) * dt
+    most = max(len(rates) // 4, 1)
+    counts = np.unique(np.geomspace(1, most, 40).astype(int))
+    rows = []
+    for m in counts:
+        second = angle[2 * m :] - 2 * angle[m:-m] + angle[: -2 * m]
+        rows.append(np.sqrt(np.mean(second**2, axis=0) / (2 * (m * dt) ** 2)))
+    return counts * dt, np.array(rows)
+
+
+def _noise(log: Log, imu: ImuSamples, resting: Phase | None) -> Noise | None:
+    if resting is None or resting.end - resting.start < LEAST_REST_S:
+        return None
+    part = _between(log, imu, resting)
+    dt = float(np.median(imu.dt[part]))
+    gyro, force = imu.dtheta[part] / imu.dt[part, None], imu.dv[part] / imu.dt[part, None]
+    found: list[tuple[float, float, float]] = []
+    for values in (gyro, force):
+        tau, deviation = allan(values - values.mean(axis=0), dt)
+        worst = deviation.max(axis=1)
+        lowest = int(np.argmin(worst))
+        found.append((float(np.interp(1.0, tau, worst)), float(worst[lowest]), float(tau[lowest])))
+    receiver = log.receiver
+    lat, h = (0.8, 0.0) if receiver is None else fixes(log.samples[receiver])[2][0, [0, 2]]
+    off = float(np.linalg.norm(force.mean(axis=0)) - gravity(float(lat), float(h)))
+    return Noise(resting.end - resting.start, *found[0], *found[1], gyro.mean(axis=0), off)
+
+
+def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration | None:
+    longest = max(moving, key=lambda p: p.end - p.start, default=None)
+    if longest is None or longest.end - longest.start < LEAST_REST_S:
+        return None
+    part = _between(log, imu, longest)
+    rate_hz = 1 / float(np.median(imu.dt[part]))
+    force = imu.dv[part] / imu.dt[part, None]
+    frequency, density = signal.welch(force, rate_hz, nperseg=min(1024, len(force)), axis=0)
+    total = density.sum(axis=1)
+    fast = frequency >= 5.0
+    if not fast.any():
+        return None
+    step = float(frequency[1])
+    floor = signal.medfilt(total, min(len(total) - 1 + len(total) % 2, 41))
+    peaks, _ = signal.find_peaks(np.where(fast & (total > LEAST_LINE * floor), total, 0.0))
+    strongest = sorted(peaks, key=lambda k: -total[k])[:3]
+    lines = [(float(frequency[k]), math.sqrt(2 * 1.5 * step * float(total[k]))) for k in strongest]
+    return Vibration(math.sqrt(float(total[fast].sum()) * step), lines)
+
+
+@njit
+def _gained(dtheta: Array, dv: Array) -> Array:
+    """Velocity (N + 1, 3) [m/s] that increments (N, 3) add up to, in the body axes of the beginning."""
+    total = np.zeros((len(dv) + 1, 3))
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    for k in range(len(dv)):
+        half = quat_normalise(quat_multiply(q, quat_from_rotvec(0.5 * dtheta[k])))
+        push = quat_rotate(half, dv[k])
+        for i in range(3):
+            total[k + 1, i] = total[k, i] + push[i]
+        q = quat_normalise(quat_multiply(q, quat_from_rotvec(dtheta[k])))
+    return total
+
+
+def _latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
+    """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it."""
+    t, v_n, place = fixes(own)
+    if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
+        return None
+    gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv))
+    at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
+    step = np.diff(t)
+    g = gravity(place[:-1, 0], place[:-1, 2])
+    change = np.diff(v_n, axis=0)
+    change[:, 2] -= g * step
+    told = np.linalg.norm(change, axis=1)
+    steady = (step < 2 * np.median(step)) & (t[:-1] - LAGS[-1] > at[0]) & (t[1:] < at[-1])
+    if steady.sum() < LEAST_FIXES:
+        return None
+    costs = []
+    for lag in LAGS:
+        moved = np.column_stack([np.interp(t - lag, at, column) for column in gained.T])
+        felt = np.linalg.norm(np.diff(moved, axis=0), axis=1)
+        apart = ((felt - told) / step)[steady]
+        costs.append(float(np.median(np.abs(apart - np.median(apart)))))
+    best = int(np.argmin(costs))
+    return float(LAGS[best]) if costs[0] > CLEARER * costs[best] and best < len(LAGS) - 1 else None
+
+
+def _sphere(field: Array) -> tuple[float, float] | None:
+    """The rms distance of magnetic fields (N, 3) from the sphere that fits them best, and its radius [T].
+
+    None where the vehicle did not turn enough to tell.
+    """
+    known = field[np.isfinite(field).all(axis=1)]
+    if len(known) < LEAST_FIXES:
+        return None
+    scale = float(np.abs(known).max()) or 1.0
+    x = known / scale
+    solved, *_ = np.linalg.lstsq(np.column_stack([2 * x, np.ones(len(x))]), np.sum(x * x, axis=1), rcond=None)
+    radius = math.sqrt(max(float(solved[3] + solved[:3] @ solved[:3]), 0.0))
+    apart = np.linalg.norm(x - solved[:3], axis=1) - radius
+    spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[-1] / math.sqrt(len(x))
+    return (scale * float(np.sqrt(np.mean(apart**2))), scale * radius) if spread > LEAST_SPREAD * radius else None
+
+
+def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
+    """True airspeed over the sensor's, of the wind and scale that fit GNSS velocity best while it flies."""
+    receiver = log.receiver
+    if receiver is None:
+        return None
+    t, v_n, place = fixes(log.samples[receiver])
+    told = np.interp(t, [one.t for one in own], [one.eas for one in own], left=np.nan, right=np.nan)
+    told = told * np.sqrt(SEA_LEVEL_DENSITY / isa_density(place[:, 2]))
+    flown = (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
+    if flown.sum() < LEAST_FIXES:
+        return None
+    v, air = v_n[flown], told[flown]
+
+    def misfit(x: Array) -> Array:
+        return np.asarray(np.sqrt((v[:, 0] - x[0]) ** 2 + (v[:, 1] - x[1]) ** 2 + v[:, 2] ** 2) - x[2] * air)
+
+    found = optimize.least_squares(misfit, [0.0, 0.0, 1.0], loss="soft_l1")
+    jacobian = np.asarray(found.jac)
+    information = jacobian.T @ jacobian
+    variance = 2 * found.cost / flown.sum() * np.linalg.pinv(information)[2, 2]
+    sure = found.success and variance < SCALE_SIGMA**2 and np.linalg.cond(information) < WORST_CONDITION
+    return float(found.x[2]) if sure else None

@@ -1,0 +1,97 @@
+"""What is in a log, as tables for the console."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from testbed.feeds.draft import sections
+from testbed.feeds.survey import Survey
+from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+MESSAGES_SHOWN = 60
+PHASES_SHOWN = 20
+
+
+def tables(found: Survey) -> Iterator[Table]:
+    """What the file holds, how its sensors report, the flight, and how good the sensors are."""
+    log = found.log
+    head = _table(f"{log.path.name}: {log.format}", "", "")
+    lasts = max(float(own.t[-1]) for own in log.imus.values()) - log.t0
+    head.add_row("lasts", f"{lasts:.1f} s")
+    head.add_row("date", str(log.date or "not said"))
+    head.add_row("reference", log.solution.name if log.solution is not None else "its GNSS alone")
+    listed = [f"{name} {count}" for name, count in sorted(log.messages.items())]
+    more = " …" if len(listed) > MESSAGES_SHOWN else ""
+    head.add_row("holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
+    for note in log.notes:
+        head.add_row("note", note)
+    yield head
+    reports = _table("sensors", "sensor", "samples", "rate [Hz]", "jitter [ms]", "gaps", "longest step [s]", "proposed")
+    proposed = sections(found)
+    for name, one in found.rates.items():
+        keys = {key: value for key, value in proposed.get(name, {}).items() if key not in ("kind", "rate_hz")}
+        said = ", ".join(f"{key} = {value}" if key != "grade" else str(value) for key, value in keys.items())
+        numbers = (f"{one.rate_hz:.4g}", f"{1e3 * one.jitter_s:.3g}", f"{one.gaps}", f"{one.longest_s:.3g}")
+        reports.add_row(name, str(one.count), *numbers, said)
+    yield reports
+    flight = _table("flight", "phase", "from [s]", "to [s]")
+    longest = sorted(found.phases, key=lambda p: p.start - p.end)[:PHASES_SHOWN]
+    for phase in sorted(longest, key=lambda p: p.start):
+        flight.add_row(phase.name, f"{phase.start:.0f}", f"{phase.end:.0f}")
+    yield flight
+    quality = _table("measured", "sensor", "what", "value")
+    for row in _measured(found):
+        quality.add_row(*row)
+    yield quality
+
+
+def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
+    """Sensor, what, and value with its unit."""
+    for name, own in found.noise.items():
+        x, y, z = own.gyro_bias / DEG_PER_H
+        yield name, f"gyro bias, {own.seconds:.0f} s at rest", f"{x:.0f}, {y:.0f}, {z:.0f} deg/h"
+        yield name, "gyro noise, by Allan deviation at 1 s", f"{own.gyro_walk / DEG_PER_ROOT_H:.3g} deg/√h"
+        yield name, f"gyro floor, at {own.gyro_floor_s:.3g} s", f"{own.gyro_floor / DEG_PER_H:.3g} deg/h"
+        yield name, "accelerometer size less gravity", f"{own.force_error / MG:.3g} mg"
+        yield name, "accelerometer noise at 1 s", f"{own.accel_walk / MPS_PER_ROOT_H:.3g} m/s/√h"
+        yield name, f"accelerometer floor, at {own.accel_floor_s:.3g} s", f"{own.accel_floor / MG:.3g} mg"
+    for name, felt in found.vibration.items():
+        yield name, "vibration above 5 Hz, rms", f"{felt.rms:.3g} m/s²"
+        for frequency, amplitude in felt.lines:
+            yield name, "line of the spectrum", f"{frequency:.1f} Hz, {amplitude:.3g} m/s²"
+    for name, lag in found.latency_s.items():
+        yield name, "velocity is told of later than the motion by", f"{lag:.2f} s"
+    for name, (residual, radius) in found.field_residual.items():
+        value = f"{residual / MICROTESLA:.3g} µT about {radius / MICROTESLA:.3g} µT"
+        yield name, "rms from the sphere that fits", value
+    for name, scale in found.airspeed_scale.items():
+        yield name, "true airspeed over the sensor's", f"{scale:.3f}"
+
+
+def _table(title: str, *columns: str) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=escape(title), title_justify="left", show_header=any(columns))
+    for column in columns:
+        table.add_column(escape(column), overflow="fold")
+    return table
+
+
+def columns(table: Any, title: str) -> Table:
+    """What the columns of a table are, for whoever has to say which is which."""
+    import numpy as np
+
+    shown = _table(title, "column", "rows", "least", "largest", "median step")
+    for name, values in table.items():
+        known = values[np.isfinite(values)]
+        steps = np.diff(values) if values.ndim == 1 and len(values) > 1 else np.empty(0)
+        ascends = len(steps) and bool((steps >= 0).all())
+        ends = (f"{known.min():.6g}", f"{known.max():.6g}") if len(known) else ("", "")
+        shape = " × ".join(map(str, values.shape))
+        shown.add_row(name, shape, *ends, f"{np.median(steps):.4g}" if ascends else "")
+    return shown
