@@ -41,14 +41,13 @@ def located(scenario: Scenario) -> Scenario:
         return scenario
     log = formats.open_log(scenario.truth)
     _require_sensors(scenario, log)
-    start = scenario.truth.start or log.start or _start(log, scenario.truth.start_s)
-    sensors = {
-        name: section if "rate_hz" in section.model_fields_set else section.model_copy(update={"rate_hz": rate_hz})
-        for name, section in scenario.sensors.items()
-        for rate_hz in (rate(log, name),)
-    }
-    truth = scenario.truth.model_copy(update={"start": start})
-    return scenario.model_copy(update={"truth": truth, "sensors": sensors})
+    found: dict[str, Any] = {}
+    if scenario.truth.start is None:
+        found["truth.start"] = (log.start or _start(log, scenario.truth.start_s)).model_dump()
+    for name, section in scenario.sensors.items():
+        if "rate_hz" not in section.model_fields_set:
+            found[f"sensors.{name}.rate_hz"] = rate(log, name)
+    return scenario.changed(found) if found else scenario
 
 
 def rate(log: Log, name: str) -> float:

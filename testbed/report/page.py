@@ -25,7 +25,13 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from matplotlib.figure import Figure
 
-KEPT = (("scenario", "Scenario"), ("overrides", "Overrides"), ("versions", "Versions"))  # attributes shown as they are
+KEPT = (  # attributes shown as they are
+    ("reference", "Reference"),
+    ("log", "Log"),
+    ("scenario", "Scenario"),
+    ("overrides", "Overrides"),
+    ("versions", "Versions"),
+)
 
 
 @dataclass(frozen=True, slots=True)

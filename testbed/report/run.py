@@ -62,6 +62,21 @@ class Run:
         return True
 
     @property
+    def recorded(self) -> bool:
+        """Whether the flight was recorded: what stands for truth is a reference, unknown here and there."""
+        return "reference" in self.dataset.attrs
+
+    @property
+    def reference(self) -> str:
+        """What the estimates are held against, in a word."""
+        return "reference" if self.recorded else "truth"
+
+    @property
+    def receivers(self) -> list[str]:
+        """The GNSS receivers."""
+        return scores.receivers(self.dataset)
+
+    @property
     def aligned(self) -> dict[str, Errors]:
         """Errors of the estimators that were ever aligned."""
         return {name: e for name, e in self.errors.items() if e.aligned_s is not None}
@@ -99,7 +114,10 @@ class Run:
 
     def track(self, lat: Array, lon: Array) -> Array:
         """North and east of the run's first point (N, 2) [km]."""
-        start = [np.full(len(lat), self.truth(name)[0]) for name in ("lat", "lon", "h")]
+        places = np.column_stack([self.truth(name) for name in ("lat", "lon", "h")])
+        known = places[np.isfinite(places).all(axis=1)]
+        first = known[0] if len(known) else places[0]
+        start = [np.full(len(lat), one) for one in first.tolist()]
         return earth.position_difference_n(lat, lon, start[2], *start)[:, :2] / 1000
 
     def against_time(self, sheet: Sheet, title: float = 0.0, sensors: list[set[str]] | None = None) -> None:

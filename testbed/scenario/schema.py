@@ -248,6 +248,11 @@ class Scenario(Section):
         overrides = json.loads(said.get("overrides", "[]"))
         return cls.parse(str(said["scenario"]), overrides, Path(path) if path else None)
 
+    def changed(self, values: Mapping[str, Any]) -> Scenario:
+        """The same with further values by key, which belong to it from then on. Raises UserError as `load` does."""
+        more = [keypath.override(key, value) for key, value in values.items()]
+        return self.parse(self.text, [*self.overrides, *more], self.path)
+
     @property
     def leg_names(self) -> tuple[str, ...]:
         """What the motion is made of, in order: the names of a flight's legs, or of a body's segments."""

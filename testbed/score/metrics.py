@@ -91,8 +91,7 @@ def outages(dataset: xarray.DataTree) -> list[Window]:
     without GNSS receivers.
     """
     changes: list[tuple[float, str, bool]] = []
-    receivers = _receivers(dataset)
-    for name in receivers:
+    for name in receivers(dataset):
         t = column(dataset, f"sensors/{name}/time")
         fix = np.asarray(has_fix(column(dataset, f"sensors/{name}/fix_type")))
         when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), t)
@@ -114,7 +113,8 @@ def outages(dataset: xarray.DataTree) -> list[Window]:
     return windows if start is None else [*windows, (start, np.inf)]
 
 
-def _receivers(dataset: xarray.DataTree) -> list[str]:
+def receivers(dataset: xarray.DataTree) -> list[str]:
+    """The GNSS receivers of a record."""
     if "sensors" not in dataset.children:
         return []
     return [name for name, node in dataset["sensors"].children.items() if "fix_type" in node.data_vars]

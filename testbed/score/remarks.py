@@ -33,7 +33,9 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
     """A sentence for each thing that the reader of a record should know first; ``metrics`` are its own."""
     astray = dict(_astray(dataset, metrics))
     trusted = [name for name in accuracy.names(dataset) if name not in astray]
+    reference = dataset.attrs.get("reference")
     return [
+        *([f"errors are against {reference}"] if reference else []),
         *scores.unscored(dataset),
         *unfinished_leg(dataset),
         *astray.values(),

@@ -68,7 +68,7 @@ def attitude(run: Run) -> Figure | None:
          run.lines[name] | layer(rank, len(run.aligned)))
         for rank, name in enumerate(run.aligned)
     ]  # fmt: skip
-    curves.insert(0, ("truth", run.t, _euler_deg(run.truth("q_nb")), {"color": TRUTH, "lw": 1.0, "zorder": 4}))
+    curves.insert(0, (run.reference, run.t, _euler_deg(run.truth("q_nb")), {"color": TRUTH, "lw": 1.0, "zorder": 4}))
     for k, (ax, label) in enumerate(zip(drawn.axes[:, 0], ("roll [deg]", "pitch [deg]", "heading [deg]"), strict=True)):
         for name, t, euler, line in curves:
             some = stride(len(t))

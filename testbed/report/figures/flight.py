@@ -23,15 +23,18 @@ from testbed.report.style import (
     thin,
 )
 from testbed.score import accuracy
+from testbed.score.accuracy import column
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-def ground_track(run: Run) -> Figure:
+def ground_track(run: Run) -> Figure | None:
     """Where it flew and where each estimator thought it was."""
     truth = run.track(run.truth("lat"), run.truth("lon"))
+    if not np.isfinite(truth).any():
+        return None
     believed = {name: run.track(run.estimate(name, "lat"), run.estimate(name, "lon")) for name in run.positioned}
     low, high = np.nanmin(truth, axis=0), np.nanmax(truth, axis=0)
     extent = max(float((high - low).max()), 0.02)
@@ -61,15 +64,19 @@ def ground_track(run: Run) -> Figure:
 
 def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> None:
     denied = accuracy.inside(run.t, run.windows)
-    ax.plot(truth[:, 1], truth[:, 0], color=TRUTH, lw=1.0, label="truth", zorder=4)
+    ax.plot(truth[:, 1], truth[:, 0], color=TRUTH, lw=1.0, label=run.reference, zorder=4)
+    for name in run.receivers if run.recorded else ():
+        fixes = run.track(*(column(run.dataset, f"sensors/{name}/{axis}") for axis in ("lat", "lon")))
+        ax.plot(fixes[:, 1], fixes[:, 0], ".", color=GUIDE, ms=2, label=f"{name}, as used", zorder=1)
     if denied.any():
         gap = np.where(denied[:, None], truth, np.nan)
         wide = 12 if believed else 7
         ax.plot(gap[:, 1], gap[:, 0], color=SHADE, lw=wide, solid_capstyle="round", zorder=0)
     for rank, (name, points) in enumerate(believed.items()):
         ax.plot(points[:, 1], points[:, 0], **run.lines[name], **layer(rank, len(believed)), label=name)
-    ax.plot(truth[0, 1], truth[0, 0], "o", color=TRUTH, ms=7, label="start", zorder=5)
-    ax.plot(truth[-1, 1], truth[-1, 0], "s", color=TRUTH, ms=7, label="end", zorder=5)
+    known = truth[np.isfinite(truth).all(axis=1)]
+    ax.plot(known[0, 1], known[0, 0], "o", color=TRUTH, ms=7, label="start", zorder=5)
+    ax.plot(known[-1, 1], known[-1, 0], "s", color=TRUTH, ms=7, label="end", zorder=5)
     ax.set_xlabel("east of the start [km]")
 
 
@@ -78,12 +85,13 @@ def flight(run: Run) -> Figure:
     drawn = sheet(2, height=2.5, gap=0.2)
     top, bottom = drawn.axes[:, 0]
     truth = run.truth("h")
-    top.plot(*thin(run.t, truth), color=TRUTH, lw=1.0, label="truth", zorder=4)
+    top.plot(*thin(run.t, truth), color=TRUTH, lw=1.0, label=run.reference, zorder=4)
     for rank, name in enumerate(run.positioned):
         line = thin(run.estimate(name, "time"), run.estimate(name, "h"))
         top.plot(*line, **run.lines[name], **layer(rank, len(run.positioned)), label=name)
-    margin = max(0.15 * float(np.nanmax(truth) - np.nanmin(truth)), 20.0)
-    top.set_ylim(np.nanmin(truth) - margin, np.nanmax(truth) + margin)
+    if np.isfinite(truth).any():
+        margin = max(0.15 * float(np.nanmax(truth) - np.nanmin(truth)), 20.0)
+        top.set_ylim(np.nanmin(truth) - margin, np.nanmax(truth) + margin)
     top.set_ylabel("height above\nellipsoid [m]")
     bottom.plot(*thin(run.t, run.truth("airspeed")), color=TRUTH, lw=1.2, label="true airspeed")
     ground = np.hypot(run.truth("v_n")[:, 0], run.truth("v_n")[:, 1])
