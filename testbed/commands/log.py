@@ -12,7 +12,7 @@ from testbed.errors import UserError, printable
 
 LogFile = Annotated[
     Path,
-    typer.Argument(metavar="FILE", help="A log, or a scenario of one, which says what a table's columns are."),
+    typer.Argument(metavar="FILE", help="A log, or a scenario of one, which says what columns are; or a shipped log."),
 ]
 Target = Annotated[
     Path | None, typer.Option("--scenario", metavar="OUT.toml", help="Write a scenario that runs the log.")
@@ -21,13 +21,15 @@ Target = Annotated[
 
 def log(file: LogFile, scenario: Target = None, force: Force = False) -> None:
     """Show what is in a recorded flight: rates, gaps, phases, noise, vibration, latencies; propose grades."""
-    from testbed.data import write_file
+    from testbed.data import data_dir, write_file
     from testbed.feeds import draft, formats
     from testbed.feeds.survey import survey
     from testbed.motion.logged import LogTruth
     from testbed.report import log as pages
 
     truth = None
+    if not file.exists() and (data_dir("scenarios") / file).is_file():
+        file = data_dir("scenarios") / file  # a shipped log, by its name
     if file.suffix == ".toml":
         from testbed.scenario import Scenario
 

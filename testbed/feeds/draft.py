@@ -35,8 +35,8 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
         match own[0]:
             case GnssSample():
                 keys = {"kind": "gnss", "grade": "standalone", **keys}
-                if not log.valid_times:
-                    keys["latency_s"] = found.latency_s.get(name, 0.2)
+                if name in found.latency_s and not log.valid_times:
+                    keys["latency_s"] = found.latency_s[name]
             case MagnetometerSample():
                 keys = {"kind": "magnetometer", "grade": "mems", **keys}
                 residual = found.field_residual.get(name, (0.0, 0.0))[0] / MICROTESLA

@@ -31,6 +31,7 @@ CLEARER = 1.1  # times as bad must no latency be, to believe in one
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
 LEAST_SPREAD = 0.05  # of a field about its mean, over its size, in the direction of the least
+ACROSS = 0.1  # share of the flight across its main direction, to tell wind from scale
 SCALE_SIGMA, WORST_CONDITION = 0.05, 1e6  # of an airspeed scale that is worth saying
 LEAST_AIR = 10.0  # an airspeed says something of its scale from here on [m/s]
 
@@ -289,6 +290,9 @@ def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
     if flown.sum() < LEAST_FIXES:
         return None
     v, air = v_n[flown], told[flown]
+    courses = v[:, :2] / np.hypot(v[:, 0], v[:, 1])[:, None]
+    if np.linalg.eigvalsh(courses.T @ courses / len(courses))[0] < ACROSS:
+        return None  # there and back alone: the wind across can't be told from the scale
 
     def misfit(x: Array) -> Array:
         return np.asarray(np.sqrt((v[:, 0] - x[0]) ** 2 + (v[:, 1] - x[1]) ** 2 + v[:, 2] ** 2) - x[2] * air)
