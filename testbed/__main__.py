@@ -253,12 +253,13 @@ def papers(
     from testbed import papers as library
     from testbed.many import progress
     from testbed.papers import saved
+    from testbed.papers.claims import Verdict
     from testbed.papers.draws import draws
 
     found = library.find(ids or [])
     drawn = draws(library.RECORDED_DRAW if draw is None else draw, runs, quick)
     if save:
-        saved.require_checkout(ids or [])
+        saved.require_checkout()
     require_own(out, [library.RESULTS, *(figure for paper in found.values() for figure in paper.figures)])
     with (
         output_folder(out),
@@ -267,14 +268,15 @@ def papers(
         progress.shown(console(stderr=True), "papers") as tell,
     ):
         claims = library.reproduce(found, drawn, out, tell)
-    for name, own in claims.items():
+    records = {name: [claim.record() for claim in own] for name, own in claims.items()}
+    for name, own in records.items():
         for table in library.tables(found[name].title, own):
             console().print(table)
-    print(library.counted(claims))
+    print(library.counted(records))
     print(printable(f"{out / library.RESULTS} and figures beside it"))
     if save:
-        print(printable(str(saved.save(found, claims, drawn, out))))
-    if any(claim.verdict == "missed" for own in claims.values() for claim in own):
+        print(printable(str(saved.save(out))))
+    if any(claim.verdict is Verdict.MISSED for own in claims.values() for claim in own if claim.paper):
         raise typer.Exit(EXIT_FAILED)
 
 

@@ -142,6 +142,7 @@ class CampaignResult:
     outcomes: Sequence[Outcome]
     failures: Sequence[Failure]
     statistics: Statistics
+    draw: int = 0
 
     def frame(self) -> pandas.DataFrame:
         """One row for each run: the varied values, the seed and all metrics, NaN where a run has none of that name."""
@@ -280,7 +281,7 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     outcomes = [stored[run] for run in sorted(stored)]
     failures.sort(key=lambda f: (f.combination, f.seed))
     statistics = campaign_report.statistics(combinations, outcomes)
-    result = CampaignResult(folder, combinations, outcomes, failures, statistics)
+    result = CampaignResult(folder, combinations, outcomes, failures, statistics, plan.draw)
     campaign_report.save(result)
     return result
 

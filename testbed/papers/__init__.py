@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from testbed.data import data_dir
 from testbed.errors import UserError
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from testbed.many.progress import Tell
 
 RESULTS = "papers.json"
-RECORDED_DRAW = 0  # of the table in the documentation, and what is drawn when nobody says
+RECORDED_DRAW = 20261122  # of the table in the documentation, and what is drawn when nobody says
+Records: TypeAlias = Sequence[Mapping[str, Any]]  # claims as `Claim.record` has them
 IDS = ("cheng2020", "cui2022", "jiang2021", "zhou2025", "zhu2020")
 
 
@@ -91,10 +92,27 @@ def reproduce(
         in_order = [results[name][k] for k in sorted(results[name])]
         claims[name] = paper.conclude(in_order)
         paper.draw(in_order, out)
-    found: dict[str, Any] = {"draw": draws.number, "runs": draws.runs}
-    found |= {name: [claim.record() for claim in own] for name, own in claims.items()}
-    write_result(out / RESULTS, json.dumps(found, indent=1).encode())
+    records = {name: [claim.record() for claim in own] for name, own in claims.items()}
+    keep(records, draws, out / RESULTS)
     return claims
+
+
+def keep(found: Mapping[str, Records], draws: Draws, path: Path) -> None:
+    """Write what was found beside what other papers of the same draws have there already."""
+    kept = stored(path)
+    if kept is None or kept[0] != draws:
+        kept = (draws, {})
+    whole = {"draw": draws.number, "runs": draws.runs, "papers": {**kept[1], **found}}
+    write_result(path, json.dumps(whole, indent=1).encode())
+
+
+def stored(path: Path) -> tuple[Draws, dict[str, Records]] | None:
+    """The draws and, by paper, the claims of a file that `reproduce` wrote; None when there is none that can be read."""
+    try:
+        whole = json.loads(path.read_text("utf-8"))
+        return Draws(whole["draw"], whole["runs"]), whole["papers"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def _work(task: tuple[str, int, Job], tell: Callable[[float], None]) -> Any:
@@ -103,47 +121,47 @@ def _work(task: tuple[str, int, Job], tell: Callable[[float], None]) -> Any:
     return job.work(*job.arguments)
 
 
-def tables(title: str, claims: Sequence[Claim]) -> Iterator[Table]:
+COLUMNS = ("quantity", "paper", "ours, with its 95 % interval", "statistic", "bound", "verdict")
+
+
+def tables(title: str, records: Records) -> Iterator[Table]:
     """Every claim of a paper in a row, and what it doesn't claim in a table of its own."""
     from rich.table import Table
 
     colours = {Verdict.MET: "green", Verdict.MISSED: "red", Verdict.OPEN: "yellow"}
-    for heading, own in parted(title, claims):
+    for heading, own in parted(title, records):
         table = Table(*COLUMNS, title=heading, title_justify="left")
-        for claim in own:
-            *cells, verdict = row(claim)
-            said = verdict.replace(claim.verdict, f"[{colours.get(claim.verdict, 'cyan')}]{claim.verdict}[/]", 1)
-            table.add_row(*(cell.replace("[", r"\[") for cell in cells), said)
+        for record in own:
+            *cells, said = (cell.replace("[", r"\[") for cell in row(record))
+            colour = colours.get(Verdict(record["verdict"]), "cyan")
+            table.add_row(*cells, f"[{colour}]{said}[/]")
         yield table
 
 
-COLUMNS = ("quantity", "paper", "ours, with its 95 % interval", "statistic", "bound", "verdict")
-
-
-def counted(claims: Mapping[str, Sequence[Claim]]) -> str:
+def counted(found: Mapping[str, Records]) -> str:
     """How many of the papers' claims have which verdict."""
-    every = [claim.verdict for own in claims.values() for claim in own if claim.paper]
+    every = [record["verdict"] for own in found.values() for record in own if record["paper"]]
     parts = ", ".join(f"{every.count(verdict)} {verdict}" for verdict in Verdict if verdict in every)
     return f"{len(every)} claims of the papers: {parts}"
 
 
-def parted(title: str, claims: Sequence[Claim]) -> Iterator[tuple[str, list[Claim]]]:
+def parted(title: str, records: Records) -> Iterator[tuple[str, Records]]:
     """(heading, claims) of those of the paper, and of the rest."""
     for heading, own in (
-        (title, [claim for claim in claims if claim.paper]),
-        (f"{title}: what it does not claim", [claim for claim in claims if not claim.paper]),
+        (title, [record for record in records if record["paper"]]),
+        (f"{title}: what it does not claim", [record for record in records if not record["paper"]]),
     ):
         if own:
             yield heading, own
 
 
-def row(claim: Claim) -> tuple[str, ...]:
+def row(record: Mapping[str, Any]) -> tuple[str, ...]:
     """A claim in `COLUMNS`."""
     return (
-        f"{claim.quantity} [{claim.unit}]" if claim.unit else claim.quantity,
-        claim.paper,
-        str(claim.interval),
-        claim.statistic.name if claim.draws == 1 else f"{claim.statistic.name} of {claim.draws}",
-        f"{'≥' if claim.at_least else '≤'} {claim.bound:.3g}",
-        f"{claim.verdict}: {claim.why}" if claim.why else claim.verdict.value,
+        f"{record['quantity']} [{record['unit']}]" if record["unit"] else record["quantity"],
+        record["paper"],
+        record["as text"],
+        record["statistic"] if record["draws"] == 1 else f"{record['statistic']} of {record['draws']}",
+        record["bound"],
+        f"{record['verdict']}: {record['why']}" if record["why"] else record["verdict"],
     )

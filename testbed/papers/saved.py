@@ -8,46 +8,52 @@ from pathlib import Path
 
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
-from testbed.papers import COLUMNS, Paper, counted, parted, row
-from testbed.papers.claims import Claim
+from testbed.papers import COLUMNS, RESULTS, Records, counted, find, parted, row, stored
 from testbed.papers.draws import Draws
 
 TABLE = "papers-table.md"
 
 
-def require_checkout(ids: Sequence[str]) -> None:
-    """Raises UserError when there is no documentation to write to, or only some papers are asked for."""
-    if ids:
-        raise UserError("--save: the table has all papers: leave out " + ", ".join(ids))
+def require_checkout() -> None:
+    """Raises UserError when there is no documentation to write to."""
     if not _docs().is_dir():
         raise UserError(f"{_docs()}: is missing: --save is for a checkout of the testbed")
 
 
-def save(
-    papers: Mapping[str, Paper], claims: Mapping[str, Sequence[Claim]], draws: Draws, figures: Path
-) -> Path:  # fmt: skip
-    """Write the table, and copy the ``figures`` of that folder beside the papers' scenarios; the table's file."""
+def save(folder: Path) -> Path:
+    """Write the table of what that ``folder`` has of all papers, and copy its figures beside their scenarios.
+
+    Returns the table's file. Raises UserError when a paper has not been judged there with the same draws as the others.
+    """
+    papers = find([])
+    draws, found = stored(folder / RESULTS) or (Draws(0), {})
+    missing = [name for name in papers if name not in found]
+    if missing:
+        raise UserError(
+            f"{folder / RESULTS}: {', '.join(missing)} not judged yet: testbed papers {' '.join(missing)} --draw"
+            f" {draws.number} --runs {draws.runs} --save"
+        )
     path = _docs() / TABLE
-    write_file(path, page({paper.title: claims[name] for name, paper in papers.items()}, draws).encode())
+    write_file(path, page({paper.title: found[name] for name, paper in papers.items()}, draws).encode())
     for paper in papers.values():
         for figure in paper.figures:
-            write_file(data_dir("scenarios") / "papers" / figure, (figures / figure).read_bytes())
+            write_file(data_dir("scenarios") / "papers" / figure, (folder / figure).read_bytes())
     return path
 
 
-def page(claims: Mapping[str, Sequence[Claim]], draws: Draws) -> str:
+def page(found: Mapping[str, Records], draws: Draws) -> str:
     """Every claim of every paper, by title, in Markdown."""
     today = datetime.now(UTC).date()
     lines = [
         "# Claims and verdicts",
         "",
-        f"Written by `testbed papers --save --draw {draws.number} --runs {draws.runs}` on {today}. {counted(claims)}.",
+        f"Written by `testbed papers --save --draw {draws.number} --runs {draws.runs}` on {today}. {counted(found)}.",
         "[Five papers](papers.md) says what each verdict means.",
     ]
-    for title, every in claims.items():
-        for heading, own in parted(title, every):
+    for title, records in found.items():
+        for heading, own in parted(title, records):
             lines += ["", f"## {heading}", "", _line(COLUMNS), _line(["---"] * len(COLUMNS))]
-            lines += [_line(row(claim)) for claim in own]
+            lines += [_line(row(record)) for record in own]
     return "\n".join(lines) + "\n"
 
 

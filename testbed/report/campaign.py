@@ -215,6 +215,7 @@ def _json(result: CampaignResult) -> dict[str, Any]:
 
     return {
         "combinations": [dict(combination.values) for combination in result.combinations],
+        "draw": result.draw,
         "runs": len(result.outcomes),
         "spreads": plain(result.statistics.spreads),
         "consistency": plain(result.statistics.consistency),

@@ -292,7 +292,7 @@ def test_failing_run_is_reported_and_stops_no_other(
     assert code == 1
     assert "seed 12: ArithmeticError: the filter blew up" in messages
     stored = json.loads((out / "campaign.json").read_text())
-    assert stored["runs"] == 2
+    assert (stored["runs"], stored["draw"]) == (2, 0)
     assert [f["seed"] for f in stored["failures"]] == [12]
     assert "in __call__" in stored["failures"][0]["traceback"]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -63,10 +62,12 @@ def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
     assert drawn == [tmp_path / "3.png"]
     assert sorted(set(told)) == pytest.approx([0.0, 1 / 3, 2 / 3, 1.0])
     assert told == sorted(told)
-    record = json.loads((tmp_path / papers.RESULTS).read_text())
-    assert (record["draw"], record["runs"]) == (0, 3)
-    assert record["toy"][0]["ours"] == pytest.approx(14 / 3)
-    assert [row["verdict"] for row in record["toy"]] == ["open", "missed"]
+    stored = papers.stored(tmp_path / papers.RESULTS)
+    assert stored is not None
+    draws, found = stored
+    assert draws == Draws(0, 3)
+    assert found["toy"][0]["ours"] == pytest.approx(14 / 3)
+    assert [row["verdict"] for row in found["toy"]] == ["open", "missed"]
 
 
 @pytest.mark.ci
