@@ -1,8 +1,8 @@
 """Many seeds: one scenario flown many times, for every combination of varied values, on many processors.
 
 Run k of a combination has the scenario's own seed + k, so `testbed run --seed` flies any one of them again, bit for
-bit; another draw begins `DRAW` seeds further on for each. Every run is a task by itself: its numbers can't depend on
-how many workers there are, or on which of them it ran.
+bit; another draw begins `draws.DRAW` seeds further on for each. Every run is a task by itself: its numbers can't depend
+on how many workers there are, or on which of them it ran.
 
 Results come back to this process, which writes them into the campaign's folder as they finish; a campaign that was
 interrupted carries on with the runs that are missing.
@@ -35,6 +35,7 @@ from nav.samples import Array
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.many import pool, progress
+from testbed.many.draws import DRAW, require_draw
 from testbed.many.shared_flight import require_control, share_truth
 from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
@@ -51,17 +52,7 @@ if TYPE_CHECKING:
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
 SETUP = "setup.json"
-DRAW = 1_000_000  # seeds from the first of one draw to the first of the next, and the most runs in one
-LARGEST_DRAW = 1_000_000_000
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
-
-
-def require_draw(number: int, runs: int) -> None:
-    """Raises UserError when there is no such draw, or it has not so many seeds."""
-    if not 0 <= number <= LARGEST_DRAW:
-        raise UserError(f"--draw {number}: give a number from 0 to {LARGEST_DRAW}")
-    if runs > DRAW:
-        raise UserError(f"--runs {runs}: a draw has {DRAW} seeds")
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,7 +107,7 @@ def keep(found: Mapping[str, Records], draws: Draws, path: Path) -> None:
 
 
 def stored(path: Path) -> tuple[Draws, dict[str, Records]] | None:
-    """The draws and, by paper, the claims of a file that `reproduce` wrote; None when there is none that can be read."""
+    """The draws and, by paper, the claims of a file that `reproduce` wrote; None when none can be read."""
     try:
         whole = json.loads(path.read_text("utf-8"))
         return Draws(whole["draw"], whole["runs"]), whole["papers"]

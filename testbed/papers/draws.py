@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from testbed.errors import UserError
-from testbed.many.campaign import DRAW, require_draw
+from testbed.many.draws import DRAW, require_draw
 from testbed.sensors.noise import stream
 
 RUNS, QUICK = 100, 10
