@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,7 +138,7 @@ class Floor(NamedTuple):
     exact: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Claim:
     """One figure of a paper beside ours.
 
@@ -161,19 +162,19 @@ class Claim:
         """How many draws there are."""
         return len(np.atleast_1d(np.asarray(self.ours, dtype=float)))
 
-    @property
+    @cached_property
     def interval(self) -> Interval:
         """The statistic with its interval; NaN when there is nothing to judge."""
         return _judged(self.ours, self.statistic)
 
-    @property
+    @cached_property
     def best(self) -> Interval | None:
         """That of the `Floor`."""
         if self.floor is None:
             return None
         return _judged(self.floor.values, EXACT if self.floor.exact else self.statistic)
 
-    @property
+    @cached_property
     def verdict(self) -> Verdict:
         """See the head of this module; without a figure it is missed."""
         found = self._compare(self.interval)
