@@ -15,6 +15,7 @@ import numpy as np
 from nav.ahrs import limited
 from nav.detection import Decision, Mean, chi_square_threshold, whiten
 from nav.detection.base import Alarm
+from nav.earth import STANDARD_GRAVITY
 from nav.fusion import scaled_inverse
 from nav.samples import Array
 from nav.weighting import ITERATIONS, TOLERANCE, inflated_distance
@@ -174,6 +175,18 @@ def weights_eq13(P: Array, common: int, members: Array) -> Array:
         norms[i] = np.linalg.norm(np.sum(inverse * inverse, axis=1))
     weights: Array = norms / norms.sum()
     return weights
+
+
+DEGREES = np.degrees(1.0)
+# What the paper's 13 states are in: deg; m/s; m; deg/h; ug. Height and vertical velocity are none of them.
+UNITS = np.repeat([DEGREES, 1.0, 0.0, 1.0, 0.0, 3600 * DEGREES, 1e6 / STANDARD_GRAVITY], [3, 2, 1, 2, 1, 3, 3])
+
+
+def weights_eq13_in_degrees(P: Array, common: int, members: Array) -> Array:
+    """Equation 13 with the states in the units of the paper's tables and figures (`UNITS`)."""
+    states = np.flatnonzero(UNITS)
+    units = UNITS[states]
+    return weights_eq13(P[:, states[:, None], states] * np.outer(units, units), len(states), members)
 
 
 # --- Jiang et al. 2021
