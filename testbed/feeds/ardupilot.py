@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import gc
 import io
 import math
-from collections.abc import Mapping
+import os
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -67,39 +70,69 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     )  # fmt: skip
 
 
-def _messages(path: Path) -> dict[str, list[Any]]:
+def _messages(path: Path) -> dict[str, list[dict[str, Any]]]:
     """All messages by their names. Raises UserError when there are none."""
-    from pymavlink import DFReader  # type: ignore[import-untyped]
-
     with path.open("rb") as file:
         text = file.read(4) == b"FMT,"
-    found: dict[str, list[Any]] = {}
-    wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES}
-    try:
-        with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):  # of bad bytes
-            reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
-            with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
-                while (message := reader.recv_msg()) is not None:
-                    name = message.get_type()
-                    own = found.setdefault(name, [])
-                    own.append(message if name in wanted else None)
-    except Exception as error:  # whatever a damaged file makes the reader raise
-        if not found:
-            raise UserError(f"{path}: can't be read as a DataFlash log: {type(error).__name__} {error}") from None
+    with warnings.catch_warnings(), _silence():
+        warnings.simplefilter("ignore", ResourceWarning)  # of a file that the reader gives up on
+        found, problem = _parsed(path, text)
+        if problem:
+            gc.collect()
     if not found:
-        raise UserError(f"{path}: a DataFlash log without a single message: it was cut off, or never written")
+        cut = "it was cut off, or never written"
+        raise UserError(f"{path}: a DataFlash log without a single message: {problem or cut}")
     return found
 
 
-def _units(messages: Mapping[str, list[Any]]) -> dict[str, dict[str, Rows]]:
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Keep what the reader has to say of bad bytes, some of it past Python, from the user, whom we tell ourselves."""
+    kept = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere, contextlib.redirect_stderr(io.StringIO()):
+            os.dup2(nowhere.fileno(), 2)
+            with contextlib.redirect_stdout(io.StringIO()):
+                yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], str]:
+    """The messages up to where the file is damaged beyond reading, and how it is, empty when it is not."""
+    from pymavlink import DFReader  # type: ignore[import-untyped]
+
+    found: dict[str, list[dict[str, Any]]] = {}
+    wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES}
+    try:
+        reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
+        with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
+            while (message := reader.recv_msg()) is not None:
+                name = message.get_type()
+                found.setdefault(name, []).append(_fields(message) if name in wanted else {})
+    except Exception as error:  # whatever a damaged file makes the reader raise
+        return found, f"{type(error).__name__} {error}"
+    return found, ""
+
+
+def _fields(message: Any) -> dict[str, Any]:
+    """The fields of a message by name, empty where one of them can't be read."""
+    try:
+        return {key: getattr(message, key) for key in message.get_fieldnames()}
+    except (AttributeError, TypeError, ValueError, UnicodeDecodeError):
+        return {}
+
+
+def _units(messages: Mapping[str, list[dict[str, Any]]]) -> dict[str, dict[str, Rows]]:
     """The fields of the messages that are sensors', by kind and name of the unit."""
     units: dict[str, dict[str, Rows]] = {}
     for kind, names in KINDS.items():
         for k, name in enumerate(names):
-            own = messages.get(name, [])
-            numbers = {getattr(one, "I", None) for one in own}
+            own = [one for one in messages.get(name, []) if one]
+            numbers = {one.get("I") for one in own}
             for number in sorted(numbers, key=lambda n: -1 if n is None else n):
-                of_unit = [one for one in own if getattr(one, "I", None) == number]
+                of_unit = [one for one in own if one.get("I") == number]
                 count = (k if number is None else int(number)) + 1
                 if kind in ("gyr", "acc") and number is None:
                     count = max(k, 1)
@@ -109,11 +142,11 @@ def _units(messages: Mapping[str, list[Any]]) -> dict[str, dict[str, Rows]]:
     return units
 
 
-def _rows(messages: list[Any]) -> Rows:
+def _rows(messages: list[dict[str, Any]]) -> Rows:
     """Fields of numbers as arrays; a field that one message lacks, or that is text, is left out."""
     rows = {}
-    for key in messages[0].get_fieldnames():
-        values = [getattr(one, key, None) for one in messages]
+    for key in messages[0] if messages else ():
+        values = [one.get(key) for one in messages]
         if all(isinstance(value, int | float) for value in values):
             rows[key] = np.array(values, float)
     return rows
@@ -170,6 +203,8 @@ def _aiding(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[s
 
 
 def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Samples:
+    if not {"Lat", "Lng", "Alt", "GCrs", "Spd", "Status", "NSats", "HDop"} <= rows.keys():
+        return []
     t, kept = _times(name, rows, notes)
     own = {key: values[kept] for key, values in rows.items()}
     fixes = Fixes(t, np.radians(own["Lat"]), np.radians(own["Lng"]), own["Alt"])
@@ -177,7 +212,7 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
     down = own.get("VZ", np.full(len(t), np.nan))
     fixes.v_n = np.column_stack([own["Spd"] * np.cos(course), own["Spd"] * np.sin(course), down])
     fixes.fix, fixes.satellites, fixes.hdop = own["Status"], own["NSats"], own["HDop"]
-    if accuracy is not None:
+    if accuracy is not None and {"HAcc", "VAcc", "SAcc", "VDop"} <= accuracy.keys():
         t_acc, kept_acc = _times(f"{name} accuracy", accuracy, [])
         at, of = joined(t, t_acc, ACCURACY_WITHIN_S)
         told = {key: accuracy[key][kept_acc][of] for key in ("HAcc", "VAcc", "SAcc", "VDop")}
@@ -188,12 +223,15 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
     return fixes.samples(name)
 
 
-def _solution(messages: Mapping[str, list[Any]]) -> Reference | None:
+def _solution(messages: Mapping[str, list[dict[str, Any]]]) -> Reference | None:
     """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position."""
     source = next((name for name in SOLUTIONS if name in messages), None)
     if source is None:
         return None
-    rows = _rows([one for one in messages[source] if getattr(one, "C", 0) == 0] or messages[source])
+    own = [one for one in messages[source] if one]
+    rows = _rows([one for one in own if one.get("C", 0) == 0] or own)
+    if not {"Roll", "Pitch", "Yaw", "VN", "VE", "VD"} <= rows.keys():
+        return None
     t, kept = _times(source, rows, [])
     angles = [np.radians(rows[key][kept]) for key in ("Roll", "Pitch", "Yaw")]
     columns = {
@@ -203,12 +241,14 @@ def _solution(messages: Mapping[str, list[Any]]) -> Reference | None:
     for name in PLACES:
         if name not in messages:
             continue
-        place = _rows(messages[name])
-        at, own = _times(name, place, [])
-        lat, lon = (np.radians(place[key][own]) for key in ("Lat", "Lng"))
+        place = _rows([one for one in messages[name] if one])
+        if not {"Lat", "Lng", "Alt"} <= place.keys():
+            continue
+        at, kept_at = _times(name, place, [])
+        lat, lon = (np.radians(place[key][kept_at]) for key in ("Lat", "Lng"))
         known = (lat != 0) | (lon != 0)
         if known.sum() > 1:
-            at, values = at[known], (lat[known], np.unwrap(lon[known]), place["Alt"][own][known])
+            at, values = at[known], (lat[known], np.unwrap(lon[known]), place["Alt"][kept_at][known])
             for key, column in zip(("lat", "lon", "h"), values, strict=True):
                 columns[key] = np.interp(t, at, column, left=np.nan, right=np.nan)
             columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi

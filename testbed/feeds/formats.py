@@ -58,9 +58,12 @@ def _read_once(truth: str, size: int, changed_ns: int) -> Log:
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """A log by its path and, of a table, its ``columns``. Raises UserError as `open_log`."""
-    module = import_module(f"testbed.feeds.{known(path).module}")
-    made: Reader = module.read
-    return made(path, columns)
+    found = known(path)
+    made: Reader = import_module(f"testbed.feeds.{found.module}").read
+    try:
+        return made(path, columns)
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # what a damaged file leads to
+        raise UserError(f"{path}: is damaged, or no {found.name} as it should be: {error!r}") from None
 
 
 def known(path: Path) -> Format:
@@ -84,6 +87,9 @@ def known(path: Path) -> Format:
         raise UserError(f"{path}: is Parquet, which is not read: write it as .npz or .csv")
     if _is_text(head):
         return CSV
+    if head[8:9] in (b"\xfd", b"\xfe"):
+        what = "a telemetry log, which has no inertial data at their rate"
+        raise UserError(f"{path}: is {what}: give the log that the autopilot kept on board")
     names = ", ".join(one.name for one in (*FORMATS, CSV))
     raise UserError(f"{path}: is no log of a known format: these are {names}")
 

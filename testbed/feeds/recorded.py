@@ -40,7 +40,7 @@ def located(scenario: Scenario) -> Scenario:
     if not isinstance(scenario.truth, LogTruth):
         return scenario
     log = formats.open_log(scenario.truth)
-    _require_sensors(scenario, log)
+    _require_sensors(scenario, log, scenario.truth.start_s)
     found: dict[str, Any] = {}
     if scenario.truth.start is None:
         found["truth.start"] = (log.start or _start(log, scenario.truth.start_s)).model_dump()
@@ -58,8 +58,8 @@ def rate(log: Log, name: str) -> float:
     return float(f"{1 / usual:.{DIGITS}g}")
 
 
-def _require_sensors(scenario: Scenario, log: Log) -> None:
-    """Raise UserError when a sensor of the scenario is not in its log, or of another kind."""
+def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
+    """Raise UserError when a sensor of the scenario is not in its log, of another kind, or over by ``start_s``."""
     for name, section in scenario.sensors.items():
         kind = section.kind
         there = log.imus.get(name) if kind == "imu" else log.samples.get(name)
@@ -68,6 +68,9 @@ def _require_sensors(scenario: Scenario, log: Log) -> None:
             raise UserError(f"sensors.{name}: {log.path} has no {kind} of that name: it has {known}")
         if kind != "imu" and not isinstance(there[0], SAMPLES.get(kind, object)):  # type: ignore[index]
             raise UserError(f"sensors.{name}: {log.path} has something else than a {kind} under that name")
+        if kind == "imu" and there.t[-1] <= log.t0 + start_s:  # type: ignore[union-attr]
+            lasts = f"it lasts {there.t[-1] - log.t0:.1f} s"  # type: ignore[union-attr]
+            raise UserError(f"truth.start_s: {name} of {log.path} is over by then: {lasts}")
         if kind == "imu" and rate(log, name) < SLOWEST_IMU_HZ:
             slow = f"reports {rate(log, name):g} times a second: at least {SLOWEST_IMU_HZ:g} are needed"
             raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
@@ -110,7 +113,7 @@ class Recorded:
             if not isinstance(section, ImuConfig)
         }
         self._times = {name: [one.t for one in own] for name, own in self._samples.items()}
-        rows = self._rows(scenario, log)
+        rows = self._rows(scenario)
         reference = self._reference(truth, log)
         self._motion = ReferenceMotion(reference, truth.rate_hz, rows)
         self.source: MotionSource = self._motion
@@ -154,13 +157,9 @@ class Recorded:
     def close(self) -> None:
         """Nothing is held."""
 
-    def _rows(self, scenario: Scenario, log: Log) -> int:
+    def _rows(self, scenario: Scenario) -> int:
         """How many rows there can be: estimates go as far as the inertial units do."""
-        ends = [float(own.t[-1]) for own in self._imus.values() if len(own)]
-        end = min(ends, default=scenario.duration_s)
-        if len(ends) < len(self._imus) or end <= 0:
-            lasts = max(float(own.t[-1]) for own in log.imus.values() if len(own)) - log.t0
-            raise UserError(f"truth.start_s: {log.path} is over by then: it lasts {lasts:.1f} s")
+        end = min((float(own.t[-1]) for own in self._imus.values()), default=scenario.duration_s)
         return math.floor(end * self.rate_hz + EDGE_S) + 1
 
     def _reference(self, truth: LogTruth, log: Log) -> Reference:

@@ -144,9 +144,10 @@ def at_times(imu: ImuSamples, other: ImuSamples) -> ImuSamples:
     """Increments of one unit over the intervals of another: what was integrated by their ends, in proportion."""
     rows = np.hstack([imu.dtheta, imu.dv])
     known: Mask = np.asarray(np.isfinite(rows).all(axis=1))
-    whole = np.cumsum(np.where(known[:, None], rows, 0.0), axis=0)
+    whole = np.vstack([np.zeros(6), np.cumsum(np.where(known[:, None], rows, 0.0), axis=0)])
+    own = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
     ends = np.concatenate([other.t[:1] - other.dt[:1], other.t])
-    parts = np.diff(np.column_stack([np.interp(ends, imu.t, column) for column in whole.T]), axis=0)
+    parts = np.diff(np.column_stack([np.interp(ends, own, column) for column in whole.T]), axis=0)
     after = np.clip(np.searchsorted(imu.t, other.t), 0, len(imu) - 1)
     outside: Mask = (other.t > imu.t[-1]) | (other.t - other.dt < imu.t[0] - imu.dt[0])
     parts[outside | ~known[after]] = np.nan

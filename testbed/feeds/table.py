@@ -95,7 +95,7 @@ def load(path: Path) -> dict[str, Array]:
         head = file.read(16)
     try:
         if head.startswith(b"PK"):
-            with np.load(path, allow_pickle=False) as arrays:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return dict(_numbers(arrays.items()))
         if head.startswith(b"MATLAB"):
             from scipy.io import loadmat

@@ -36,9 +36,8 @@ from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.many import pool, progress
 from testbed.many.draws import DRAW, require_draw
-from testbed.many.shared_flight import require_control, share_truth
+from testbed.many.shared_flight import log_digests, require_control, share_truth
 from testbed.motion import aircraft
-from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
 from testbed.scenario import Scenario
@@ -313,7 +312,6 @@ def _tasks(
 def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
     packages = ("numpy", "scipy", "numba", "jsbsim", "pygeomag")
-    logs = {one.truth.file for one in scenarios if isinstance(one.truth, LogTruth)}
     flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
         "scenario text": scenarios[0].text,
@@ -321,7 +319,7 @@ def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
         "varied values": {key: list(values) for key, values in plan.vary.items()},
         "code": _code(),
         "aircraft": [aircraft.digest(name) for name in sorted(flown)],
-        "logs": [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in sorted(logs) if Path(file).is_file()],
+        "logs": log_digests(scenarios),
         "versions": {package: version(package) for package in packages},
     }
 

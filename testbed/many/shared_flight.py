@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +33,12 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
             shutil.rmtree(truth)
             raise
     return truth
+
+
+def log_digests(scenarios: Sequence[Scenario]) -> list[str]:
+    """What tells the logs of these scenarios, if any, from others."""
+    files = {Path(one.truth.file) for one in scenarios if isinstance(one.truth, LogTruth)}
+    return [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files) if file.is_file()]
 
 
 def require_control(source: MotionSource) -> None:

@@ -68,6 +68,7 @@ def test_a_record_as_log_gives_every_estimate_bit_for_bit(flown: tuple[str, RunR
     assert second.dataset.attrs["reference"] == "simulated truth"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "changes",
     [
@@ -110,6 +111,7 @@ COARSE = {"lat": 2e-9, "lon": 4e-9, "h": 0.02, "v_n": 0.02, "q_nb": 0.005}
 FINE = {"lat": 1e-12, "lon": 1e-12, "h": 1e-4, "v_n": 1e-4, "q_nb": 1e-4}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("name", "near"), [("bin", COARSE), ("log", COARSE), ("ulg", COARSE), ("csv", FINE)])
 def test_a_flight_written_in_another_format_gives_the_same_within_its_resolution(
     flown: tuple[str, RunResult], tmp_path: Path, name: str, near: Mapping[str, float]

@@ -1,0 +1,224 @@
+"""What real logs are like: a flight with bad times, gaps and things missing runs to its end and says what was odd."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import testbed.__main__ as cli
+from nav.samples import GnssSample
+from testbed import Scenario, run
+from testbed.data import data_dir
+from testbed.errors import UserError
+from testbed.feeds import draft, formats
+from testbed.feeds.log import Log
+from testbed.feeds.survey import survey
+from testbed.loop.loop import RunResult
+from testbed.score import metrics
+
+BIN = data_dir("scenarios") / "recorded_flight.bin"
+SECONDS = 70.0
+SCENARIO = """
+title = "rough"
+duration_s = 69
+date = 2026-06-01
+[truth]
+source = "log"
+file = "rough.npz"
+rate_hz = 100
+reference = "gnss"
+[truth.columns]
+imu = { time = { column = "imu_t", unit = "us" }, gyro = "gyro", accel = "accel" }
+gnss = { time = "gnss_t", lat = "lat", lon = "lon", height = "h", GNSS }
+barometer = { time = "baro_t", pressure = "p" }
+magnetometer = { time = "mag_t", field = "m" }
+[sensors.imu]
+[sensors.gnss]
+latency_s = 0.1
+[sensors.barometer]
+[sensors.magnetometer]
+[[estimator]]
+name = "ins"
+kind = "ins"
+aids = ["gnss", "barometer", "magnetometer"]
+"""
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return formats.read(BIN, {})
+
+
+def arrays(log: Log) -> dict[str, Any]:
+    """The first `SECONDS` of the shipped log as a table."""
+    imu = log.imus["imu"]
+    kept = imu.t <= SECONDS
+    made: dict[str, Any] = {"imu_t": np.round(imu.t[kept] * 1e6), "gyro": (imu.dtheta / imu.dt[:, None])[kept]}
+    made["accel"] = (imu.dv / imu.dt[:, None])[kept]
+    fixes = [one for one in log.samples["gnss"] if isinstance(one, GnssSample) and one.t <= SECONDS]
+    made |= {key: np.array([getattr(one, key) for one in fixes]) for key in ("lat", "lon", "h")}
+    made |= {"gnss_t": np.array([one.t for one in fixes]), "v": np.array([one.v_n for one in fixes])}
+    made |= {"sp": np.array([one.sigma_position_n for one in fixes])}
+    made |= {"sv": np.array([one.sigma_velocity_n for one in fixes])}
+    for name, time, field, key in (("barometer", "baro_t", "pressure", "p"), ("magnetometer", "mag_t", "field_b", "m")):
+        own = [one for one in log.samples[name] if one.t <= SECONDS]
+        made |= {time: np.array([one.t for one in own]), key: np.array([getattr(one, field) for one in own])}
+    return made
+
+
+def fly(table: Mapping[str, Any], folder: Path, gnss: str, changes: Mapping[str, Any] | None = None) -> RunResult:
+    np.savez(folder / "rough.npz", **table)
+    (folder / "rough.toml").write_text(SCENARIO.replace("GNSS", gnss))
+    return run(Scenario.load(folder / "rough.toml", changes or {}))
+
+
+ALL = 'velocity = "v", sigma_position = "sp", sigma_velocity = "sv"'
+
+
+def told(result: RunResult) -> str:
+    return "\n".join(result.dataset["events"].dataset["text"].values.tolist())
+
+
+def scored(result: RunResult) -> dict[str, float]:
+    return metrics.compute(result.dataset, settling_s=10.0)
+
+
+def jittered(table: dict[str, Any], rng: np.random.Generator) -> None:
+    table["imu_t"] = table["imu_t"] + np.round(rng.uniform(-3000, 3000, len(table["imu_t"])))
+    table["gnss_t"] = table["gnss_t"] + rng.uniform(0, 0.01, len(table["gnss_t"]))
+
+
+def repeated(table: dict[str, Any], rng: np.random.Generator) -> None:
+    for k in rng.integers(10, len(table["imu_t"]), size=50):
+        table["imu_t"][k] = table["imu_t"][k - 1]
+
+
+def disordered(table: dict[str, Any], rng: np.random.Generator) -> None:
+    for k in rng.integers(10, len(table["imu_t"]), size=50):
+        table["imu_t"][[k - 1, k]] = table["imu_t"][[k, k - 1]]
+        for name in ("gyro", "accel"):
+            table[name][[k - 1, k]] = table[name][[k, k - 1]]
+
+
+def wrapped(table: dict[str, Any], rng: np.random.Generator) -> None:
+    table["imu_t"] = (table["imu_t"] + 2**32 - 30e6) % 2**32
+    for name in ("gnss_t", "baro_t", "mag_t"):
+        table[name] = table[name] + 2**32 * 1e-6 - 30
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(
+    ("mangle", "note"),
+    [(jittered, ""), (repeated, "come again"), (disordered, "out of order"), (wrapped, "began anew")],
+)
+def test_bad_times_cost_little_and_are_told(log: Log, tmp_path: Path, mangle: Any, note: str) -> None:
+    table = arrays(log)
+    mangle(table, np.random.default_rng(1))
+    result = fly(table, tmp_path, ALL)
+    scores = scored(result)
+    assert scores["ins.position_horizontal_rms_m"] < 2.5
+    assert scores["ins.velocity_rms_mps"] < 0.35
+    assert note in told(result)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("gap_s", [0.3, 3.0])
+def test_a_gap_of_the_imu_is_told_and_flown_over(log: Log, tmp_path: Path, gap_s: float) -> None:
+    table = arrays(log)
+    lost = (table["imu_t"] > 30e6) & (table["imu_t"] < (30 + gap_s) * 1e6)
+    for name in ("imu_t", "gyro", "accel"):
+        table[name] = table[name][~lost]
+    result = fly(table, tmp_path, ALL)
+    assert "imu: a gap of" in told(result)
+    assert result.dataset["truth"].sizes["time"] == 691  # to the end
+    assert scored(result)["ins.aligned_s"] < 5
+    dtheta, dt = (result.dataset[f"sensors/imu/{name}"].values for name in ("dtheta", "dt"))
+    assert dt[np.isnan(dtheta).any(axis=1)].sum() == pytest.approx(gap_s, abs=0.05)
+
+
+@pytest.mark.ci
+def test_without_accuracies_the_grade_is_declared(log: Log, tmp_path: Path) -> None:
+    result = fly(arrays(log), tmp_path, 'velocity = "v"')
+    sigma = result.dataset["sensors/gnss/sigma_position_n"].values
+    assert np.allclose(sigma, np.hypot([0.4, 0.4, 0.8], [1.0, 1.0, 2.0]))
+    assert scored(result)["ins.position_horizontal_rms_m"] < 2.5
+
+
+@pytest.mark.ci
+def test_without_velocity_it_runs_and_says_that_it_never_aligned(log: Log, tmp_path: Path) -> None:
+    result = fly(arrays(log), tmp_path, 'sigma_position = "sp"')
+    assert any("never aligned" in remark for remark in result.remarks)
+
+
+def test_an_unknown_reference_is_not_judged(log: Log, tmp_path: Path) -> None:
+    result = fly(arrays(log), tmp_path, ALL, {"truth.reference": "none"})
+    scores = scored(result)
+    assert "ins.position_horizontal_rms_m" not in scores
+    assert "ins.nonfinite_samples" not in scores
+    assert scores["ins.nis_mean.gnss_position"] < 3
+    assert result.remarks[0] == "errors are against none: nothing is judged"
+
+
+def test_gnss_that_is_taken_away_is_what_it_is_judged_by(log: Log, tmp_path: Path) -> None:
+    result = fly(arrays(log), tmp_path, ALL, {"sensors.gnss.denied": [[40, 60]]})
+    assert 0.1 < scored(result)["ins.outage_position_horizontal_rms_m"] < 50
+    assert "kept back where it is denied" in result.dataset.attrs["reference"]
+    place = result.dataset["sensors/gnss/lat"].values
+    assert np.isnan(place).sum() >= 95
+    assert np.isfinite(result.dataset["truth/lat"].values).mean() > 0.95
+
+
+@pytest.mark.ci
+def test_a_start_later_in_the_log(log: Log, tmp_path: Path) -> None:
+    result = fly(arrays(log), tmp_path, ALL, {"truth.start_s": 20, "duration_s": 40})
+    t, first = (result.dataset[f"sensors/imu/{name}"].values for name in ("time", "dtheta"))
+    assert 0 < t[0] <= 0.02 + 1e-9
+    imu = log.imus["imu"]
+    assert np.allclose(first[0], imu.dtheta[np.searchsorted(imu.t, 20.0 + t[0] - 1e-6)])
+    with pytest.raises(UserError, match=r"start_s: .*is over by then: it lasts 70\.0 s"):
+        fly(arrays(log), tmp_path, ALL, {"truth.start_s": 2000})
+
+
+# --- what is in a log
+
+
+def test_a_survey_finds_latency_noise_and_phases(tmp_path: Path) -> None:
+    changes = {"duration_s": 150, "sensors.imu.grade": "mems-consumer", "sensors.imu.turn_on": "exact"}
+    result = run(Scenario.load("static_bench", {**changes, "record.imu": True}), out=tmp_path)
+    still = survey(formats.read(tmp_path / "run.nc", {}))
+    assert [phase.name for phase in still.phases] == ["rest"]
+    noise = still.noise["imu"]
+    assert np.rad2deg(noise.gyro_walk) * 60 == pytest.approx(0.3, rel=0.3)
+    assert np.rad2deg(np.abs(noise.gyro_bias)).max() * 3600 == pytest.approx(40, rel=0.6)
+    assert draft.imu_keys(noise)["grade"] == "mems-consumer"
+    assert result.path is not None
+
+
+def test_log_shows_a_table_and_writes_a_scenario_that_runs(
+    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["testbed", *arguments])
+        with suppress(SystemExit):
+            cli.main()
+        out, err = capsys.readouterr()
+        return out + err
+
+    np.savez(tmp_path / "rough.npz", **arrays(log))
+    (tmp_path / "rough.toml").write_text(SCENARIO.replace("GNSS", ALL))
+    assert "imu_t" in command("log", "rough.npz")
+    assert "begin with a scenario" in command("log", "rough.npz", "--scenario", "new.toml")
+    shown = command("log", "rough.toml", "--scenario", "new.toml")
+    assert "magnetometer" in shown
+    assert "is there already" in command("log", "rough.toml", "--scenario", "new.toml")
+    scenario = Scenario.load("new.toml", {"duration_s": 15})
+    assert run(scenario).metrics["ins.aligned_s"] < 5
+    assert "without a log" in command("log", str(data_dir("scenarios") / "u_turn.toml"))
+    assert "No such file" in command("log", "nowhere.bin")

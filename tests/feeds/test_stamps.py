@@ -1,0 +1,98 @@
+"""Times as logs have them are put in order, and increments made of them leave nothing out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nav.samples import ImuSamples
+from testbed.feeds.stamps import at_times, bridged, integrated, ordered
+
+T = np.arange(1, 401) / 50
+
+
+def steady(t: np.ndarray) -> ImuSamples:
+    return integrated(t, np.full((len(t), 3), 0.1), np.full((len(t), 3), -9.8), "averaged")
+
+
+def test_times_in_order_are_left_as_they_are() -> None:
+    notes: list[str] = []
+    t, rows = ordered("imu", T, notes)
+    assert np.array_equal(t, T)
+    assert np.array_equal(rows, np.arange(len(T)))
+    assert notes == []
+
+
+@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0])
+def test_a_counter_that_wraps_goes_on(wrap: float) -> None:
+    notes: list[str] = []
+    t, rows = ordered("imu", (T + wrap - 4) % wrap, notes)
+    assert np.allclose(t, T + wrap - 4, rtol=0, atol=1e-6)
+    assert len(rows) == len(T)
+    assert [note for note in notes if "began anew" in note]
+
+
+def test_disorder_and_repeats_are_mended_and_told() -> None:
+    stamps = T.copy()
+    stamps[[10, 11]] = stamps[[11, 10]]
+    stamps[20] = stamps[21]
+    stamps[30] = np.nan
+    notes: list[str] = []
+    t, rows = ordered("gnss", stamps, notes)
+    assert (np.diff(t) > 0).all()
+    assert rows[10] == 11
+    assert len(t) == len(T) - 2
+    assert [note.split()[1] for note in notes] == ["1", "1", "1"]
+    assert all(note.startswith("gnss: ") for note in notes)
+
+
+def test_after_a_restart_the_longer_part_is_kept() -> None:
+    notes: list[str] = []
+    t, rows = ordered("imu", np.concatenate([T[:100], T]), notes)
+    assert np.array_equal(t, T)
+    assert rows[0] == 100
+    assert any("100 rows are left out" in note for note in notes)
+
+
+def test_gaps_are_told() -> None:
+    notes: list[str] = []
+    ordered("imu", np.delete(T, np.s_[100:150]), notes)
+    assert notes == ["imu: a gap of 1.02 s, 1.98 s after its beginning"] or "a gap of 1.02 s" in notes[0]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_increment_is_longer_than_the_first_and_nothing_is_lost(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    imu = steady(np.sort(T + rng.uniform(-0.008, 0.008, len(T))))
+    ready = bridged(imu)
+    assert ready.dt.max() <= ready.dt[0] + 1e-15
+    assert np.allclose(ready.t[1:] - ready.dt[1:], ready.t[:-1], rtol=0, atol=1e-12)
+    assert np.allclose(ready.dtheta[1:].sum(axis=0), imu.dtheta[1:].sum(axis=0), rtol=1e-12)
+    assert set(imu.t.tolist()) <= set(ready.t.tolist())
+
+
+def test_over_a_gap_nothing_is_known() -> None:
+    ready = bridged(steady(np.delete(T, np.s_[100:150])))
+    lost = np.isnan(ready.dtheta).all(axis=1)
+    assert 0.95 < ready.dt[lost].sum() < 1.02
+    assert np.isfinite(ready.dtheta[~lost]).all()
+
+
+def test_rates_become_increments() -> None:
+    rates = np.sin(T)[:, None] * np.ones(3)
+    mean, point = (integrated(T, rates, rates, form).dtheta.sum(axis=0) for form in ("averaged", "instantaneous"))
+    exact = np.cos(T[0]) - np.cos(T[-1])
+    assert abs(point[0] - rates[0, 0] / 50 - exact) < 1e-4
+    assert abs(mean[0] - rates[0, 0] / 50 - exact) > 1e-3
+    given = integrated(T, rates, rates, "increments")
+    assert given.dtheta is rates
+
+
+def test_a_spare_unit_is_given_at_the_times_of_the_first() -> None:
+    first, spare = steady(T), steady(T[:-20] + 0.007)
+    ready = at_times(spare, first)
+    assert np.array_equal(ready.t, first.t)
+    known = np.isfinite(ready.dtheta).all(axis=1)
+    assert np.allclose(ready.dtheta[known], first.dtheta[known])
+    assert known[5:-25].all()
+    assert not known[-10:].any()
