@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 ROWS = (
     (P_N, "latitude\nerror [m]", 60.0),
     (P_E, "longitude\nerror [m]", 60.0),
-    (V_N, "v$_N$ error\n[m/s]", 0.6),
-    (V_E, "v$_E$ error\n[m/s]", 0.6),
+    (V_N, "v$_N$ error\n[m/s]", 0.25),
+    (V_E, "v$_E$ error\n[m/s]", 0.25),
 )
 STD = {column: robust for column, _, robust in SPREAD.values()}  # of the robust filter, Table 3
 ALONE = (
-    (AST, "transponder alone", COLOURS[1]),
-    (DVL, "log alone", COLOURS[2]),
+    (AST, "transponder, alone", COLOURS[1]),
+    (DVL, "log, alone", COLOURS[2]),
     (FRKF_ALONE, "federated, no feedback", COLOURS[0]),
     (FRKF, "federated, feedback", COLOURS[3]),
-    (EQ13_DEGREES, "equation 13", COLOURS[4]),
+    (EQ13_DEGREES, "equation 13, deg and µg", COLOURS[4]),
 )
 PAPER_LARGEST = {AST: (25.13, 225.30), DVL: (81.53, 62.27), FRKF_ALONE: (17.57, 18.68)}  # latitude, longitude [m]
 
@@ -50,32 +50,25 @@ def draw(one: Draw, out: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 8.2), dpi=85, layout="constrained")
+    figure = Figure(figsize=(11.0, 8.6), dpi=85, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(4, 2)
-    _draw_river(panels[:, 0], one.river)
-    _draw_outage(panels[:2, 1], one.outage)
-    panels[2, 1].axis("off")
-    _draw_bars(panels[3, 1], one.outage)
-    panels[2, 1].text(
-        0.0, 0.9, CAPTION, fontsize=9, va="top", transform=panels[2, 1].transAxes
-    )  # fmt: skip
-    for ax in panels.flat:
+    of = figure.subplot_mosaic([["0", "north"], ["1", "east"], ["2", "bars"], ["3", "bars"]])
+    _draw_river([of[str(row)] for row in range(len(ROWS))], one.river)
+    _draw_outage([of["north"], of["east"]], one.outage)
+    _draw_bars(of["bars"], one.outage)
+    for ax in of.values():
         ax.grid(alpha=0.35, lw=0.6)
         ax.spines[["top", "right"]].set_visible(False)
+    figure.supxlabel(CAPTION, fontsize=9)
     image = io.BytesIO()
     figure.savefig(image, format="png")
     write_result(out / "zhu2020.png", image.getvalue())
 
 
-CAPTION = (
-    "Not reproduced: the ship's own data, which are not public; the motion\n"
-    "on the river, the noise and the start errors are made up here. Its log\n"
-    "is better than the paper's must have been, whose filter without fixes\n"
-    "drifts by 82 m and whose velocity is ten times as uncertain.\n"
-    "Dashed: the paper's; 1 sigma of the robust filter, and in the outage\n"
-    "its largest error. The outage is flown to its end."
-)
+CAPTION = """\
+Not reproduced: the ship's own data, which are not public; motion, noise and start errors are made up here. The log is
+better than the paper's must have been, whose filter without fixes drifts by 82 m and whose velocity is ten times as
+uncertain. The outage is flown to its end."""
 
 
 def _draw_river(panels: Sequence[Axes], river: Mapping[str, Flown]) -> None:
@@ -94,7 +87,7 @@ def _draw_river(panels: Sequence[Axes], river: Mapping[str, Flown]) -> None:
         ax.set_xlim(0, 3600)
     panels[-1].set_xlabel("time [s]")
     panels[0].set_title("Fixes 500 m wrong every 150 s, log every 30 s, no feedback", fontsize=10)
-    panels[0].legend(loc="lower left", ncols=4, fontsize=7.5, frameon=False)
+    panels[0].legend(loc="lower left", ncols=2, fontsize=7.5, frameon=False)
 
 
 def _draw_outage(panels: Sequence[Axes], outage: Mapping[str, Flown]) -> None:
@@ -128,5 +121,5 @@ def _draw_bars(ax: Axes, outage: Mapping[str, Flown]) -> None:
     ax.set_yscale("log")
     ax.set_ylim(1, 1000)
     ax.set_xticks(range(len(shown)), [text.replace(", ", ",\n") for _, text, _ in shown], fontsize=8)
-    ax.set_ylabel("largest error\nin the outage [m]")
+    ax.set_ylabel("largest error in the outage [m]")
     ax.legend(loc="upper right", fontsize=8, frameon=False)
