@@ -38,6 +38,7 @@ from testbed.many import pool, progress
 from testbed.many.draws import DRAW, require_draw
 from testbed.many.shared_flight import log_digests, require_control, share_truth
 from testbed.motion import aircraft
+from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
 from testbed.scenario import Scenario
@@ -424,9 +425,10 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
                 "this worker has other code than the campaign began with: has a file been edited meanwhile?"
             )
         shared = task.truth if task.truth is not None and task.truth.is_dir() else None
-        source = Replay(shared) if shared else motion(task.scenario, task.seed)
+        recorded = isinstance(task.scenario.truth, LogTruth)  # is read by the run itself
+        source = Replay(shared) if shared else None if recorded else motion(task.scenario, task.seed)
         result = run(task.scenario, seed=task.seed, source=source, progress=lambda now: tell(now.t / now.duration))
-        require_control(source)
+        require_control(result.failure)
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
         finite = {key: value for key, value in kept.items() if math.isfinite(value)}

@@ -10,7 +10,7 @@ from pathlib import Path
 from testbed.errors import UserError
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
-from testbed.motion.table import MotionSource, save_motion
+from testbed.motion.table import save_motion
 from testbed.scenario import Scenario
 
 
@@ -28,7 +28,7 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
         source = motion(first, first.seed)
         save_motion(source, round(first.duration_s * source.rate_hz) + 1, truth)
         try:
-            require_control(source)
+            require_control(source.failure)
         except UserError:
             shutil.rmtree(truth)
             raise
@@ -41,10 +41,10 @@ def log_digests(scenarios: Sequence[Scenario]) -> list[str]:
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files) if file.is_file()]
 
 
-def require_control(source: MotionSource) -> None:
+def require_control(failure: str) -> None:
     """A flight that got out of control says nothing about navigation: don't let its numbers in among the others."""
-    if source.failure:
-        raise UserError(f"the flight ended early: {source.failure}")
+    if failure:
+        raise UserError(f"the flight ended early: {failure}")
 
 
 def same_motion(one: Scenario, other: Scenario) -> bool:

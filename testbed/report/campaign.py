@@ -282,7 +282,7 @@ def tables(result: CampaignResult) -> list[Table]:
         for k, name in enumerate(head):
             number = k >= text.words
             table.add_column(escape(name), justify="right" if number else "left", no_wrap=number, overflow="fold")
-        for row, following in zip(rows, [*rows[1:], ["end"]], strict=True):
+        for row, following in zip(rows, [*rows[1:], ["end"]][: len(rows)], strict=True):
             table.add_row(*map(escape, row), end_section=grouped and bool(following[0]))
         made.append(table)
     return made

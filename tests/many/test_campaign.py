@@ -648,3 +648,12 @@ def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
     assert campaign_figures._outages(result) == [(100.0, 200.0)]
     drawn = campaign_figures.figures(result)["errors"].figure
     assert drawn.axes[0].get_lines()[0].get_xdata()[-1] == 399.0
+
+
+@pytest.mark.ci
+def test_a_recorded_flight_is_read_by_every_run(tmp_path: Path) -> None:
+    vary = {"sensors.gnss.denied": ["[[10, 15]]", "[[12, 20]]"]}
+    plan = Plan("recorded_flight", 1, tmp_path / "out", vary, ("duration_s=70", "expect={}"))
+    result = campaigns.fly(plan, None, None)
+    assert result.failures == []
+    assert [len(outcome.metrics) > 40 for outcome in result.outcomes] == [True, True]
