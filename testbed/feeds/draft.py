@@ -14,10 +14,12 @@ from testbed.feeds.recorded import rate
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
 from testbed.sensors import imu
+from testbed.sensors.airspeed import GRADES as AIRSPEEDS
 from testbed.sensors.magnetometer import GRADES as MAGNETOMETERS
 from testbed.sensors.magnetometer import WMM_YEARS
 from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
 
+WORST = "mems-hobby"
 NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its noise, and biases within so many sigmas
 DIGITS = 3
 AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
@@ -25,29 +27,34 @@ ROWS_HZ, RECORD_HZ = 100.0, 10.0
 
 
 def sections(found: Survey) -> dict[str, dict[str, Any]]:
-    """The keys of each sensor: kind, grade, rate, and what was measured to be otherwise."""
+    """The keys of each sensor: kind, grade, rate, and what was measured to be otherwise.
+
+    Beside an inertial unit of the worst grade the other sensors are taken to be installed no better.
+    """
     log = found.log
     made: dict[str, dict[str, Any]] = {
         name: {"kind": "imu", **imu_keys(found.noise.get(name)), "rate_hz": rate(log, name)} for name in log.imus
     }
+    hobby = any(keys["grade"] == WORST for keys in made.values())
+    grade, receiver = ("hobby", "u-blox-m8") if hobby else ("mems", "standalone")
     for name, own in log.samples.items():
         keys: dict[str, Any] = {"rate_hz": rate(log, name)}
         match own[0]:
             case GnssSample():
-                keys = {"kind": "gnss", "grade": "standalone", **keys}
+                keys = {"kind": "gnss", "grade": receiver, **keys}
                 if name in found.latency_s and not log.valid_times:
                     keys["latency_s"] = found.latency_s[name]
             case MagnetometerSample():
-                keys = {"kind": "magnetometer", "grade": "mems", **keys}
+                keys = {"kind": "magnetometer", "grade": grade, **keys}
                 residual = found.field_residual.get(name, (0.0, 0.0))[0] / MICROTESLA
-                if residual > MAGNETOMETERS["mems"]["hard_iron_ut"]:
+                if residual > MAGNETOMETERS[grade]["hard_iron_ut"]:
                     keys["hard_iron_ut"] = _rounded(residual)
             case BarometerSample():
-                keys = {"kind": "barometer", "grade": "mems", **keys}
+                keys = {"kind": "barometer", "grade": grade, **keys}
             case AirspeedSample():
-                keys = {"kind": "airspeed", "grade": "mems", **keys}
+                keys = {"kind": "airspeed", "grade": grade, **keys}
                 off = 200 * abs(found.airspeed_scale.get(name, 1.0) - 1)  # of pressure: twice that of speed
-                if off > 1.0:
+                if off > AIRSPEEDS[grade]["scale_percent"]:
                     keys["scale_percent"] = min(_rounded(off), 50.0)
             case _:
                 continue
@@ -56,13 +63,13 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
 
 
 def imu_keys(noise: Noise | None) -> dict[str, Any]:
-    """The best grade that covers what an inertial unit shows at rest; of one that no grade covers, the last with that.
+    """The best grade that covers what an inertial unit shows at rest; of one that no grade covers, the worst with that.
 
-    Without a rest nothing is known, and the last grade is the safest.
+    Without a rest nothing is known, and the worst grade is the safest.
     """
     grades = [name for name in imu.GRADES if name != "perfect"]
     if noise is None:
-        return {"grade": grades[-1]}
+        return {"grade": WORST}
     shown = {
         "angle_random_walk_degprth": noise.gyro_walk / DEG_PER_ROOT_H,
         "velocity_random_walk_mpsprth": noise.accel_walk / MPS_PER_ROOT_H,
@@ -73,8 +80,8 @@ def imu_keys(noise: Noise | None) -> dict[str, Any]:
         told = imu.GRADES[name]
         if all(value <= _margin(key) * told[key] for key, value in shown.items()):
             return {"grade": name}
-    told = imu.GRADES[grades[-1]]
-    return {"grade": grades[-1]} | {key: _rounded(value) for key, value in shown.items() if value > told[key]}
+    told = imu.GRADES[WORST]
+    return {"grade": WORST} | {key: _rounded(value) for key, value in shown.items() if value > told[key]}
 
 
 def _margin(key: str) -> float:

@@ -23,6 +23,9 @@ GRADES: dict[str, dict[str, Any]] = {
     # TE MS4525DO, +-1 psi, 14 bit: 1.05 Pa per count, accuracy 0.25 % of span (17 Pa) before the zero taken on the
     # ground. What is left after that zero, and the calibration of the tube on the airframe, assumed.
     "mems": {"scale_percent": 1.0, "bias_pa": 3.0, "noise_pa": 2.0},
+    # The same kind of part on a hobby airframe, its tube not calibrated and in the propeller's wake: assumed, at the
+    # size that innovations on recorded flights have.
+    "hobby": {"scale_percent": 5.0, "bias_pa": 15.0, "noise_pa": 15.0},
 }
 
 
@@ -44,7 +47,9 @@ class AirspeedConfig(AidingTiming):
     kind: Literal["airspeed"] = Field(
         default="airspeed", description="what the sensor is; the table's name where it is left out"
     )
-    grade: Literal["perfect", "mems"] = Field(default="mems", description="datasheet that presets every error below")
+    grade: Literal["perfect", "mems", "hobby"] = Field(
+        default="mems", description="datasheet that presets every error below"
+    )
 
     scale_percent: float = Field(0.0, ge=0, le=50, description="of dynamic pressure: half of it in speed")
     bias_pa: float = Field(0.0, ge=0, le=1e4, description="constant offset of the differential pressure")

@@ -18,6 +18,9 @@ GRADES: dict[str, dict[str, Any]] = {
     # TE MS5611-01BA03 data sheet: accuracy +-1.5 mbar (taken as three sigma), resolution 0.012 mbar rms at the highest
     # oversampling. Drift, from temperature inside its +-2.5 mbar error band and from the weather, assumed.
     "mems": {"bias_pa": 50.0, "drift_pa": 15.0, "drift_time_s": 1800.0, "noise_pa": 1.2},
+    # The same in a fuselage without a static port: cabin pressure changes with airspeed, sideslip and propeller.
+    # Assumed, at the size that innovations on recorded flights have.
+    "hobby": {"bias_pa": 100.0, "drift_pa": 60.0, "drift_time_s": 1800.0, "noise_pa": 20.0},
 }
 
 
@@ -40,7 +43,9 @@ class BarometerConfig(AidingTiming):
     kind: Literal["barometer"] = Field(
         default="barometer", description="what the sensor is; the table's name where it is left out"
     )
-    grade: Literal["perfect", "mems"] = Field(default="mems", description="datasheet that presets every error below")
+    grade: Literal["perfect", "mems", "hobby"] = Field(
+        default="mems", description="datasheet that presets every error below"
+    )
 
     bias_pa: float = Field(
         0.0, ge=0, le=1e5, description="constant offset of the pressure; near the ground 12 Pa are a metre"

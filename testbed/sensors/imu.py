@@ -184,6 +184,41 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_resolution_mg": 12_000 / 2**15,
         "accel_bandwidth_hz": 145.0,
     },
+    # As flown in hobby autopilots: a part of the kind of the InvenSense MPU-6000 (PS-MPU-6000A Rev. 3.4: 0.005
+    # deg/s/sqrt(Hz), zero offset +-20 deg/s and +-50 to 80 mg, scale +-3 %, cross axis +-2 %, 0.1 deg/s/g), its gyros
+    # zeroed at power-up and otherwise not calibrated, on a vibrating airframe. Measured on recorded flights of such:
+    # 430 to 1900 deg/h of gyro bias, scale and alignment of 1 % and 1 deg; white noise is what vibration makes of it,
+    # some ten times the data sheet's.
+    "mems-hobby": {
+        **INSTALLATION,
+        "gyro_turn_on_degph": 1000.0,
+        "gyro_instability_degph": 30.0,
+        "gyro_instability_tau_s": 200.0,
+        "angle_random_walk_degprth": 2.0,
+        "gyro_rate_random_walk_degphprth": 20.0,
+        "gyro_scale_ppm": 10_000.0,
+        "gyro_scale_asymmetry_ppm": 1000.0,
+        "gyro_misalignment_mrad": 17.0,
+        "gyro_nonorthogonality_mrad": 5.0,
+        "gyro_g_sensitivity_degphpg": 300.0,
+        "gyro_temperature_degphpk": 20.0,
+        "gyro_range_degps": 500.0,
+        "gyro_resolution_degps": 500 / 2**15,
+        "gyro_bandwidth_hz": 42.0,
+        "accel_turn_on_mg": 50.0,
+        "accel_instability_mg": 1.0,
+        "accel_instability_tau_s": 200.0,
+        "velocity_random_walk_mpsprth": 3.0,
+        "accel_random_walk_mgprth": 5.0,
+        "accel_scale_ppm": 10_000.0,
+        "accel_scale_asymmetry_ppm": 1000.0,
+        "accel_misalignment_mrad": 17.0,
+        "accel_nonorthogonality_mrad": 5.0,
+        "accel_temperature_mgpk": 0.5,
+        "accel_range_g": 8.0,
+        "accel_resolution_mg": 8000 / 2**15,
+        "accel_bandwidth_hz": 44.0,
+    },
 }
 
 
@@ -231,7 +266,7 @@ class ImuConfig(Section):
     """
 
     kind: Literal["imu"] = Field(default="imu", description="what the sensor is; the table's name where it is left out")
-    grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer"] = Field(
+    grade: Literal["perfect", "navigation", "tactical", "mems-industrial", "mems-consumer", "mems-hobby"] = Field(
         default="mems-consumer", description="datasheet that presets every error below"
     )
     rate_hz: float = Field(200.0, ge=5, le=10_000, description="increments per second; divides the tick rate")

@@ -47,12 +47,15 @@ height = "ref_h"
 velocity = "ref_vel"
 attitude = "ref_q"
 [sensors.imu]
-grade = "mems-consumer"
+grade = "mems-hobby"
 [sensors.gnss]
-latency_s = 0.2
+grade = "u-blox-m8"
 [sensors.barometer]
+grade = "hobby"
 [sensors.airspeed]
+grade = "hobby"
 [sensors.magnetometer]
+grade = "hobby"
 [[estimator]]
 name = "ins"
 kind = "ins"
@@ -87,12 +90,15 @@ height = "refpos_h"
 velocity = "refpos_vel"
 attitude = "ref_q"
 [sensors.imu]
-grade = "mems-consumer"
+grade = "mems-hobby"
 [sensors.gnss]
-latency_s = 0.2
+grade = "u-blox-m8"
 [sensors.barometer]
+grade = "hobby"
 [sensors.airspeed]
+grade = "hobby"
 [sensors.magnetometer]
+grade = "hobby"
 [[estimator]]
 name = "ins"
 kind = "ins"
@@ -121,11 +127,13 @@ field = {{ column = "mag", unit = "mG" }}
 time = "ref_t"
 attitude = "ref_q"
 [sensors.imu]
-grade = "mems-consumer"
+grade = "mems-hobby"
 [sensors.gnss]
-latency_s = 0.2
+grade = "u-blox-m8"
 [sensors.barometer]
+grade = "hobby"
 [sensors.magnetometer]
+grade = "hobby"
 [[estimator]]
 name = "ins"
 kind = "ins"
