@@ -318,17 +318,22 @@ def _own(found: Found) -> Iterator[Claim]:
     ):  # fmt: skip
         rival = min(others, key=lambda other: found.soft(Case(other), "wrong").mean())
         pair = np.column_stack([found.soft(Case(one), "wrong") for one in (name, rival)])
-        what = f"ramp of 0.1 sigma/s: time judged wrongly, {name} over {rival}"
-        yield Claim(what, "", "", pair, 1.0, statistic=DETECTED)
+        what = f"ramp of 0.1 sigma/s: time judged wrongly, {name} over the best {'reset' if name != GLR else 'other'}"
+        yield Claim(what, "", "", pair, 1.0, statistic=DETECTED, note=f"that is {rival}")
     for axes in (2, 3):
         for name in SEVERAL_AXES:
             case = Case(name, MAIN_RATE, axes)
             yield Claim(f"{axes} axes, hard fault, {name}: delay", "s", "", found.hard(case, "delay"), 0.4)
-            yield Claim(f"{axes} axes, alarms before the faults, {name}", "", "", found.early(case), P, statistic=SHARE)
+            yield _early(f"{axes} axes, alarms before the faults, {name}", found, case)
 
 
 def _false_alarms(found: Found) -> Iterator[Claim]:
     for rate in RATES:
         for name in MAIN:
-            early = found.early(Case(name, rate))
-            yield Claim(f"alarms before the faults at {rate} Hz, {name}", "", "", early, P, statistic=SHARE)
+            yield _early(f"alarms before the faults at {rate} Hz, {name}", found, Case(name, rate))
+
+
+def _early(what: str, found: Found, case: Case) -> Claim:
+    """Of chi-square P is what it is made to have, so there is room for chance."""
+    bound = 2 * P if case.detector == CHI2 else P
+    return Claim(what, "", "", found.early(case), bound, statistic=SHARE)
