@@ -13,6 +13,8 @@ import re
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -288,10 +290,14 @@ def _figure(value: Any) -> str:
 
 
 def _sources(module: Any) -> dict[str, str]:
-    """By grade, the comment above it in the code, which says where its figures come from."""
-    text = inspect.getsource(module)
+    """By grade, the comment above it in the code, which says where its figures come from.
+
+    The grades of ``imu`` are beside it in ``imu_grades``.
+    """
+    beside = f"{module.__name__}_grades"
+    text = inspect.getsource(import_module(beside) if find_spec(beside) else module)
     text = text[text.index("GRADES: dict") :]
-    found = re.findall(r'((?:^    # .*\n)+)^    "([a-z-]+)": \{', text[: text.index("\n}\n")], re.MULTILINE)
+    found = re.findall(r'((?:^    # .*\n)+)^    "([a-z0-9-]+)": \{', text[: text.index("\n}\n")], re.MULTILINE)
     return {name: " ".join(line.strip().removeprefix("# ") for line in said.splitlines()) for said, name in found}
 
 

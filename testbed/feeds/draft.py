@@ -13,8 +13,8 @@ from nav.samples import AirspeedSample, BarometerSample, GnssSample, Magnetomete
 from testbed.feeds.recorded import rate
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
-from testbed.sensors import imu
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
+from testbed.sensors.imu_grades import GRADES as IMUS
 from testbed.sensors.magnetometer import GRADES as MAGNETOMETERS
 from testbed.sensors.magnetometer import WMM_YEARS
 from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
@@ -67,7 +67,7 @@ def imu_keys(noise: Noise | None) -> dict[str, Any]:
 
     Without a rest nothing is known, and the worst grade is the safest.
     """
-    grades = [name for name in imu.GRADES if name != "perfect"]
+    grades = [name for name in IMUS if name != "perfect"]
     if noise is None:
         return {"grade": WORST}
     shown = {
@@ -77,10 +77,10 @@ def imu_keys(noise: Noise | None) -> dict[str, Any]:
         "accel_turn_on_mg": abs(noise.force_error) / MG,
     }
     for name in grades:
-        told = imu.GRADES[name]
+        told = IMUS[name]
         if all(value <= _margin(key) * told[key] for key, value in shown.items()):
             return {"grade": name}
-    told = imu.GRADES[WORST]
+    told = IMUS[WORST]
     return {"grade": WORST} | {key: _rounded(value) for key, value in shown.items() if value > told[key]}
 
 

@@ -11,7 +11,8 @@ import pytest
 
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import KinematicStart
-from testbed.sensors.imu import GRADES, Imu, ImuConfig
+from testbed.sensors.imu import Imu, ImuConfig
+from testbed.sensors.imu_grades import GRADES
 
 RATE_HZ = 50.0
 HOURS = 2
