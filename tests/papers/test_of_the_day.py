@@ -16,10 +16,13 @@ ROWS = {
                   "ranks with velocity, position, heading, a turn: off by"),
     "cui2022": ("detection delay, longitude step", "largest error after 60 s, velocity north, six faults",
                 "largest error after 60 s, pitch, no fault"),
-    "jiang2021": (),
+    "jiang2021": ("plain inertial: roll and pitch error, largest", "heading error after 600 s, off the paper's 6.7",
+                  "seconds taken for level in the turn, after its first"),
     "zhou2025": ("hard fault at 5 Hz, complete reset: delay", "hard fault at 5 Hz, complete reset: end lag",
                  "north RMSE over the traditional, ramp as printed, SPRT"),
-    "zhu2020": (),
+    "zhu2020": ("no feedback, the whole run: std of latitude, robust over traditional",
+                "no feedback: largest step at a wrong fix, any state, robust",
+                "no feedback: largest step at a wrong fix, any state, traditional"),
 }  # fmt: skip
 
 
