@@ -573,8 +573,9 @@ def loads_or_complains(text: str, overrides: list[str]) -> Scenario | None:
         return None
     assert scenario.title
     Faults(scenario.fault, scenario.sensors, scenario.seed)
-    for name, config in scenario.sensors.items():
-        sensors.build(name, config, scenario.truth.rate_hz, scenario.seed, scenario.site())
+    if scenario.truth.source != "log":  # whose sensors are not simulated, and which says itself where it begins
+        for name, config in scenario.sensors.items():
+            sensors.build(name, config, scenario.truth.rate_hz, scenario.seed, scenario.site())
     assert dict(Scenario.parse(scenario.text, scenario.overrides)) == dict(scenario)
     return scenario
 

@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from nav.observability import Visibility
 from nav.samples import Array
 from testbed import Scenario, run
-from testbed.papers import cheng2020, scenario
+from testbed.papers import scenario
 from testbed.report import page as report
 from testbed.report import tables
 from testbed.report.figures import observability as figures
@@ -29,6 +29,12 @@ STRAIGHT = [
 HEALTHY = ["sensors.precise.denied=[]", "sensors.plain.denied=[]"]
 KNOWN = "handover={level_deg=0.02,heading_deg=0.2,velocity_mps=0.1,position_m=10}"
 GONE = "{{name='gone',sensor='{}',kind='dropout',window=[0,1e4]}}"
+
+
+def selected(estimators: list[str], overrides: Sequence[str] = ()) -> Scenario:
+    """The drive of Cheng et al. 2020 with these of its estimators."""
+    whole = scenario("cheng2020", overrides)
+    return whole.model_copy(update={"estimator": tuple(one for one in whole.estimator if one.name in estimators)})
 
 
 def seen(run_of: Scenario) -> dict[str, Visibility]:
@@ -54,7 +60,7 @@ def overridden(estimator: str, faults: Sequence[str] = ()) -> list[str]:
 
 @pytest.mark.ci
 def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tmp_path: Path) -> None:
-    straight = run(cheng2020.selected(["improved", "no_course"], STRAIGHT)).dataset
+    straight = run(selected(["improved", "no_course"], STRAIGHT)).dataset
     found = visibility.of_run(straight)
     assert list(found) == ["improved", "no_course"]
     heading = found["improved"].names.index("phi down")
@@ -68,7 +74,7 @@ def test_course_shows_the_heading_of_a_straight_and_a_turn_the_accelerometers(tm
     assert "<tr><td>phi down</td><td>from 5 s</td><td>never (0.00)</td></tr>" in page
     assert (tmp_path / "visibility.png").stat().st_size > 5000
 
-    turned = seen(cheng2020.selected(["improved"], ["duration_s=360"]))["improved"]
+    turned = seen(selected(["improved"], ["duration_s=360"]))["improved"]
     assert (np.abs(turned.seen_from()[level] - 330) < 12).all()
 
 
@@ -113,7 +119,7 @@ def test_a_star_tracker_shows_the_heading_at_once_and_only_while_it_is_believed(
 
 
 def test_a_look_that_was_not_used_shows_nothing() -> None:
-    dataset = run(cheng2020.selected(["improved"], STRAIGHT)).dataset
+    dataset = run(selected(["improved"], STRAIGHT)).dataset
     before = visibility.of_run(dataset)["improved"]
     place = states(before, "dp north", "dp east", "dp down")
     for part in accuracy.aids(dataset, "improved"):
@@ -181,7 +187,7 @@ def test_an_ahrs_never_sees_its_heading_without_a_magnetometer() -> None:
 
 
 def test_a_record_without_its_scenario_has_none() -> None:
-    dataset = run(cheng2020.selected(["improved"], ["duration_s=5"])).dataset
+    dataset = run(selected(["improved"], ["duration_s=5"])).dataset
     dataset.attrs["scenario"] = "title = 3"
     assert visibility.of_run(dataset) == {}
     assert tables.seen({}) == []
