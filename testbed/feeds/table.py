@@ -106,6 +106,7 @@ def load(path: Path) -> dict[str, Array]:
         frame = pandas.read_csv(path, skipinitialspace=True)
         return dict(_numbers((str(name), frame[name].to_numpy()) for name in frame.columns))
     except (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
+        # NotImplementedError is scipy's word for a MATLAB file of version 7.3.
         raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
     except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None

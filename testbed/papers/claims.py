@@ -116,6 +116,10 @@ def _share(values: Array) -> Interval:
     return Interval(float(hits / trials), low, high)
 
 
+def _ratio_of_means(values: Array) -> float:
+    return float(values[:, 0].mean() / values[:, 1].mean())
+
+
 def _ratio_of_rms(values: Array) -> float:
     square = np.mean(values**2, axis=0)
     return float(np.sqrt(square[0] / square[1]))
@@ -126,6 +130,7 @@ NEARLY_ALL, HARDLY_ANY = quantile(0.95), quantile(0.05)  # what is said of "any"
 MEAN = bootstrapped("mean", lambda values: float(np.mean(values)))
 RMS = bootstrapped("RMS", lambda values: float(np.sqrt(np.mean(values**2))))
 RATIO_OF_RMS = bootstrapped("ratio of RMS", _ratio_of_rms)  # of (draws, 2): the first over the second
+RATIO_OF_MEANS = bootstrapped("ratio of means", _ratio_of_means)  # likewise
 SHARE = Statistic("share", _share)
 EXACT = Statistic("exact", _exact)  # of a figure that nothing is drawn for
 

@@ -19,6 +19,27 @@ lon = "gnss_lon"
 height = "gnss_h"
 velocity = "gnss_vel"
 """
+# Every sensor is told to be a hobby autopilot's.
+AEROPLANE = """
+[sensors.imu]
+grade = "mems-hobby"
+[sensors.gnss]
+grade = "u-blox-m8"
+[sensors.barometer]
+grade = "hobby"
+[sensors.airspeed]
+grade = "hobby"
+[sensors.magnetometer]
+grade = "hobby"
+[[estimator]]
+name = "ins"
+kind = "ins"
+aids = ["gnss", "barometer", "airspeed", "magnetometer"]
+[[estimator]]
+name = "ahrs"
+kind = "ahrs"
+aids = ["barometer", "airspeed", "magnetometer"]
+"""
 THOR = f"""
 title = "Ultra Stick, 696 s at 50 Hz"
 duration_s = 600
@@ -46,25 +67,7 @@ lon = "ref_lon"
 height = "ref_h"
 velocity = "ref_vel"
 attitude = "ref_q"
-[sensors.imu]
-grade = "mems-hobby"
-[sensors.gnss]
-grade = "u-blox-m8"
-[sensors.barometer]
-grade = "hobby"
-[sensors.airspeed]
-grade = "hobby"
-[sensors.magnetometer]
-grade = "hobby"
-[[estimator]]
-name = "ins"
-kind = "ins"
-aids = ["gnss", "barometer", "airspeed", "magnetometer"]
-[[estimator]]
-name = "ahrs"
-kind = "ahrs"
-aids = ["barometer", "airspeed", "magnetometer"]
-"""
+{AEROPLANE}"""
 SWISS = f"""
 title = "Fixed wing, 150 s at 145 Hz"
 duration_s = 149
@@ -89,25 +92,7 @@ lon = "refpos_lon"
 height = "refpos_h"
 velocity = "refpos_vel"
 attitude = "ref_q"
-[sensors.imu]
-grade = "mems-hobby"
-[sensors.gnss]
-grade = "u-blox-m8"
-[sensors.barometer]
-grade = "hobby"
-[sensors.airspeed]
-grade = "hobby"
-[sensors.magnetometer]
-grade = "hobby"
-[[estimator]]
-name = "ins"
-kind = "ins"
-aids = ["gnss", "barometer", "airspeed", "magnetometer"]
-[[estimator]]
-name = "ahrs"
-kind = "ahrs"
-aids = ["barometer", "airspeed", "magnetometer"]
-"""
+{AEROPLANE}"""
 QUAD = f"""
 title = "Quadcopter, 702 s at 45 Hz"
 duration_s = 690
