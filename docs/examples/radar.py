@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from pydantic import Field
 
-from testbed.sensors.noise import Process, stream
+from testbed.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 
 

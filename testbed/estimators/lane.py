@@ -16,7 +16,7 @@ from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Handover
-from testbed.sensors.noise import stream
+from testbed.noise import stream
 
 
 class Tracked(NamedTuple):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from testbed.errors import UserError
 from testbed.many.draws import DRAW, require_draw
-from testbed.sensors.noise import stream
+from testbed.noise import stream
 
 RUNS, QUICK = 100, 10
 LATITUDE_DEG = (10.0, 60.0)  # of either hemisphere

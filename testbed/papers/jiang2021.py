@@ -24,6 +24,7 @@ from testbed.estimators import ahrs, registry
 from testbed.estimators.lane import Lane
 from testbed.motion.sections import KinematicTruth
 from testbed.motion.segments import Straight, Turn
+from testbed.noise import stream
 from testbed.papers import Job, Paper, levelling, scenario
 from testbed.papers.claims import HARDLY_ANY, MEAN, NEARLY_ALL, SHARE, Claim, bootstrapped, quantile
 from testbed.papers.draws import World, world
@@ -34,7 +35,6 @@ from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score import accuracy
 from testbed.sensors.imu import ImuConfig
-from testbed.sensors.noise import stream
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ from pydantic import Field, model_validator
 from nav.earth import SEA_LEVEL_DENSITY
 from nav.samples import AirspeedSample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import PERCENT
 

@@ -9,8 +9,8 @@ from pydantic import Field, model_validator
 
 from nav.samples import BarometerSample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 
 GRADES: dict[str, dict[str, Any]] = {

@@ -10,8 +10,8 @@ from pydantic import Field, field_validator, model_validator
 
 from nav.samples import Array, BodyVelocitySample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import InterruptedTiming, Interruptions, Schedule
 from testbed.sensors.units import PERCENT
 

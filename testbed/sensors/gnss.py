@@ -18,9 +18,9 @@ from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
 from nav.rotation import quat_rotate
 from nav.samples import Array, FixType, GnssSample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.schema import Section
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
 

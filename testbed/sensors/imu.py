@@ -17,11 +17,11 @@ from scipy.linalg import expm
 from nav.rotation import dcm_from_quat, quat_from_euler
 from nav.samples import Array, ImuSamples
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.schema import Section
 from testbed.sensors.grades import with_grade
 from testbed.sensors.imu_grades import GRADES
 from testbed.sensors.increments import accumulate, degrade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import ticks_per_sample
 from testbed.sensors.units import (
     DEG,

@@ -16,8 +16,8 @@ from nav.rotation import quat_conjugate, quat_rotate
 from nav.samples import Array, MagnetometerSample
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, MICROTESLA, PERCENT
 

@@ -12,10 +12,10 @@ from pydantic import Field, model_validator
 from nav.earth import ecef_from_geodetic
 from nav.samples import Array, PositionSample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.schema import Section
 from testbed.sensors.gnss import displaced
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import InterruptedTiming, Interruptions, Schedule
 from testbed.sensors.units import DEG
 

@@ -12,8 +12,8 @@ from nav.earth import quat_en, quat_ie
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.samples import Array, StarSample
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.timing import InterruptedTiming, Interruptions, Schedule
 from testbed.sensors.units import ARCSEC
 

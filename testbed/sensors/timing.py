@@ -15,8 +15,8 @@ from pydantic import AfterValidator, Field
 from nav.samples import Array
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
+from testbed.noise import Process, stream
 from testbed.schema import Section
-from testbed.sensors.noise import Process, stream
 from testbed.sensors.units import PERCENT
 
 SILENT_S = 0.5  # beyond its period, or half of it if that is longer, before a sensor that says nothing is silent

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import Field
 
-from testbed.sensors.noise import Process, stream
+from testbed.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 
 

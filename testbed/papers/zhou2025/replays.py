@@ -17,11 +17,11 @@ import numpy as np
 
 from nav.detection import ChiSquare, Detector, Glr, Mean, Reset, Sprt, exponential, glr_false_alarm
 from nav.samples import Array
+from testbed.noise import stream
 from testbed.papers.bounds import TOLD, told_test
 from testbed.papers.claims import MEAN, NEARLY_ALL, RATIO_OF_MEANS, SHARE, Claim, Floor
 from testbed.papers.misprints import CountedEvidence, FadingMean, InclusiveEvidence
 from testbed.score import accuracy, detection
-from testbed.sensors.noise import stream
 
 P = 1e-3  # false alarms and missed ones, per sample
 STEP, GAP, RAMP = (40.0, 60.0), (60.0, 90.0), (90.0, 130.0)

@@ -12,6 +12,7 @@ from typing import Any, overload
 import numpy as np
 
 from nav.samples import GnssSample, ImuSamples, Sample
+from testbed.noise import stream
 from testbed.sensors.faults.channels import CHANNELS, Increment
 from testbed.sensors.faults.kinds import (
     Delay,
@@ -34,7 +35,6 @@ from testbed.sensors.faults.kinds import (
     Step,
     Stuck,
 )
-from testbed.sensors.noise import stream
 from testbed.sensors.units import DEG
 
 ON_THE_EDGE_S = 1e-6  # what times lose as decimal numbers

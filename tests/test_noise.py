@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from testbed.sensors.noise import BATCH, Process, stream
+from testbed.noise import BATCH, Process, stream
 
 
 def test_stream_is_a_function_of_seed_sensor_and_process():

@@ -1,6 +1,7 @@
 """Random processes, drawn ahead in batches of fixed size so that nothing depends on how a run is cut into blocks.
 
-Every process of every sensor has its own stream: adding a sensor, or switching one error off, moves no other number.
+Every process of every sensor, and of the weather, has its own stream: adding one, or switching an error off, moves no
+other number.
 """
 
 from __future__ import annotations
