@@ -25,6 +25,8 @@ PLACEHOLDER = re.compile(r"^<!-- generated: ([a-z_]+) -->$", re.MULTILINE)
 # --- the scenario reference, from pydantic's JSON schema
 
 UNITS = {  # by the end of a key, longer ones first
+    "_mps_per_sqrt_s": "m/s/√s",
+    "_mps_per_km": "m/s/km",
     "_degphprth": "deg/h/√h",
     "_mpsprth": "m/s/√h",
     "_degprth": "deg/√h",
@@ -208,13 +210,16 @@ def _default(about: Mapping[str, Any]) -> str:
         return "none"
     if isinstance(default, Mapping):
         return "its own"
-    if isinstance(default, bool):
-        return f"`{str(default).lower()}`"
-    if isinstance(default, float | int):
-        return f"`{default:.6g}`"
-    if isinstance(default, str):
-        return f'`"{default}"`' if not re.fullmatch(r"\d{4}-\d\d-\d\d", default) else f"`{default}`"
-    return "`[" + ", ".join(f'"{item}"' if isinstance(item, str) else f"{item:g}" for item in default) + "]`"
+    return f"`{default}`" if re.fullmatch(r"\d{4}-\d\d-\d\d", str(default)) else f"`{_toml(default)}`"
+
+
+def _toml(value: Any) -> str:
+    """A value as the file has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float | int):
+        return f"{value:.6g}"
+    return f'"{value}"' if isinstance(value, str) else "[" + ", ".join(map(_toml, value)) + "]"
 
 
 def _plain(text: str) -> str:

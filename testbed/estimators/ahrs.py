@@ -140,7 +140,7 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
         site.lat,
         site.h,
         tuple(aids),
-        airspeed_sigma=rig.gust_mps(section.gust_mps),
+        airspeed_sigma=rig.air(section.gust_mps).gust,
         force_sigma=LEVELLING_FORCE,
     )
     level = section.level

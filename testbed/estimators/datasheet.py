@@ -21,6 +21,7 @@ from nav.aids import (
 )
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
+from testbed.estimators.rig import Air
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
 from testbed.sensors import SensorConfig, registry
@@ -40,7 +41,6 @@ FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
-WIND_WALK = 0.015  # change of the mean wind [m/s/sqrt(s)]: 1 m/s in 75 min
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 
 
@@ -99,7 +99,7 @@ def _drive(sigma: float, tau: float) -> float:
 
 
 def aid_of(
-    name: str, section: SensorConfig, imu: ImuErrors, gust_mps: float, usual: Usual, slip_mps: float | None = None
+    name: str, section: SensorConfig, imu: ImuErrors, air: Air, usual: Usual, slip_mps: float | None = None
 ) -> Aid | None:
     """A sensor as a filter is told of it, None for one that aids none.
 
@@ -131,11 +131,11 @@ def aid_of(
             a = section.errors()
             return AirspeedAid(
                 name,
-                sigma=math.hypot(a.noise, SHORT_GUSTS * gust_mps),
+                sigma=math.hypot(a.noise, SHORT_GUSTS * air.gust),
                 scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
-                sideslip_sigma=math.hypot(SIDESLIP, SHORT_GUSTS * gust_mps),
-                wind_walk=WIND_WALK,
-                gust_sigma=gust_mps,
+                sideslip_sigma=math.hypot(SIDESLIP, SHORT_GUSTS * air.gust),
+                wind_walk=air.wind_walk,
+                gust_sigma=air.gust,
                 gust_correlation_s=GUST_LENGTH / usual.airspeed_mps,
             )
         case BodyVelocityConfig():

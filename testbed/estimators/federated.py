@@ -43,6 +43,7 @@ from testbed.estimators.section import (
     Slip,
     States,
     TurnRate,
+    WindWalk,
     aid_mistakes,
 )
 from testbed.schema import IDENTIFIER, Section
@@ -141,6 +142,7 @@ class FederatedSection(EstimatorSection):
     states: States = "biases"
     turn_degps: TurnRate = None
     gust_mps: Gust = None
+    wind_walk_mps_per_sqrt_s: WindWalk = None
     handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: Slip | None = None
     structure: Literal["no_reset", "full_reset", "partial"] = Field(
@@ -205,10 +207,10 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
 def configuration(section: FederatedSection, rig: Rig) -> Config:
     """What the federation is told."""
     errors = rig.imu(section.imu).errors()
+    air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid:
-        slip = section.nonholonomic_mps
-        made = aid_of(name, rig.sensors[name], errors, rig.gust_mps(section.gust_mps), rig.usual, slip)
+        made = aid_of(name, rig.sensors[name], errors, air, rig.usual, section.nonholonomic_mps)
         assert made is not None  # the scenario was checked
         return made
 

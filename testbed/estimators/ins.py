@@ -29,6 +29,7 @@ from testbed.estimators.section import (
     Slip,
     States,
     TurnRate,
+    WindWalk,
     aid_mistakes,
     second_of_a_kind,
 )
@@ -75,6 +76,7 @@ class InsSection(EstimatorSection):
     states: States = "biases"
     turn_degps: TurnRate = None
     gust_mps: Gust = None
+    wind_walk_mps_per_sqrt_s: WindWalk = None
     handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: Slip | None = None
     engine: Engine = "linear"
@@ -99,9 +101,10 @@ class InsSection(EstimatorSection):
 def build(section: InsSection, rig: Rig) -> Lane:
     """The INS that a section asks for, not yet aligned."""
     sensors, errors = rig.sensors, rig.imu(section.imu).errors()
+    air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid | None:
-        return aid_of(name, sensors[name], errors, rig.gust_mps(section.gust_mps), rig.usual, section.nonholonomic_mps)
+        return aid_of(name, sensors[name], errors, air, rig.usual, section.nonholonomic_mps)
 
     # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
     offered = {sensors[name].kind: name for name in section.aids if sensors[name].kind in ONE_EACH}

@@ -9,8 +9,17 @@ from pathlib import Path
 
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
 from testbed.motion.gusts import UNKNOWN_AIR
+from testbed.motion.weather import UNKNOWN_WALK
 from testbed.sensors import SensorConfig, Site
 from testbed.sensors.imu import ImuConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Air:
+    """What is expected of the air: gusts, rms per axis [m/s], and the random walk of the mean wind [m/s/sqrt(s)]."""
+
+    gust: float = UNKNOWN_AIR
+    wind_walk: float = UNKNOWN_WALK
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,8 +28,8 @@ class Rig:
 
     ``site`` is the area of operation and the date, known within kilometres; ``tick_rate_hz`` the rate of the motion;
     ``seed`` that of the run, for what an estimator draws itself. Files that a scenario names lie in ``folder``.
-    ``usual`` is how the aircraft, or a body of which nothing is known, usually flies; ``expected_gust_mps`` how strong
-    the gusts are that its plan meets, rms.
+    ``usual`` is how the aircraft, or a body of which nothing is known, usually flies; ``expected_air`` the
+    gusts that its plan meets and how the scenario's wind wanders.
     """
 
     sensors: Mapping[str, SensorConfig]
@@ -29,7 +38,7 @@ class Rig:
     seed: int
     folder: Path = field(default_factory=Path)
     usual: Usual = UNKNOWN_BODY
-    expected_gust_mps: float = UNKNOWN_AIR
+    expected_air: Air = Air()
 
     def imu(self, name: str) -> ImuConfig:
         """The section of an IMU. Raises ValueError when ``name`` is no IMU."""
@@ -42,9 +51,12 @@ class Rig:
         """The rate of turn [rad/s] that an estimator is told, or else the usual one."""
         return self.usual.turn_rate_radps if told_degps is None else math.radians(told_degps)
 
-    def gust_mps(self, told: float | None) -> float:
-        """The gusts [m/s] that an estimator is told to expect, or else those of the scenario."""
-        return self.expected_gust_mps if told is None else told
+    def air(self, gust_mps: float | None, wind_walk: float | None = None) -> Air:
+        """The gusts [m/s] and walk of the wind [m/s/sqrt(s)] that an estimator is told of, else the scenario's."""
+        expected = self.expected_air
+        return Air(
+            expected.gust if gust_mps is None else gust_mps, expected.wind_walk if wind_walk is None else wind_walk
+        )
 
     def lag_s(self, names: Iterable[str]) -> float:
         """The largest latency [s] of the aids of these names."""

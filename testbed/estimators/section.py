@@ -36,6 +36,15 @@ Gust: TypeAlias = Annotated[
         " turbulence at the plan's altitudes, 1 m/s where none is asked for",
     ),
 ]
+WindWalk: TypeAlias = Annotated[
+    float | None,
+    Field(
+        ge=0,
+        le=1,
+        description="random walk of the mean wind that the filter expects; none: that of the scenario's wind,"
+        " 0.015 m/s/√s where none is asked for",
+    ),
+]
 Slip: TypeAlias = Annotated[
     float, Field(gt=0, le=10, description="slip of wheels where body velocity aids; none: no constraint")
 ]

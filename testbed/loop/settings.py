@@ -97,9 +97,9 @@ def knobs(scenario: Scenario) -> dict[str, Knob]:
         text = f"mask of the IMUs whose {channel} says nothing: 1 {imus[0]}, 2 the next"
         knobs[f"SIM_{what}_FAIL_MSK"] = Knob(Setting(0, 0, 2 ** len(imus) - 1, True, text), _masked(imus, channel))
     truth = scenario.truth
-    if isinstance(truth, FlightTruth) and not truth.wind.profile:
+    if isinstance(truth, FlightTruth) and truth.wind.one:
         wind = truth.wind
-        knobs["SIM_WIND_SPD"] = Knob(Setting(wind.speed_mps, 0, 50, False, "steady wind [m/s]"), act=_blow)
+        knobs["SIM_WIND_SPD"] = Knob(Setting(wind.speed_mps, 0, 50, False, "mean wind [m/s]"), act=_blow)
         knobs["SIM_WIND_DIR"] = Knob(Setting(wind.from_deg % 360, 0, 360, False, "it comes from [deg]"), act=_blow)
     text = "simulated over wall time"
     knobs["SIM_SPEEDUP"] = Knob(Setting(1, SMALLEST_SPEED, LARGEST_SPEED, False, text))

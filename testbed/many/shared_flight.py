@@ -36,8 +36,10 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
 
 
 def log_digests(scenarios: Sequence[Scenario]) -> list[str]:
-    """What tells the logs of these scenarios, if any, from others."""
+    """What tells the logs and tables of wind of these scenarios, if any, from others."""
     files = {Path(one.truth.file) for one in scenarios if isinstance(one.truth, LogTruth)}
+    winds = [one.truth.wind.file for one in scenarios if isinstance(one.truth, FlightTruth)]
+    files |= {Path(file) for file in winds if file}
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files) if file.is_file()]
 
 
@@ -58,10 +60,10 @@ def _moving(scenario: Scenario) -> tuple[object, ...]:
 
 
 def seed_leaves_motion(scenario: Scenario) -> bool:
-    """Whether the motion is the same for every seed: nothing estimated is fed back, and no gust follows the seed."""
+    """Whether the motion is the same for every seed: nothing estimated is fed back, no gust or weather follows it."""
     if scenario.autopilot.feedback.estimators:
         return False
     if not isinstance(scenario.truth, FlightTruth):
         return True
     wind = scenario.truth.wind
-    return wind.turbulence == "none" or wind.turbulence_seed is not None
+    return not wind.drawn and (wind.turbulence == "none" or wind.turbulence_seed is not None)

@@ -10,7 +10,6 @@ import sys
 from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import jsbsim
 import numpy as np
@@ -26,11 +25,9 @@ from testbed.motion.guidance import Guidance
 from testbed.motion.gusts import TURBULENCE
 from testbed.motion.legs import Leg
 from testbed.motion.paths import Feedback
-from testbed.motion.sections import FlightTruth, Start, Wind
+from testbed.motion.sections import FlightTruth, Start
 from testbed.motion.table import TruthBlock, increments
-
-Winds: TypeAlias = Sequence[tuple[float, float, float]]  # altitude [m], velocity of the air north, east [m/s]
-CALM: Winds = [(0.0, 0.0, 0.0)]
+from testbed.motion.weather import Weather
 
 FOOT = 0.3048  # [m]
 POUND = 0.45359237  # [kg]
@@ -41,7 +38,6 @@ GUIDANCE_HZ = 10.0
 # One for all threads and for good: JSBSim lets go of a thread's logger as the thread ends, without Python's lock, which
 # is the end of the process when nobody else holds it.
 LOGGER = jsbsim.DefaultLogger(jsbsim.LogLevel.ERROR)
-WIND_CHANGE_S = 5.0  # time constant of a change of wind in flight, as in ArduPilot's simulation (SIM_WIND_TC)
 SETTLING_S = 90.0  # of straight and level flight before the run starts
 
 # JSBSim's numbers for: second order Adams-Bashforth rates, Adams-Bashforth 3 position, and Buss's augmented second
@@ -121,14 +117,13 @@ class Flight:
         self._ended = False
         self._frame = max(1, round(truth.rate_hz / GUIDANCE_HZ))
         self._aircraft = Aircraft(truth.aircraft, truth.rate_hz)
-        self._winds = _winds(truth.wind)
-        self._aircraft.start(truth.start, self._winds)
+        self._weather = Weather(truth.wind, truth.start, seed, self._frame / truth.rate_hz)
+        self._aircraft.start(truth.start, self._weather.start())
         wind_seed = truth.wind.turbulence_seed
         self._aircraft.turbulence(truth.wind.turbulence, seed if wind_seed is None else wind_seed)
         self._row = self._aircraft.read()
         self._last = self._row  # the last row handed out, for its increments
         self._feedback: Feedback | None = None
-        self._wind_asked: tuple[float, float] | None = None  # north, east [m/s]
         alt, speed = truth.start.alt_m, truth.start.airspeed_mps
         envelope, period = self._aircraft.envelope, self._frame / truth.rate_hz
         self._guidance = Guidance(plan, envelope, self.true_feedback(), alt, speed, period)
@@ -163,9 +158,8 @@ class Flight:
         self._aircraft.feed_back(state)
 
     def blow(self, from_deg: float, speed_mps: float) -> None:
-        """Let the steady wind, where there is no profile, become this one with a time constant of `WIND_CHANGE_S`."""
-        north, east, _ = _v_n(speed_mps, from_deg)
-        self._wind_asked = (-north, -east)
+        """Let the mean wind, where it is one, become this: `Weather.blow`."""
+        self._weather.blow(from_deg, speed_mps)
 
     def give_up(self, why: str) -> None:
         """End the flight here, with ``why`` for a failure."""
@@ -186,15 +180,8 @@ class Flight:
         self._ended = self._guidance.done
         self._commands = (command.bank, command.altitude, command.airspeed, float(self._guidance.leg))
         self._aircraft.command(command.bank, command.altitude, command.climb, command.airspeed)
-        if self._wind_asked is not None:
-            share = -math.expm1(-self._frame / (self.rate_hz * WIND_CHANGE_S))
-            _, north, east = self._winds[0]
-            north += share * (self._wind_asked[0] - north)
-            east += share * (self._wind_asked[1] - east)
-            self._winds = [(0.0, north, east)]
-            self._aircraft.wind(north, east)
-        elif len(self._winds) > 1:
-            self._aircraft.wind(*_wind_at(self._winds, true.h))
+        if self._weather.changes:
+            self._aircraft.wind(*self._weather.step(true.lat, true.lon, true.h))
 
     def true_feedback(self) -> Feedback:
         """The true state at the newest row."""
@@ -332,10 +319,11 @@ class Aircraft:
         }.items():
             self.fdm[f"feedback/{name}"] = value
 
-    def wind(self, north: float, east: float) -> None:
-        """Set the steady wind, the velocity of the air [m/s]."""
+    def wind(self, north: float, east: float, down: float) -> None:
+        """Set the wind beside the gusts, the velocity of the air [m/s]."""
         self.fdm["atmosphere/wind-north-fps"] = north / FOOT
         self.fdm["atmosphere/wind-east-fps"] = east / FOOT
+        self.fdm["atmosphere/wind-down-fps"] = down / FOOT
 
     def turbulence(self, level: str, seed: int) -> None:
         """Dryden turbulence of MIL-F-8785C, its random numbers a child of ``seed``."""
@@ -348,8 +336,8 @@ class Aircraft:
         self.fdm["atmosphere/turbulence/milspec/windspeed_at_20ft_AGL-fps"] = at_20ft
         self.fdm["atmosphere/turbulence/milspec/severity"] = severity
 
-    def start(self, start: Start, winds: Winds) -> None:
-        """Put the aircraft in trim at its start.
+    def start(self, start: Start, wind: tuple[float, float] = (0.0, 0.0)) -> None:
+        """Put the aircraft in trim at its start, in a wind north, east [m/s].
 
         Trim is found by flying: straight and level on the inner loops until everything is steady, engine speed and
         integrators too, which a static trim leaves out. Then attitude, airspeed and angle of attack found are put at
@@ -357,7 +345,6 @@ class Aircraft:
         """
         fdm = self.fdm
         fuel = {name: fdm[name] for name in self._tanks}
-        wind = _wind_at(winds, start.alt_m)
         # JSBSim's engine start finds no steady state at high advance ratios, so the engine is started slowly.
         slow = _v_n(1.15 * self.envelope.min_airspeed(start.alt_m), start.heading_deg)
         self._place(start, (0.0, 0.0, math.radians(start.heading_deg)), slow, (0.0, 0.0))
@@ -459,22 +446,6 @@ def _probe(shipped: Path, folder: Path) -> None:
 def _v_n(speed: float, heading_deg: float) -> tuple[float, float, float]:
     heading = math.radians(heading_deg)
     return speed * math.cos(heading), speed * math.sin(heading), 0.0
-
-
-def _winds(wind: Wind) -> Winds:
-    """Rows of altitude [m] and velocity of the air north, east [m/s]."""
-    profile = wind.profile or [(0.0, wind.from_deg, wind.speed_mps)]
-    rows = []
-    for alt, from_deg, speed in profile:
-        north, east, _ = _v_n(speed, from_deg)
-        rows.append((alt, -north, -east))
-    return rows
-
-
-def _wind_at(winds: Winds, alt: float) -> tuple[float, float]:
-    """Velocity of the air north, east [m/s] at an altitude, linear between the rows and constant beyond them."""
-    alts, north, east = zip(*winds, strict=True)
-    return float(np.interp(alt, alts, north)), float(np.interp(alt, alts, east))
 
 
 def _loss_of_control(state: Feedback) -> str:

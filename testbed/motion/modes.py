@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nav.earth import STANDARD_GRAVITY
-from testbed.motion.flight import CALM, POUND, Aircraft
+from testbed.motion.flight import POUND, Aircraft
 from testbed.motion.sections import Start
 
 
@@ -40,7 +40,7 @@ class Trim(NamedTuple):
 def trim_and_modes(name: str, airspeed: float, alt_m: float) -> tuple[Trim, list[Mode]]:
     """The trim of an aircraft at a true airspeed [m/s] and an altitude [m], and its modes there: `modes`."""
     aircraft = Aircraft(name, 200.0)
-    aircraft.start(Start(lat_deg=0, lon_deg=0, alt_m=alt_m, heading_deg=0, airspeed_mps=airspeed), CALM)
+    aircraft.start(Start(lat_deg=0, lon_deg=0, alt_m=alt_m, heading_deg=0, airspeed_mps=airspeed))
     fdm = aircraft.fdm
     trim = Trim(
         airspeed,

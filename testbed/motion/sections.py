@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from testbed.motion.segments import Body, GroundSpeed, Segment, Track, lay_track
-from testbed.schema import Heading, Section
+from testbed.schema import LONGEST_RUN_S, Heading, Section
 
 LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
 
@@ -18,6 +19,7 @@ Latitude: TypeAlias = Annotated[
 Longitude: TypeAlias = Annotated[float, Field(ge=-180, le=180, description="longitude, east positive")]
 Altitude: TypeAlias = Annotated[float, Field(ge=-500, le=10_000, description="height above the WGS84 ellipsoid")]
 WindSpeed: TypeAlias = Annotated[float, Field(ge=0, le=50)]
+Shear: TypeAlias = Annotated[float, Field(ge=-5, le=5)]
 TickRate: TypeAlias = Annotated[
     float, Field(ge=50, le=1000, description="ticks of the simulation; every other rate divides it")
 ]
@@ -33,14 +35,58 @@ class Start(Section):
     airspeed_mps: float = Field(gt=0, le=100, description="true airspeed, at which it is trimmed")
 
 
+class GaussMarkov(Section):
+    """A part of the mean wind that wanders and comes back, north and east alike (Ornstein and Uhlenbeck's process)."""
+
+    sigma_mps: float = Field(ge=0, le=20, description="standard deviation per axis, from the start of the run")
+    correlation_s: float = Field(gt=0, le=1e6, description="time in which it forgets itself but for 1/e")
+
+
+class Front(Section):
+    """Another wind that comes to stay. The change is 3 s^2 - 2 s^3 of the share s of the width that has passed."""
+
+    time_s: float = Field(ge=0, le=LONGEST_RUN_S, description="when half of the change has come")
+    width_s: float = Field(gt=0, le=LONGEST_RUN_S, description="from the first of the change to the last")
+    from_deg: Heading = Field(description="true direction that the new wind comes from")
+    speed_mps: WindSpeed = Field(description="of the new wind")
+
+
+class BoundaryLayer(Section):
+    """Wind that grows with the logarithm of the height over ground: ln(h / roughness) / ln(reference / roughness)."""
+
+    roughness_m: float = Field(
+        gt=0, le=5, description="of the ground: water 0.0002, grass 0.03, crops 0.1 to 0.25, a forest 1"
+    )
+    reference_m: float = Field(default=10.0, gt=0, le=500, description="height over ground that `speed_mps` is of")
+    top_m: float = Field(default=300.0, gt=0, le=3000, description="height over ground from which on it is the same")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if not self.roughness_m < self.reference_m <= self.top_m:
+            raise ValueError("roughness_m must be below reference_m, and that not above top_m")
+        return self
+
+    def factor(self, h: float) -> float:
+        """The wind at a height ``h`` over ground [m] over that at the reference."""
+        height = min(max(h, self.roughness_m), self.top_m)
+        return math.log(height / self.roughness_m) / math.log(self.reference_m / self.roughness_m)
+
+
+class Updrafts(Section):
+    """Thermals with sink between them (`testbed.motion.updrafts`), placed by the run's seed."""
+
+    w_star_mps: float = Field(ge=0, le=10, description="convective velocity scale: 1 in winter, 2.7 in a desert's July")
+    depth_m: float = Field(ge=100, le=6000, description="of the mixing layer, to which they rise")
+
+
 class Wind(Section):
-    """Wind over ground: one vector, or a profile of rows [alt_m, from_deg, speed_mps]; and turbulence on top.
+    """Wind over ground: one vector, a profile of rows [alt_m, from_deg, speed_mps], or a file; what changes it; gusts.
 
     The gusts follow the run's seed, or ``turbulence_seed`` where runs of different seeds shall meet the same ones.
     """
 
     from_deg: Heading = Field(default=0.0, description="true direction that the wind comes from")
-    speed_mps: WindSpeed = Field(default=0.0, description="of the steady wind over ground")
+    speed_mps: WindSpeed = Field(default=0.0, description="of the mean wind over ground")
     turbulence: Literal["none", "light", "moderate", "severe"] = Field(
         default="none", description="Dryden gusts by MIL-F-8785C, as JSBSim makes them"
     )
@@ -48,15 +94,48 @@ class Wind(Section):
     profile: tuple[tuple[Altitude, Heading, WindSpeed], ...] = Field(
         default=(), description="rows of `[alt_m, from_deg, speed_mps]`, climbing, in place of one wind"
     )
+    file: str | None = Field(
+        default=None,
+        description="a CSV file, seen from this file, in place of one wind: columns `alt_m`, `from_deg`, `speed_mps`,"
+        " and `time_s` where it changes",
+    )
+    walk_mps_per_sqrt_s: float = Field(
+        default=0.0, ge=0, le=1, description="random walk of the mean wind, north and east alike; PX4 assumes 0.05"
+    )
+    gauss_markov: GaussMarkov | None = Field(default=None, description="mean wind that wanders and comes back")
+    front: Front | None = Field(default=None, description="another wind that comes to stay")
+    gradient_mps_per_km: tuple[tuple[Shear, Shear], tuple[Shear, Shear]] = Field(
+        default=((0.0, 0.0), (0.0, 0.0)),
+        description="change of the wind over ground from the start: of its north component per km north and east,"
+        " then of its east one",
+    )
+    boundary_layer: BoundaryLayer | None = Field(default=None, description="wind that grows with height over ground")
+    updrafts: Updrafts | None = Field(default=None, description="thermals, and sink between them")
 
     @model_validator(mode="after")
     def _one_wind(self) -> Self:
-        if self.profile and self.model_fields_set & {"from_deg", "speed_mps"}:
-            raise ValueError("a profile replaces from_deg and speed_mps: give one or the other")
+        one = [key for key in ("from_deg", "speed_mps", "front", "boundary_layer") if key in self.model_fields_set]
+        given = [key for key in ("profile", "file") if getattr(self, key)]
+        if len(given) == 2:
+            raise ValueError("a file replaces a profile: give one or the other")
+        if given and one:
+            keys = " and ".join(one)
+            raise ValueError(f"a {given[0]} replaces {keys}: give one or the other")
         heights = [row[0] for row in self.profile]
         if any(upper <= lower for lower, upper in itertools.pairwise(heights)):
             raise ValueError("the rows of profile must climb: sort them by alt_m, each altitude once")
         return self
+
+    @property
+    def one(self) -> bool:
+        """Whether there is one mean wind over all altitudes and times, but for what wanders about it."""
+        return not (self.profile or self.file or self.front or self.boundary_layer)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether any of it but the gusts follows the run's seed."""
+        wanders = self.gauss_markov is not None and self.gauss_markov.sigma_mps > 0
+        return self.walk_mps_per_sqrt_s > 0 or wanders or self.updrafts is not None
 
 
 class FlightTruth(Section):

@@ -13,6 +13,7 @@ from testbed.estimators.section import EstimatorSection
 from testbed.motion import aircraft, guidance
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
+from testbed.motion.weather import strongest
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
 from testbed.schema import IDENTIFIER, LONGEST_RUN_S
@@ -63,8 +64,12 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         yield from complaints
         return
     envelope = aircraft.load(named)
-    strongest = max(wind.speed_mps, *(row[2] for row in wind.profile), 0)
-    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, strongest):
+    try:
+        foreseen = strongest(wind)
+    except UserError as error:
+        yield ("truth", "wind", "file"), str(error)
+        return
+    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, foreseen):
         yield keypath.read(key), what
 
 

@@ -31,12 +31,13 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from testbed.data import data_dir
 from testbed.errors import UserError, shown
 from testbed.estimators import registry
-from testbed.estimators.rig import Rig
+from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
 from testbed.motion import aircraft, legs
 from testbed.motion.gusts import expected_gust
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
+from testbed.motion.weather import expected_walk
 from testbed.scenario import keypath, messages, mistakes
 from testbed.schema import LONGEST_RUN_S, Section
 from testbed.sensors import SensorConfig, Site, faults
@@ -216,10 +217,8 @@ class Scenario(Section):
             raise UserError(f"{place}: is empty: begin with a copy of {data_dir('scenarios') / 'u_turn.toml'}")
         set_paths = {keypath.assign(data, override): override for override in overrides}
         truth, sensors = data.get("truth"), data.get("sensors")
-        if isinstance(truth, dict) and isinstance(named := truth.get("aircraft"), str):
-            truth["aircraft"] = _aircraft(named, path)
-        if isinstance(truth, dict) and truth.get("source") == "log" and isinstance(file := truth.get("file"), str):
-            truth["file"] = str((path.parent if path else Path()) / file)
+        if isinstance(truth, dict):
+            _see_files(truth, path)
         for name, table in sensors.items() if isinstance(sensors, dict) else ():
             if isinstance(table, dict):
                 table.setdefault("kind", name)
@@ -276,8 +275,8 @@ class Scenario(Section):
         usual = aircraft.UNKNOWN_BODY
         if isinstance(self.truth, FlightTruth | LogTruth) and self.truth.aircraft is not None:
             usual = aircraft.load(self.truth.aircraft).usual
-        gust_mps = expected_gust(self.truth, self.plan)
-        return Rig(self.sensors, self.site(), self.truth.rate_hz, seed, folder, usual, gust_mps)
+        air = Air(expected_gust(self.truth, self.plan), expected_walk(self.truth))
+        return Rig(self.sensors, self.site(), self.truth.rate_hz, seed, folder, usual, air)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -346,6 +345,17 @@ def _toml(text: str, place: str) -> dict[str, Any]:
         raise UserError(f"{place}: tables or lists are nested too deeply") from None
     except ValueError as error:  # an integer of thousands of digits
         raise UserError(f"{place}: is not valid TOML: {error}") from None
+
+
+def _see_files(truth: dict[str, Any], path: Path | None) -> None:
+    """Put what ``[truth]`` names as seen from the scenario file in place of what is written there."""
+    folder = path.parent if path else Path()
+    if isinstance(named := truth.get("aircraft"), str):
+        truth["aircraft"] = _aircraft(named, path)
+    wind = truth.get("wind")
+    for table in (truth if truth.get("source") == "log" else None, wind):
+        if isinstance(table, dict) and isinstance(file := table.get("file"), str):
+            table["file"] = str(folder / file)
 
 
 def _aircraft(named: str, path: Path | None) -> str:

@@ -10,7 +10,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from testbed.motion.aircraft import load
-from testbed.motion.flight import CALM, FOOT, POUND, Aircraft, Flight
+from testbed.motion.flight import FOOT, POUND, Aircraft, Flight
 from testbed.motion.legs import Leg
 from testbed.motion.modes import modes, modes_table
 from testbed.motion.sections import FlightTruth, Start
@@ -46,7 +46,7 @@ def climbing(aircraft: Aircraft, airspeed: float, alt: float, seconds: float, ra
 @pytest.mark.parametrize("airspeed", AIRSPEEDS)
 @pytest.mark.parametrize("alt", [50.0, 800.0])
 def test_trims(aircraft: Aircraft, airspeed: float, alt: float) -> None:
-    aircraft.start(level(alt, airspeed), CALM)
+    aircraft.start(level(alt, airspeed))
     accelerations = values(aircraft, *(f"accelerations/{axis}dot-ft_sec2" for axis in "uvw"))
     angular = values(aircraft, *(f"accelerations/{axis}dot-rad_sec2" for axis in "pqr"))
     assert np.abs(accelerations).max() * FOOT < 0.02
@@ -65,7 +65,7 @@ def test_trims(aircraft: Aircraft, airspeed: float, alt: float) -> None:
 
 
 def test_mass_and_inertia_are_the_published_ones(aircraft: Aircraft) -> None:
-    aircraft.start(level(800.0, 25.0), CALM)
+    aircraft.start(level(800.0, 25.0))
     mass, *inertia = values(aircraft, "inertia/mass-slugs", *(f"inertia/i{a}-slugs_ft2" for a in ("xx", "yy", "zz")))
     assert mass * 14.593903 == pytest.approx(MASS, rel=1e-3)
     assert np.array(inertia) * 1.3558179 == pytest.approx([JX, JY, JZ], rel=1e-3)
@@ -106,7 +106,7 @@ def test_modes_table_is_complete() -> None:
 def test_short_period_and_phugoid_are_seen_in_flight(aircraft: Aircraft) -> None:
     """The linearisation against a flight of the bare airframe: kicked in pitch, hands off."""
     aircraft = Aircraft("loiter", 200.0)
-    aircraft.start(level(800.0, 25.0), CALM)
+    aircraft.start(level(800.0, 25.0))
     fdm = aircraft.fdm
     for surface, travel in {"aileron": 0.35, "elevator": 0.52, "rudder": 0.35}.items():
         fdm[f"fcs/{surface}-cmd-norm"] = fdm[f"fcs/{surface}-pos-rad"] / travel
@@ -130,7 +130,7 @@ def test_thrust_falls_with_airspeed(aircraft: Aircraft) -> None:
     """At the same throttle, in the same air."""
     thrusts = []
     for airspeed in (20.0, 25.0, 30.0, 35.0):
-        aircraft.start(level(100.0, airspeed), CALM)
+        aircraft.start(level(100.0, airspeed))
         aircraft.linearise()  # freezes the airframe and hands the throttle over
         aircraft.fdm["fcs/throttle-cmd-norm"] = 0.8
         aircraft.run(1000, array("d"))
@@ -147,7 +147,7 @@ def test_thrust_falls_with_airspeed(aircraft: Aircraft) -> None:
 def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
     """Full throttle at low altitude: power and fuel flow of the published table within a fifth."""
     fdm = aircraft.fdm
-    aircraft.start(level(30.0, 35.0), CALM)
+    aircraft.start(level(30.0, 35.0))
     climbing(aircraft, 60.0, 30.0, 8.0)
     rpm, hp, pps = values(
         aircraft, "propulsion/engine/engine-rpm", "propulsion/engine/power-hp", "propulsion/engine/fuel-flow-rate-pps"
@@ -163,7 +163,7 @@ def test_engine_against_its_published_map(aircraft: Aircraft) -> None:
 def test_climbs_as_the_plan_check_believes(aircraft: Aircraft) -> None:
     for airspeed, alt in [(21.0, 100.0), (25.0, 100.0), (32.0, 100.0), (27.0, 2500.0), (34.0, 2500.0)]:
         for rate in (LOITER.climb_limit(airspeed, alt), -LOITER.descent_limit(airspeed, alt)):
-            aircraft.start(level(alt, airspeed), CALM)
+            aircraft.start(level(alt, airspeed))
             climbing(aircraft, airspeed, alt, 40.0, rate)
             height, speed, throttle = values(
                 aircraft, "position/geod-alt-ft", "velocities/vt-fps", "fcs/throttle-pos-norm"
@@ -175,7 +175,7 @@ def test_climbs_as_the_plan_check_believes(aircraft: Aircraft) -> None:
 
 def test_actuators_lag_and_keep_to_rate_and_travel(aircraft: Aircraft) -> None:
     aircraft = Aircraft("loiter", 200.0)
-    aircraft.start(level(800.0, 25.0), CALM)
+    aircraft.start(level(800.0, 25.0))
     fdm = aircraft.fdm
     fdm["ap/engaged"], fdm["ap/hold"] = 0.0, -1.0
     fdm.run()
@@ -210,7 +210,7 @@ def wing() -> Aircraft:
 
 @pytest.mark.parametrize("airspeed", [12.5, 18.0, 25.0])
 def test_trims_of_the_wing(wing: Aircraft, airspeed: float) -> None:
-    wing.start(level(280.0, airspeed), CALM)
+    wing.start(level(280.0, airspeed))
     fdm = wing.fdm
     assert np.abs(values(wing, *(f"accelerations/{axis}dot-ft_sec2" for axis in "uvw"))).max() * FOOT < 0.02
     assert fdm["velocities/vt-fps"] * FOOT == pytest.approx(airspeed, abs=0.02)
@@ -267,7 +267,7 @@ def test_modes_of_the_wing_are_stable_and_where_textbooks_put_them(airspeed: flo
 def test_the_wing_climbs_as_the_plan_check_believes(wing: Aircraft) -> None:
     for airspeed, alt in [(12.5, 100.0), (18.0, 100.0), (25.0, 100.0), (27.0, 2500.0)]:
         for rate in (WING.climb_limit(airspeed, alt), -WING.descent_limit(airspeed, alt)):
-            wing.start(level(alt, airspeed), CALM)
+            wing.start(level(alt, airspeed))
             climbing(wing, airspeed, alt, 40.0, rate)
             height, speed, throttle = values(wing, "position/geod-alt-ft", "velocities/vt-fps", "fcs/throttle-pos-norm")
             assert height * FOOT - (alt + rate * 40) == pytest.approx(0.0, abs=0.5)
