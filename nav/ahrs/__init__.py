@@ -15,8 +15,8 @@ Source: Jiang et al. 2021, attitude of a low-grade inertial system without satel
 turned from north-up-east to north-east-down.
 """
 
-from nav.ahrs.config import AhrsConfig, Correction, limited
-from nav.ahrs.filter import LEVEL, MAGNETIC_HEADING, Ahrs
+from nav.ahrs.config import LEVEL, MAGNETIC_HEADING, AhrsConfig, AnyMotion, Correction, limited
+from nav.ahrs.filter import Ahrs
 from nav.ahrs.state import BIAS, PHI, STATES, transition
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "STATES",
     "Ahrs",
     "AhrsConfig",
+    "AnyMotion",
     "Correction",
     "limited",
     "transition",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -14,6 +14,8 @@ from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, Array, BarometerSample, MagnetometerSample
 
 KINDS: dict[type, str] = {AirspeedSample: "airspeed", BarometerSample: "barometer", MagnetometerSample: "magnetometer"}
+# What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
+LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
 DEG = math.pi / 180
 Correction: TypeAlias = Callable[[Array, float], Array]  # as `limited`
 
@@ -24,6 +26,32 @@ def limited(phi: Array, limit: float) -> Array:
     Equation 10 (which prints the north axis' error for both level axes).
     """
     return np.array([min(max(error, -limit), limit) for error in phi.tolist()])
+
+
+@dataclass(frozen=True)
+class AnyMotion:
+    """How to level whatever the body does (`nav.ahrs.any_motion`); SI, radians. Fit for a hand, a rotor and a wing.
+
+    Chosen on six trials of BROAD and two recorded flights, where half and twice each value makes little difference.
+    """
+
+    velocity_correlation_s: float = 4.0  # how long a velocity lasts that nothing on board tells
+    acceleration_correlation_s: float = 0.8  # over which the means of a period count as one
+    acceleration_memory_s: float = 2.0  # time over which accelerations are measured
+    least_acceleration_density: float = 1e-3  # of horizontal accelerations, where none are seen [(m/s^2)^2 s]
+    airspeed_error_s: float = 1.0  # how long ``airspeed_sigma`` has one sign
+    gyro_share: float = 3e-3  # of the rate of turn that is an error, by misalignment and scale, over a second
+    unknown_speed: float = 10.0  # at which the body may be turning while it is first levelled [m/s]
+
+    field_tolerance: float = 0.1  # of the size of the magnetic field: further off it tells no heading
+    dip_tolerance: float = 6 * DEG
+    field_memory_s: float = 20.0  # time over which size and dip are learned
+    field_patience_s: float = 20.0  # time after which another field that stays is taken for the right one
+
+    rest_rate: float = 0.5 * DEG  # by how much rates vary over a period at rest, beside the gyros' noise [rad/s]
+    rest_force: float = 0.1  # the same of specific force [m/s^2]
+    rest_periods: int = 4  # that have to be quiet in a row
+    rest_sigma: float = 0.03 * DEG  # of a second's mean rate, taken for bias [rad/s]
 
 
 @dataclass(frozen=True)
@@ -64,7 +92,13 @@ class AhrsConfig:
     # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
     magnetometer_sigma: float = 30 * DEG
 
+    any_motion: AnyMotion | None = None  # levels by this instead of in low dynamics, and takes all corrections at once
+
     correction: Correction = limited  # what of the estimated attitude error is taken out at the end of a period
+
+    def in_any_motion(self, told: AnyMotion | None = None) -> AhrsConfig:
+        """The same that levels whatever the body does (`nav.ahrs.any_motion`): the one configuration for all bodies."""
+        return replace(self, period_s=0.4, tilt_sigma=3 * DEG, any_motion=told or AnyMotion())
 
     def __post_init__(self) -> None:
         unknown = set(self.aids) - set(KINDS.values())

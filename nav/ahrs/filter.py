@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from nav import aids
-from nav.ahrs.config import KINDS, AhrsConfig
+from nav.ahrs.any_motion import AnyMotionLevelling
+from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig
 from nav.ahrs.further import FurtherStates
 from nav.ahrs.state import BIAS, PHI, STATES, UNKNOWN, State, covariance_step, fresh, propagate, transition
 from nav.detection import Mask
@@ -29,8 +30,6 @@ from nav.samples import (
     UpdateReport,
 )
 
-# What an update is called, by the accelerometers and by the magnetometer: an angle, not a field.
-LEVEL, MAGNETIC_HEADING = "level", "magnetic_heading"
 JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what the last period was judged by
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
@@ -75,6 +74,10 @@ class Ahrs:
             H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
         H[0, PHI + 2] = -1.0
         self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, n) and R (1,) of a heading
+        told = config.any_motion
+        self._any_motion = (
+            None if told is None else AnyMotionLevelling(config, told, self.further, self._g, self._earth_n, H)
+        )
         self._last_bad = -math.inf
 
     @property
@@ -185,7 +188,7 @@ class Ahrs:
             rows = slice(start, min(end, n))
             bad = propagate(
                 s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,
-                s.elapsed, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
+                s.elapsed, s.sums, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[start + bad])
@@ -198,12 +201,16 @@ class Ahrs:
         """Level by what the period has shown, and begin the next."""
         if s.levelled:
             self._settle(s)
-            self._level(s, t, reports)
+            if self._any_motion is None:
+                self._level(s, t, reports)
+            else:
+                self._level_in_motion(s, self._any_motion, t, reports)
         else:
             self._find_level(s, t)
         s.angle[:] = 0.0
         s.force[:] = 0.0
-        s.elapsed[1] = 0.0
+        s.sums[:] = 0.0
+        s.elapsed[1:] = 0.0
         s.air_velocity_n = self._air_velocity_n(s, t)
         period = self.config.period_s if s.levelled else self.config.levelling_s
         while s.period_end <= t + COINCIDENT:
@@ -228,9 +235,15 @@ class Ahrs:
         Equations 1 to 3 find it by the Earth's rate, which such gyros do not feel.
         """
         config = self.config
-        f_0, _ = self._steady_force(s, t)
+        f_0, compensated = self._steady_force(s, t)
         no_field = "magnetometer" in self._aids and not s.field_n.any()
-        if no_field or not abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit:
+        if self._any_motion is not None:
+            rate = math.sqrt(s.angle @ s.angle) / float(s.elapsed[1])
+            tilt_variance = self._any_motion.tilt_variance(f_0, rate, compensated)
+        else:
+            unaccelerated = abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit
+            tilt_variance = config.tilt_sigma**2 if unaccelerated else math.nan
+        if no_field or math.isnan(tilt_variance):
             s.q_nb = np.array([1.0, 0.0, 0.0, 0.0])
             s.field_n[:] = 0.0
             return
@@ -242,6 +255,11 @@ class Ahrs:
         s.levelled = True
         s.q_nb = quat_multiply(quat_from_euler(roll, pitch, heading), s.q_nb)
         s.P = self._initial_covariance()
+        if self._any_motion is not None:
+            s.P[PHI, PHI] = s.P[PHI + 1, PHI + 1] = tilt_variance
+            s.P[PHI + 2, PHI + 2] += float(np.square(self.heading_measurement[0][0, :2]).sum()) * tilt_variance
+            s.field_n[:] = 0.0
+            s.in_motion.fields = 0
         s.turned[:] = 0.0
         s.elapsed[0] = 0.0
 
@@ -267,15 +285,44 @@ class Ahrs:
         reports.append(_fuse(s, H, R, f_n[:2], t, "accelerometer", LEVEL))
         self._feed_back(s)
 
-    def level_measurement(self, q_nb: Array, omega_b: Array, compensated: bool) -> tuple[Array, Array]:
+    def _level_in_motion(self, s: State, how: AnyMotionLevelling, t: float, reports: list[UpdateReport]) -> None:
+        """Level by what a period of any motion shows, turn by the field's mean, and correct all that was found."""
+        T = float(s.elapsed[1])
+        f_n, compensated = self._steady_force(s, t)
+        omega_b = s.angle / T - s.gyro_bias
+        how.watch(s, f_n[:2], T)
+        acceleration = math.sqrt(2 * s.in_motion.acceleration_variance)
+        s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
+        s.mode_counter += 1
+        H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, T)
+        reports.append(_fuse(s, H, R, how.unexplained(s, f_n[:2], T), t, "accelerometer", LEVEL))
+        how.move(s, f_n[:2], T)
+        if s.in_motion.fields and self._field_n is not None:
+            field_n = s.field_n / s.in_motion.fields
+            z = math.remainder(_azimuth(field_n) - _azimuth(self._field_n), 2 * math.pi)
+            variance = float(self.heading_measurement[1][0]) / s.in_motion.fields
+            reports.append(how.turn(s, z, variance, t, field_n, T))
+            s.field_n[:] = 0.0
+            s.in_motion.fields = 0
+        how.rest(s, T)
+        how.feed_back(s)
+        s.correction_counter += 1
+
+    def level_measurement(
+        self, q_nb: Array, omega_b: Array, compensated: bool, acceleration: float = 0.0, T: float = 1.0
+    ) -> tuple[Array, Array]:
         """H (2, n) and R (2,) of a levelling at the attitude ``q_nb`` and the rate ``omega_b``, with the acceleration
         taken off or without.
+
+        In any motion also by the horizontal ``acceleration`` seen of late [m/s^2], rms, and the period ``T`` [s].
         """
         variance = self.config.force_sigma**2
         if compensated:
             variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b)
         H = self._H_level.copy()
         self.further.columns(H, q_nb)
+        if self._any_motion is not None:
+            return self._any_motion.level_measurement(H, omega_b, compensated, acceleration, T)
         return H, np.full(2, variance)
 
     def _level_commanded(self, start: float, end: float) -> bool:
@@ -310,8 +357,10 @@ class Ahrs:
         if s is None or m_n is None:
             return []
         levelled = quat_rotate(s.q_nb, sample.field_b)
-        if not s.levelled:
+        if not s.levelled or self._any_motion is not None:
             s.field_n += levelled
+            s.in_motion.fields += 1
+            s.in_motion.sensor = sample.sensor
             return []
         self._settle(s)
         z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
@@ -320,11 +369,13 @@ class Ahrs:
     def _settle(self, s: State) -> None:
         """Bring error states and covariance up to the time of the attitude."""
         if s.elapsed[0] > 0:
-            T, period = s.elapsed.tolist()
+            T, period, _ = s.elapsed.tolist()
             whole, half_noise = self._stays.copy(), 0.5 * T * self._variance_rate
             whole[PHI : PHI + 3, :STATES] = transition(s.turned, self._earth_n, T)
             self.further.step(whole, half_noise, T)
             self.further.turn(whole, s.turned, float(s.angle[2]) / period)
+            if self._any_motion is not None:
+                half_noise[PHI : PHI + 3] += self._any_motion.half_noise(s)
             covariance_step(s, whole, half_noise)
 
     def _estimate(self, s: State | None, t: float, last_bad: float) -> Estimate:

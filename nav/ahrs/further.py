@@ -1,4 +1,4 @@
-"""Error states after the six, as far as they are asked for: misaligned gyros, biased accelerometers, gusts."""
+"""Error states after the six, as far as they are asked for: gyro axes, accelerometer biases, gusts, velocity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ NAMES = (
     [f"gyro_misalignment {axis}" for axis in "xyz"],
     [f"accel_bias {axis}" for axis in "xyz"],
     ["gust north", "gust east"],
+    ["velocity north", "velocity east"],
 )
+VELOCITY_SIGMA = 1.0  # of it at the start [m/s]
 
 
 class FurtherStates:
@@ -38,23 +40,28 @@ class FurtherStates:
     and are taken for AR(1), a <- r a + noise, with r such that the long-term power of the gusts is kept:
 
         s_m^2 (1 + r) / (1 - r) = p = 2 s^2 tau / T,    so  r = (p - s_m^2) / (p + s_m^2)
+
+    Velocity (2,) is that of `nav.ahrs.any_motion`, which moves it itself.
     """
 
     def __init__(self, config: AhrsConfig) -> None:
         ratio = config.gust_correlation_s / config.period_s
         power = 2 * config.gust_sigma**2 * ratio
         variance = power * (1 + ratio * math.expm1(-1 / ratio))
-        sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance)
+        velocity = 0.0 if config.any_motion is None else VELOCITY_SIGMA
+        sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance), velocity
         sizes = [len(names) if sigma > 0 else 0 for names, sigma in zip(NAMES, sigmas, strict=True)]
         edges = STATES + np.cumsum([0, *sizes])
         # where they lie in the state
-        self.misalignment, self.accel_bias, self.gust = (slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES)))
+        self.misalignment, self.accel_bias, self.gust, self.velocity = (
+            slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES))
+        )
         self.count = sum(sizes)
         self._places = np.arange(STATES, STATES + self.count)
         self.names = [name for names, size in zip(NAMES, sizes, strict=True) for name in names[:size]]
         self.sigma = np.repeat(sigmas, sizes)  # (k,) at the start
         fading = -math.log((power - variance) / (power + variance)) / config.period_s if sizes[2] else 0.0
-        self.decay_rate = np.repeat([0.0, 0.0, fading], sizes)  # (k,) [1/s]
+        self.decay_rate = np.repeat([0.0, 0.0, fading, 0.0], sizes)  # (k,) [1/s]
 
     def step(self, whole: Array, half_noise: Array, T: float) -> None:
         """Put what fades in ``T`` [s] into the transition ``whole`` (n, n), and half of what comes in into (n,).

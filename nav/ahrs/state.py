@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,25 @@ from nav.samples import Array
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 UNKNOWN = np.full(3, np.nan)
+
+
+@dataclass
+class InMotion:
+    """What `nav.ahrs.any_motion` keeps in mind: velocity, accelerations, the magnetic field, rest."""
+
+    velocity_n: Array  # (2,) north and east, beside what airspeed tells
+    acceleration_n: Array  # (2,) mean of the last seconds
+    acceleration_variance: float  # about that mean, of one axis
+    fields: int  # samples in `State.field_n` since the period began
+    sensor: str  # whose they are
+    field: Array  # (2,) size and dip that count as undisturbed, NaN before the first
+    other: Array  # (2,) of a field that may replace it
+    other_s: float  # for how long that has been seen
+    quiet: int  # periods in a row
+
+    def copy(self) -> InMotion:
+        """The same in arrays of its own."""
+        return copied(self)
 
 
 @dataclass
@@ -35,12 +54,22 @@ class State:
     turned: Array  # (3, 3) integral of C_nb since the last covariance step
     angle: Array  # (3,) integral of angular rate over the period, body axes
     force: Array  # (3,) integral of specific force over the period, n
-    elapsed: Array  # (2,) seconds since the last covariance step, since the start of the period
+    elapsed: Array  # (3,) seconds since the last covariance step, since the start of the period; increments since then
+    sums: Array  # (3, 3) integrals over the period of specific force and of the squares of rate and of it, body axes
+    in_motion: InMotion
 
     def copy(self) -> State:
         """The same in arrays of its own."""
-        values: list[Any] = [x.copy() if isinstance(x, np.ndarray) else x for x in vars(self).values()]
-        return State(*values)
+        return copied(self)
+
+
+T = TypeVar("T", State, InMotion)
+
+
+def copied(state: T) -> T:
+    """The same in arrays of its own."""
+    values: list[Any] = [x.copy() if isinstance(x, np.ndarray | InMotion) else x for x in vars(state).values()]
+    return type(state)(*values)
 
 
 def fresh(period_end: float, n: int) -> State:
@@ -61,7 +90,9 @@ def fresh(period_end: float, n: int) -> State:
         turned=np.zeros((3, 3)),
         angle=np.zeros(3),
         force=np.zeros(3),
-        elapsed=np.zeros(2),
+        elapsed=np.zeros(3),
+        sums=np.zeros((3, 3)),
+        in_motion=InMotion(np.zeros(2), np.zeros(2), 0.0, 0, "", UNKNOWN[:2], UNKNOWN[:2], 0.0, 0),
     )
 
 
@@ -91,7 +122,7 @@ def covariance_step(s: State, whole: Array, half_noise: Array) -> None:
 @njit
 def propagate(
     q_nb: Array, gyro_bias: Array, earth_n: Array, rates: Array, turned: Array, angle: Array, force: Array,
-    elapsed: Array, dtheta: Array, dv: Array, dt: Array,
+    elapsed: Array, sums: Array, dtheta: Array, dv: Array, dt: Array,
 ) -> int:  # fmt: skip
     """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
 
@@ -121,6 +152,16 @@ def propagate(
         angle[0] += p0
         angle[1] += p1
         angle[2] += p2
+        sums[0, 0] += u0
+        sums[0, 1] += u1
+        sums[0, 2] += u2
+        per_s = 1.0 / T
+        sums[1, 0] += p0 * p0 * per_s
+        sums[1, 1] += p1 * p1 * per_s
+        sums[1, 2] += p2 * p2 * per_s
+        sums[2, 0] += u0 * u0 * per_s
+        sums[2, 1] += u1 * u1 * per_s
+        sums[2, 2] += u2 * u2 * per_s
         p0, p1, p2 = p0 - b0 * T, p1 - b1 * T, p2 - b2 * T
 
         # half the turn, twice
@@ -166,5 +207,6 @@ def propagate(
         force[2] += c20 * u0 + c21 * u1 + c22 * u2
         elapsed[0] += T
         elapsed[1] += T
+        elapsed[2] += 1.0
     q_nb[0], q_nb[1], q_nb[2], q_nb[3] = w, x, y, z
     return bad

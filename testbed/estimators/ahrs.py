@@ -85,6 +85,11 @@ class AhrsSection(EstimatorSection):
     turn_degps: TurnRate = None
     gust_mps: Gust = None
     heading_deg: Heading | None = Field(default=None, description="at the start, of one without magnetometer")
+    profile: Literal["jiang2021", "any_motion"] = Field(
+        default="jiang2021",
+        description="jiang2021: levels in low dynamics only; any_motion: always, on any vehicle; it also gates the"
+        " magnetic field and finds gyro biases at rest",
+    )
     levelling: bool = Field(default=True, description="false: once it has begun, it goes by its gyros alone")
     level: LevelSection | None = Field(default=None, description="how it levels; none: as light turbulence wants")
     autopilot: bool = Field(default=False, description="true: it levels only while level flight is commanded")
@@ -101,6 +106,10 @@ class AhrsSection(EstimatorSection):
             yield ("heading_deg",), "is missing: an AHRS without magnetometer is told where it points at the start"
         elif not blind and self.heading_deg is not None:
             yield ("heading_deg",), "the magnetometer among the aids finds the heading: leave one of the two out"
+        if self.profile == "any_motion":
+            for key in ("level", "autopilot", "levelling"):
+                if key in self.model_fields_set:
+                    yield (key,), 'says how profile "jiang2021" levels: leave it out, or the profile "any_motion"'
         yield from super().mistakes(sensors)
         yield from aid_mistakes("ahrs", self.aids, sensors, AIDS)
         yield from second_of_a_kind("ahrs", self.aids, sensors)
@@ -144,7 +153,7 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
         force_sigma=LEVELLING_FORCE,
     )
     level = section.level
-    if level is not None and level.gyro_misalignment_mrad > 0:
+    if section.profile == "any_motion" or (level is not None and level.gyro_misalignment_mrad > 0):
         aligned = replace(errors, gyro_misalignment=0.0, gyro_nonorthogonality=0.0, gyro_scale=0.0)
         config = replace(config, imu=imu_model(aligned, usual=rig.usual))
     if level is not None:
@@ -162,6 +171,8 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
             gust_sigma=level.gust_mps2,
             gust_correlation_s=level.gust_correlation_s,
         )
+    if section.profile == "any_motion":
+        config = config.in_any_motion()
     if not section.levelling:
         config = replace(config, motion=NEVER_LEVEL, compensated_motion=NEVER_LEVEL)
     if section.heading_deg is not None:

@@ -1,0 +1,187 @@
+"""Levelling whatever the body does: what it gains in velocity averages out, tilt does not.
+
+`nav.motion.LowDynamics` waits for a second without acceleration, which a hand, a rotor or a manoeuvring wing may not
+grant for minutes. Here every period counts. Its horizontal specific force, integrated along the gyros' attitude, is the
+change of velocity and what tilt makes of gravity,
+
+    integral of f = v(t + T) - v(t) + g [phi_E, -phi_N] T
+
+where what airspeed tells of v is taken off first (`nav.motion.acceleration_n`). The rest of v is a Gauss-Markov process
+of correlation time tau, driven by accelerations of the spectral density S, so that with r = exp(-T / tau)
+
+    v(t + T) - r v(t) = noise of variance S tau (1 - r^2) / 2
+
+An estimate of v, driven by f, is an error state: delta v' = g [phi_E, -phi_N]. S follows the variance of the specific
+force in the last seconds, about its mean, so that a tilt does not make itself believed an acceleration. The magnetic
+field turns the heading alone; it is used while its size and dip are those of the last minutes. At rest the gyros show
+their biases. All that is found is corrected at once.
+
+The idea that accelerations average out along an attitude by gyros is that of Laidig and Seel 2023, VQF: highly accurate
+IMU orientation estimation with bias estimation and magnetic disturbance rejection; here as error states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from nav.ahrs.config import MAGNETIC_HEADING, AhrsConfig, AnyMotion
+from nav.ahrs.further import FurtherStates
+from nav.ahrs.state import BIAS, PHI, STATES, State
+from nav.kalman import update
+from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
+from nav.samples import Array, Outcome, UpdateReport
+
+REST_GATE = 16.3  # chi-square of three, 99.9 %
+MOST_TILT = math.radians(60)  # claimed of a first levelling
+FORCE = 0.5, 2.0  # in g: a body that feels less or more than this is not levelled at first
+
+
+class AnyMotionLevelling:
+    """The steps at the end of a period, on a state whose error states are all zero between them.
+
+    ``g`` [m/s^2] is gravity, ``earth_n`` (3,) [rad/s] the Earth's rate; ``H_heading`` (1, n) sees the heading.
+    """
+
+    def __init__(
+        self, config: AhrsConfig, told: AnyMotion, further: FurtherStates, g: float, earth_n: Array, H_heading: Array
+    ) -> None:
+        self.config, self.told = config, told
+        self._velocity = further.velocity
+        self._g, self._earth_n = g, earth_n
+        self._H_heading = H_heading
+        n = STATES + further.count
+        self._gain_n = np.zeros((2, n))  # of velocity by tilt [m/s^2]
+        self._gain_n[0, PHI + 1], self._gain_n[1, PHI] = g, -g
+
+    def tilt_variance(self, f_n: Array, rate: float, compensated: bool) -> float:
+        """Of a first levelling by a mean specific force (3,), turning at ``rate`` [rad/s]; NaN when it shows none."""
+        force = math.sqrt(f_n @ f_n) / self._g
+        if not FORCE[0] <= force <= FORCE[1]:
+            return math.nan
+        turning = 0.0 if compensated else self.told.unknown_speed * rate / self._g
+        return min(math.hypot(self.config.tilt_sigma, force - 1, turning), MOST_TILT) ** 2
+
+    def half_noise(self, s: State) -> float:
+        """Half of the variance that the turns of a period bring to each axis of the attitude."""
+        return 0.5 * self.told.gyro_share**2 * float(s.sums[1].sum())
+
+    def level_measurement(
+        self, H: Array, omega_b: Array, compensated: bool, acceleration: float, T: float
+    ) -> tuple[Array, Array]:
+        """``H`` (2, n) with the velocity's columns and R (2,) of the mean horizontal specific force over ``T`` [s].
+
+        ``acceleration`` [m/s^2] is what was seen of it lately, horizontal rms.
+        """
+        told, tau = self.told, self.told.velocity_correlation_s
+        kept = math.exp(-T / tau)
+        density = told.least_acceleration_density + 0.5 * acceleration**2 * told.acceleration_correlation_s
+        variance = 0.5 * density * tau * (1 - kept**2) + self.config.imu.accel_noise**2 * T
+        if compensated:
+            variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b) * told.airspeed_error_s * T
+        H[:, self._velocity] += np.eye(2) * ((1 - kept) / T)
+        return H, np.full(2, variance / T**2)
+
+    def watch(self, s: State, f_n: Array, T: float) -> None:
+        """Follow mean and variance of the horizontal specific force ``f_n`` (2,) [m/s^2]."""
+        m = s.in_motion
+        share = -math.expm1(-T / self.told.acceleration_memory_s)
+        m.acceleration_n += share * (f_n - m.acceleration_n)
+        beside = f_n - m.acceleration_n
+        m.acceleration_variance += share * (0.5 * float(beside @ beside) - m.acceleration_variance)
+
+    def unexplained(self, s: State, f_n: Array, T: float) -> Array:
+        """What of the mean horizontal specific force (2,) the decay of the velocity does not explain."""
+        left: Array = f_n + s.in_motion.velocity_n * (-math.expm1(-T / self.told.velocity_correlation_s) / T)
+        return left
+
+    def move(self, s: State, f_n: Array, T: float) -> None:
+        """Take velocity and its error states over a period with the mean horizontal specific force (2,)."""
+        s.in_motion.velocity_n += f_n * T
+        whole = np.eye(len(s.x))
+        whole[self._velocity] += self._gain_n * T
+        s.x[:] = whole @ s.x
+        s.P[:] = whole @ s.P @ whole.T
+
+    def _undisturbed(self, s: State, field_n: Array, T: float) -> bool:
+        """Whether size and dip of a field (3,) are the usual ones, which follow it slowly then; or have come to be."""
+        m, told = s.in_motion, self.told
+        level = math.hypot(field_n[0], field_n[1])
+        seen = np.array([math.hypot(level, field_n[2]), math.atan2(field_n[2], level)])
+        if math.isnan(m.field[0]):
+            m.field = seen
+        share = min(T / told.field_memory_s, 1.0)
+        if self._alike(seen, m.field):
+            m.other_s = 0.0
+            m.field = m.field + share * (seen - m.field)
+            return True
+        if m.other_s > 0 and self._alike(seen, m.other):
+            m.other = m.other + share * (seen - m.other)
+        else:
+            m.other, m.other_s = seen, 0.0
+        m.other_s += T
+        if m.other_s >= told.field_patience_s:
+            m.field, m.other_s = m.other, 0.0
+        return False
+
+    def _alike(self, seen: Array, usual: Array) -> bool:
+        size, dip = np.abs(seen - usual).tolist()
+        return bool(size <= self.told.field_tolerance * usual[0] and dip <= self.told.dip_tolerance)
+
+    def turn(self, s: State, z: float, variance: float, t: float, field_n: Array, T: float) -> UpdateReport:
+        """Take the heading ``z`` [rad] of a mean field (3,) for what it is, unless the field is disturbed.
+
+        It moves heading and the gyros' bias about the vertical, no other state; the covariance is that of the gain that
+        is used (Joseph's form).
+        """
+        H = self._H_heading
+        PH = s.P @ H[0]
+        S = float(H[0] @ PH) + variance
+        nu = z - float(H[0] @ s.x)
+        report = UpdateReport(
+            t, s.in_motion.sensor, MAGNETIC_HEADING, np.array([nu]), np.array([[S]]), nu * nu / S, math.inf, 1.0,
+            Outcome.FUSED,
+        )  # fmt: skip
+        if not self._undisturbed(s, field_n, T):
+            return replace(report, weight=0.0, outcome=Outcome.OUTSIDE_GATE, reason="the field is disturbed")
+        gain = np.zeros(len(s.x))
+        gain[PHI + 2] = PH[PHI + 2] / S
+        down_b = dcm_from_quat(s.q_nb)[2]
+        gain[BIAS:STATES] = down_b * float(down_b @ PH[BIAS:STATES]) / S
+        s.x += gain * nu
+        rest = np.eye(len(s.x)) - gain[:, None] * H
+        s.P[:] = rest @ s.P @ rest.T + variance * gain[:, None] * gain
+        return report
+
+    def rest(self, s: State, T: float) -> None:
+        """Take the mean rate for bias when the body has been at rest for some periods.
+
+        Rest is that neither rate nor specific force varies by more than noise, and that no rate is seen but what the
+        biases may be.
+        """
+        told, imu = self.told, self.config.imu
+        rate, force, increments = s.angle / T, s.sums[0] / T, float(s.elapsed[2])
+        spread = s.sums[1:3] / T - np.square([rate, force])
+        limits = [
+            one**2 + 6 * noise**2 * increments / T
+            for one, noise in ((told.rest_rate, imu.gyro_noise), (told.rest_force, imu.accel_noise))
+        ]
+        H = np.zeros((3, len(s.x)))
+        H[:, BIAS:STATES] = -np.eye(3)
+        R = np.full(3, told.rest_sigma**2 / T)
+        nu = rate - s.gyro_bias - dcm_from_quat(s.q_nb).T @ self._earth_n
+        S = s.P[BIAS:STATES, BIAS:STATES] + np.diag(R)
+        quiet = bool((spread.sum(axis=1) <= limits).all()) and float(nu @ np.linalg.solve(S, nu)) <= REST_GATE
+        s.in_motion.quiet = s.in_motion.quiet + 1 if quiet else 0
+        if s.in_motion.quiet >= told.rest_periods:
+            update(s.x, s.P, H, R, nu - H @ s.x, math.inf)
+
+    def feed_back(self, s: State) -> None:
+        """Take what was found out of attitude, gyros and velocity."""
+        s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(s.x[PHI : PHI + 3]), s.q_nb))
+        s.gyro_bias -= s.x[BIAS:STATES]
+        s.in_motion.velocity_n -= s.x[self._velocity]
+        s.x[:STATES] = 0.0
+        s.x[self._velocity] = 0.0
