@@ -118,6 +118,11 @@ class ImuModel:
 
     A bias is a turn-on value that walks, plus, when its sigma is not zero, an in-run part that is first-order Markov.
     Scale factor errors are states when their sigma is not zero.
+
+    Errors that come with motion and have no state are white noise beside that of rest: ``gyro_motion`` and
+    ``accel_motion`` are the shares of the rate, and of the specific force less gravity, that go wrong over each
+    second, as scale and alignment of small units do while a manoeuvre lasts; ``vibration`` the share of the noise that
+    the increments themselves show (`nav.state.propagate`).
     """
 
     gyro_noise: float  # angle random walk [rad/sqrt(s)]
@@ -132,6 +137,14 @@ class ImuModel:
     accel_drift_correlation_s: float = 300.0
     gyro_scale_sigma: float = 0.0  # scale factor error [1]
     accel_scale_sigma: float = 0.0
+    gyro_motion: float = 0.0  # [1]
+    accel_motion: float = 0.0  # [1]
+    vibration: float = 0.0  # [1]
+
+    @property
+    def in_motion(self) -> Array:
+        """Squares (3,) of the shares by which noise follows motion and vibration."""
+        return np.array([self.gyro_motion, self.accel_motion, self.vibration]) ** 2
 
     def blocks(self) -> list[Block]:
         """The motion (its noise is the sensors' white noise) and the sensor errors that drive it."""

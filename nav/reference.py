@@ -82,6 +82,7 @@ class Reference:
             self._decay_rate[i, : model.size] = model.decay_rate
             self._noise[i, : model.size] = model.density**2
         self._variance_rate = self._noise.copy()
+        self._in_motion = np.zeros((filters, 3))
         self._room, self._work = np.zeros(2 * MOTION * self.common + 2 * n), scratch(n)
         self._scratch = (*working(self._room, self.common, n), self._work)
         self.share_noise(shares)
@@ -90,7 +91,9 @@ class Reference:
 
     def share_noise(self, shares: Sequence[float] | Array) -> None:
         """New shares of the noise of the common states."""
-        self._variance_rate[:, : self.common] = self._noise[:, : self.common] / np.array(shares)[:, None]
+        each = np.array(shares)[:, None]
+        self._variance_rate[:, : self.common] = self._noise[:, : self.common] / each
+        self._in_motion[:] = np.array([model.imu.in_motion for model in self.models]) / each
 
     def start(self, initial: InitialState, names: Sequence[Mapping[str, str]] | None = None) -> State:
         """A given state with its covariance, not yet shared; ``names[i]`` renames correlated blocks for filter i."""
@@ -139,8 +142,8 @@ class Reference:
         s = state
         if s.elapsed[0] > 0 and self.scaling is not None:
             sigma_step(
-                s.q_nb, s.v_n, s.lla, s.imu, s.x[0], s.P[0], s.errors, s.sums, s.elapsed, self.driven,
-                self._decay_rate[0], self._variance_rate[0], *self._scratch, self.scaling.spread, self.scaling.excess,
+                s.q_nb, s.v_n, s.lla, s.imu, s.x[0], s.P[0], s.errors, s.sums, s.elapsed, s.shaking,
+                self.driven, self._decay_rate[0], self._variance_rate[0], self._in_motion[0], *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
         elif s.elapsed[0] > 0:
             before = s.copy() if self.scalings else None
@@ -162,7 +165,8 @@ class Reference:
         inject(q_nb, v_n, lla, imu, x[: self.common])
         error = sigma_step(
             q_nb, v_n, lla, imu, x, before.P[row], np.empty((4, 3)), dcm_from_quat(_turn(x)) @ before.sums,
-            np.array([T, 0.0]), self.driven, self._decay_rate[row], self._variance_rate[row], *self._scratch,
+            np.array([T, 0.0]), before.shaking, self.driven, self._decay_rate[row], self._variance_rate[row],
+            self._in_motion[row], *self._scratch,
             scaling.spread, scaling.excess,
         )  # fmt: skip
         remove_open(x, error)
@@ -171,7 +175,7 @@ class Reference:
     def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
         """See the kernel."""
         return propagate(
-            s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._room, self._work,
+            s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._in_motion, self._room, self._work,
             period, dtheta, dv, dt, settle,
         )  # fmt: skip
 

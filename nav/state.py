@@ -11,7 +11,7 @@ import numpy as np
 
 from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
-from nav.earth import radii, wrap_longitude
+from nav.earth import gravity, radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition
 from nav.kalman import predict, update
 from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
@@ -20,7 +20,9 @@ from nav.strapdown import step
 from nav.unscented import predict as predict_points
 from nav.unscented import remove
 
-FIXED = 57  # numbers in a `State` of any size
+FIXED = 66  # numbers in a `State` of any size
+SAME = 1e-9  # rates this close, relative, are those of one increment
+SHAKEN_S = 1.0  # over which the noise of increments is averaged
 
 
 class State:
@@ -41,12 +43,14 @@ class State:
     sums: Array  # (3, 3, 3), see `error_model.transition`
     elapsed: Array  # (2,) seconds and samples since the last covariance step
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
+    shaking: Array  # (3, 3) rate and force of the increment before; densities of their noise, and the last one's length
 
     def __init__(self, common: int, filters: int, n: int) -> None:
         self.shape = common, filters, n
         self.whole = np.zeros(FIXED + common + filters * n * (n + 1))
         (
             self.q_nb, self.v_n, self.lla, self.imu, self.x, self.P, self.errors, self.sums, self.elapsed, self.rates,
+            self.shaking,
         ) = parts(self.whole, common, filters, n)  # fmt: skip
 
     def take(self, other: State) -> None:
@@ -63,14 +67,14 @@ class State:
 @njit
 def parts(
     whole: Array, common: int, filters: int, n: int
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
     """The parts of the ``whole`` of a `State` as views, in the order of the class; those of fixed size lie first."""
     x = FIXED + common
     P = x + filters * n
     return (
         whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
         whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
-        whole[49:51], whole[51:FIXED].reshape(2, 3),
+        whole[49:51], whole[51:57].reshape(2, 3), whole[57:FIXED].reshape(3, 3),
     )  # fmt: skip
 
 
@@ -93,7 +97,7 @@ def absorb(
 
     With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
     """
-    q_nb, v_n, lla, imu, x, P, errors, _, _, _ = parts(whole, common, filters, n)
+    q_nb, v_n, lla, imu, x, P, errors, _, _, _, _ = parts(whole, common, filters, n)
     S, nis = update(x[row], P[row], H, R, nu, threshold)
     if close and nis <= threshold:
         inject(q_nb, v_n, lla, imu, x[row])
@@ -124,8 +128,8 @@ def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -
 @njit
 def _covariance_step(
     v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
-    work: Array,
+    shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,
+    decay: Array, half_noise: Array, work: Array,
 ) -> None:  # fmt: skip
     """Take every filter's covariance and states over the time in ``elapsed``, and empty the integrals."""
     T = elapsed[0]
@@ -135,6 +139,7 @@ def _covariance_step(
         for i in range(x.shape[1]):
             half_noise[i] = 0.5 * T * variance_rate[f, i]
             decay[i] = math.exp(-T * decay_rate[f, i]) if decay_rate[f, i] > 0.0 else 1.0
+        _add_motion(half_noise, in_motion[f], sums, shaking, lla, T)
         estimated = False
         for i in range(common):
             if x[f, i] != 0.0:
@@ -157,6 +162,57 @@ def _covariance_step(
 
 
 @njit
+def _add_motion(half_noise: Array, in_motion: Array, sums: Array, shaking: Array, lla: Array, T: float) -> None:
+    """Add what motion and vibration over ``T`` seconds do to half of the noise of attitude and velocity.
+
+    ``in_motion`` (3,) is `error_model.ImuModel.in_motion`: of the mean rate and of the mean force less gravity a share
+    that is another one each second, so that its density is that share times one root of a second.
+    """
+    if in_motion[0] == 0.0 and in_motion[1] == 0.0 and in_motion[2] == 0.0:
+        return
+    turn2 = push2 = 0.0
+    for i in range(3):
+        turn, push = 0.0, gravity(lla[0], lla[2]) * T if i == 2 else 0.0
+        for j in range(3):
+            turn, push = turn + sums[1, i, j], push + sums[2, i, j]
+        turn2, push2 = turn2 + turn * turn, push2 + push * push
+    phi = in_motion[0] * turn2 / T + in_motion[2] * shaking[2, 0] * T
+    dv = in_motion[1] * push2 / T + in_motion[2] * shaking[2, 1] * T
+    for i in range(3):
+        half_noise[PHI + i] += 0.5 * phi
+        half_noise[VEL + i] += 0.5 * dv
+
+
+@njit
+def _shake(shaking: Array, rates: Array, dtheta: Array, dv: Array, T: float) -> None:
+    """Learn from one sound increment how noisy increments are, ``rates`` being those of the one before.
+
+    The second difference of three rates in a row has six times the variance of one, whatever a slow motion does. The
+    density of the noise (mean of the axes) is that variance times the length of an increment, averaged over a second.
+    Parts into which an increment was split have its rates, and count as one.
+    """
+    same = True
+    for i in range(3):
+        turn, push = dtheta[i] / T, dv[i] / T
+        if abs(turn - rates[0, i]) > SAME * (1.0 + abs(turn)) or abs(push - rates[1, i]) > SAME * (1.0 + abs(push)):
+            same = False
+    if same:
+        shaking[2, 2] += T
+        return
+    length = shaking[2, 2]
+    for kind in range(2):
+        spread = 0.0
+        for i in range(3):
+            now = dtheta[i] / T if kind == 0 else dv[i] / T
+            second = now - 2.0 * rates[kind, i] + shaking[kind, i]
+            spread += second * second
+            shaking[kind, i] = rates[kind, i]
+        if length > 0.0:
+            shaking[2, kind] += min(1.0, length / SHAKEN_S) * (spread / 18.0 * length - shaking[2, kind])
+    shaking[2, 2] = T
+
+
+@njit
 def _empty(sums: Array, elapsed: Array) -> None:
     """Begin the integrals anew."""
     for i in range(3):
@@ -169,8 +225,8 @@ def _empty(sums: Array, elapsed: Array) -> None:
 @njit
 def sigma_step(
     q_nb: Array, v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
-    driven: Indices, decay_rate: Array, variance_rate: Array, Phi: Array, FT: Array, decay: Array, half_noise: Array,
-    work: Array, spread: float, excess: float,
+    shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,
+    decay: Array, half_noise: Array, work: Array, spread: float, excess: float,
 ) -> Array:  # fmt: skip
     """`_covariance_step` of one closed filter by sigma points, whose mean error (n,) is taken out of the motion."""
     T = elapsed[0]
@@ -181,6 +237,7 @@ def sigma_step(
     for i in range(len(x)):
         half_noise[i] = 0.5 * T * variance_rate[i]
         decay[i] = math.exp(-T * decay_rate[i]) if decay_rate[i] > 0.0 else 1.0
+    _add_motion(half_noise, in_motion, sums, shaking, lla, T)
     for i in range(MOTION, len(x)):
         x[i] *= decay[i]
     for i in range(MOTION, len(imu)):
@@ -195,16 +252,17 @@ def sigma_step(
 @njit
 def propagate(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
-    room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
+    in_motion: Array, room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
 ) -> int:  # fmt: skip
     """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
 
     A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
     since it is long to compile.
     """
-    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates = parts(whole, common, filters, n)
+    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates, shaking = parts(whole, common, filters, n)
     Phi, FT, decay, half_noise = working(room, common, n)
     bad = -1
+    shaken = in_motion[0, 2] > 0.0
     angle, push, before = np.empty(3), np.empty(3), np.empty(4)
     for k in range(len(dt) + 1):
         T = dt[k] if k < len(dt) else 0.0
@@ -214,6 +272,8 @@ def propagate(
                 if not (abs(dtheta[k, i]) <= RATE_LIMIT * T and abs(dv[k, i]) <= FORCE_LIMIT * T):
                     sound = False
             if sound:
+                if shaken:
+                    _shake(shaking, rates, dtheta[k], dv[k], T)
                 for i in range(3):
                     rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
             else:
@@ -229,8 +289,8 @@ def propagate(
             elapsed[1] += 1.0
         if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
             _covariance_step(
-                v_n, lla, imu, x, P, errors, sums, elapsed,
-                driven, decay_rate, variance_rate, Phi, FT, decay, half_noise, work,
+                v_n, lla, imu, x, P, errors, sums, elapsed, shaking,
+                driven, decay_rate, variance_rate, in_motion, Phi, FT, decay, half_noise, work,
             )  # fmt: skip
     return bad
 

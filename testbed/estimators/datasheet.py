@@ -91,6 +91,9 @@ def imu_model(
         accel_drift_correlation_s=errors.accel_in_run_tau,
         gyro_scale_sigma=errors.gyro_scale if full else 0.0,
         accel_scale_sigma=errors.accel_scale if full else 0.0,
+        gyro_motion=errors.gyro_motion,
+        accel_motion=errors.accel_motion,
+        vibration=errors.vibration_share,
     )
 
 

@@ -32,6 +32,7 @@ from testbed.sensors.units import (
     MG_PER_ROOT_H,
     MPS_PER_ROOT_H,
     MRAD,
+    PERCENT,
     PPM,
     G,
     LeverArm,
@@ -54,7 +55,8 @@ class ImuErrors:
     Random walks: ``gyro_noise`` [rad/sqrt(s)], ``accel_noise`` [m/s/sqrt(s)]. Biases: ``*_turn_on`` constant of a run,
     ``*_in_run`` Gauss-Markov with correlation time ``*_in_run_tau`` [s], ``*_random_walk`` per sqrt(s), all
     in rad/s and m/s^2. ``*_scale`` and ``*_scale_asymmetry`` [1], ``*_misalignment`` and ``*_nonorthogonality`` [rad],
-    ``gyro_g_sensitivity`` [rad/s per m/s^2], ``*_temperature`` per kelvin. ``lever_arm_b`` (3,) [m] from the centre of
+    ``gyro_g_sensitivity`` [rad/s per m/s^2], ``*_temperature`` per kelvin. ``*_motion`` and ``vibration_share`` are
+    what filters are told of noise that follows motion (`nav.error_model.ImuModel`). ``lever_arm_b`` (3,) [m] from the centre of
     gravity, ``C_sb`` (3, 3) from body axes to the axes of the unit.
     """
 
@@ -79,6 +81,9 @@ class ImuErrors:
     accel_misalignment: float
     accel_nonorthogonality: float
     accel_temperature: float
+    gyro_motion: float
+    accel_motion: float
+    vibration_share: float
     lever_arm_b: Array
     C_sb: Array
 
@@ -146,6 +151,15 @@ class ImuConfig(Section):
     vibration_degps: float = Field(
         0.0, ge=0, le=1e4, description="engine vibration of the rate: amplitude at one per rev and 6000 rpm"
     )
+    gyro_motion_percent: float = Field(
+        0.0, ge=0, le=100, description="told to filters: of the rate, what goes wrong in each second of a manoeuvre"
+    )
+    accel_motion_percent: float = Field(
+        0.0, ge=0, le=100, description="told to filters: the same of the specific force less gravity"
+    )
+    vibration_percent: float = Field(
+        0.0, ge=0, le=1000, description="told to filters: of the noise that the increments show, what they expect"
+    )
     self_heating_k: float = Field(0.0, ge=0, le=100, description="how much the unit warms up after power-on")
     self_heating_tau_s: float = Field(300.0, gt=0, le=1e5, description="time constant of warming up")
 
@@ -186,6 +200,9 @@ class ImuConfig(Section):
             accel_misalignment=self.accel_misalignment_mrad * MRAD,
             accel_nonorthogonality=self.accel_nonorthogonality_mrad * MRAD,
             accel_temperature=self.accel_temperature_mgpk * MG,
+            gyro_motion=self.gyro_motion_percent * PERCENT,
+            accel_motion=self.accel_motion_percent * PERCENT,
+            vibration_share=self.vibration_percent * PERCENT,
             lever_arm_b=np.array(self.lever_arm_m, dtype=float),
             C_sb=dcm_from_quat(quat_from_euler(roll, pitch, heading)).T.copy(),
         )

@@ -146,11 +146,15 @@ GRADES: dict[str, dict[str, Any]] = {
     # As flown in hobby autopilots: a part of the kind of the InvenSense MPU-6000 (PS-MPU-6000A Rev. 3.4: 0.005
     # deg/s/sqrt(Hz), zero offset +-20 deg/s and +-50 to 80 mg, scale +-3 %, cross axis +-2 %, 0.1 deg/s/g), its gyros
     # zeroed at power-up and otherwise not calibrated, on a vibrating airframe. Measured on recorded flights of such:
-    # 430 to 1900 deg/h of gyro bias, scale and alignment of 1 % and 1 deg; white noise is what vibration makes of it,
-    # some ten times the data sheet's.
+    # 430 to 4300 deg/h of gyro bias, scale and alignment of 1 % and 1 deg; white noise is what vibration makes of it,
+    # some ten times the data sheet's. Where they fly briskly, 1 % of the rate and of the force less gravity goes wrong
+    # each second; what vibrates more than usual shows it in its increments.
     "mems-hobby": {
         **INSTALLATION,
-        "gyro_turn_on_degph": 1000.0,
+        "gyro_motion_percent": 1.0,
+        "accel_motion_percent": 1.0,
+        "vibration_percent": 50.0,
+        "gyro_turn_on_degph": 2000.0,
         "gyro_instability_degph": 30.0,
         "gyro_instability_tau_s": 200.0,
         "angle_random_walk_degprth": 2.0,
