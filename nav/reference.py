@@ -143,7 +143,8 @@ class Reference:
         if s.elapsed[0] > 0 and self.scaling is not None:
             sigma_step(
                 s.q_nb, s.v_n, s.lla, s.imu, s.x[0], s.P[0], s.errors, s.sums, s.elapsed, s.shaking,
-                self.driven, self._decay_rate[0], self._variance_rate[0], self._in_motion[0], *self._scratch, self.scaling.spread, self.scaling.excess,
+                self.driven, self._decay_rate[0], self._variance_rate[0], self._in_motion[0],
+                *self._scratch, self.scaling.spread, self.scaling.excess,
             )  # fmt: skip
         elif s.elapsed[0] > 0:
             before = s.copy() if self.scalings else None
@@ -175,7 +176,8 @@ class Reference:
     def _propagate(self, s: State, period: int, dtheta: Array, dv: Array, dt: Array, *, settle: bool = False) -> int:
         """See the kernel."""
         return propagate(
-            s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._in_motion, self._room, self._work,
+            s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._in_motion, self._room,
+            self._work,
             period, dtheta, dv, dt, settle,
         )  # fmt: skip
 

@@ -56,8 +56,8 @@ class ImuErrors:
     ``*_in_run`` Gauss-Markov with correlation time ``*_in_run_tau`` [s], ``*_random_walk`` per sqrt(s), all
     in rad/s and m/s^2. ``*_scale`` and ``*_scale_asymmetry`` [1], ``*_misalignment`` and ``*_nonorthogonality`` [rad],
     ``gyro_g_sensitivity`` [rad/s per m/s^2], ``*_temperature`` per kelvin. ``*_motion`` and ``vibration_share`` are
-    what filters are told of noise that follows motion (`nav.error_model.ImuModel`). ``lever_arm_b`` (3,) [m] from the centre of
-    gravity, ``C_sb`` (3, 3) from body axes to the axes of the unit.
+    what filters are told of noise that follows motion (`nav.error_model.ImuModel`). ``lever_arm_b`` (3,) [m] from the
+    centre of gravity, ``C_sb`` (3, 3) from body axes to the axes of the unit.
     """
 
     gyro_noise: float
