@@ -101,6 +101,15 @@ def test_verdicts() -> None:
     assert claim([1.0, math.nan], 3.0).verdict is Verdict.MISSED
 
 
+@pytest.mark.parametrize("at_least", [True, False])
+def test_a_figure_that_is_its_bound_but_for_rounding_keeps_it(at_least: bool) -> None:
+    lag = 67.6 - 60.0  # 7.599999999999994
+    found = Claim("lag", "s", "7.6", [lag, lag, lag], 7.6, at_least=at_least, statistic=MEAN)
+    assert found.verdict is Verdict.MET
+    rest = Claim("lag", "s", "7.6", [1.2 + 2e-16] * 9, 1.2, statistic=MEAN)
+    assert rest.verdict is Verdict.MET
+
+
 def test_impossible_takes_a_bound_that_was_computed_and_does_not_keep_the_claim_either() -> None:
     beyond, below = Floor(HUNDRED + 50, "the optimal filter"), Floor(HUNDRED - 50, "the optimal filter")
     assert claim(HUNDRED + 60, 20.0, floor=beyond).verdict is Verdict.IMPOSSIBLE
