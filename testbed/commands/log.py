@@ -17,9 +17,16 @@ LogFile = Annotated[
 Target = Annotated[
     Path | None, typer.Option("--scenario", metavar="OUT.toml", help="Write a scenario that runs the log.")
 ]
+Simulation = Annotated[
+    Path | None,
+    typer.Option(
+        "--compare", metavar="RUN.nc", help="Show beside it what a simulation of the flight has. Two records are "
+        "compared by their innovations too.",
+    ),
+]  # fmt: skip
 
 
-def log(file: LogFile, scenario: Target = None, force: Force = False) -> None:
+def log(file: LogFile, scenario: Target = None, compare: Simulation = None, force: Force = False) -> None:
     """Show what is in a recorded flight: rates, gaps, phases, noise, vibration, latencies; propose grades."""
     from testbed.data import data_dir, write_file
     from testbed.feeds import draft, formats
@@ -51,8 +58,13 @@ def log(file: LogFile, scenario: Target = None, force: Force = False) -> None:
         print("Say in [truth.columns.<sensor>] of a scenario what they are, and give that in place of the table.")
         return
     found = survey(formats.read(place, {}) if truth is None else formats.open_log(truth))
-    for table in pages.tables(found):
-        console().print(table)
+    if compare is not None:
+        from testbed.score import likeness
+
+        console().print(pages.beside(likeness.compare(found, survey(formats.read(compare, {})))))
+    else:
+        for table in pages.tables(found):
+            console().print(table)
     if scenario is not None:
         write_file(scenario, draft.scenario(found, scenario, truth).encode())
         print(printable(f"scenario: {scenario}"))

@@ -167,7 +167,8 @@ def _phases(log: Log) -> list[Phase]:
     return [Phase(names[a], a * WINDOW_S, b * WINDOW_S) for a, b in itertools.pairwise(changes)]
 
 
-def _between(log: Log, imu: ImuSamples, phase: Phase) -> slice:
+def between(log: Log, imu: ImuSamples, phase: Phase) -> slice:
+    """The rows of an inertial unit in a phase."""
     first, last = np.searchsorted(imu.t, [log.t0 + phase.start, log.t0 + phase.end])
     return slice(int(first), int(last))
 
@@ -187,7 +188,7 @@ def allan(rates: Array, dt: float) -> tuple[Array, Array]:
 def _noise(log: Log, imu: ImuSamples, resting: Phase | None) -> Noise | None:
     if resting is None or resting.end - resting.start < LEAST_REST_S:
         return None
-    part = _between(log, imu, resting)
+    part = between(log, imu, resting)
     dt = float(np.median(imu.dt[part]))
     gyro, force = imu.dtheta[part] / imu.dt[part, None], imu.dv[part] / imu.dt[part, None]
     found: list[tuple[float, float, float]] = []
@@ -206,7 +207,7 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     longest = max(moving, key=lambda p: p.end - p.start, default=None)
     if longest is None or longest.end - longest.start < LEAST_REST_S:
         return None
-    part = _between(log, imu, longest)
+    part = between(log, imu, longest)
     rate_hz = 1 / float(np.median(imu.dt[part]))
     force = imu.dv[part] / imu.dt[part, None]
     frequency, density = signal.welch(force, rate_hz, nperseg=min(1024, len(force)), axis=0)

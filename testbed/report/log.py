@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from testbed.feeds.draft import sections
 from testbed.feeds.survey import Survey
+from testbed.score.likeness import ALIKE, Row
 from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
 
 if TYPE_CHECKING:
@@ -70,6 +72,27 @@ def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
         yield name, "rms from the sphere that fits", value
     for name, scale in found.airspeed_scale.items():
         yield name, "true airspeed over the sensor's", f"{scale:.3f}"
+
+
+def beside(rows: Sequence[Row]) -> Table:
+    """A flight and its simulation, row by row, and where they are not alike."""
+    unlike = sum(not row.alike for row in rows)
+    title = f"{len(rows)} figures, {len(rows) - unlike} of them alike, within a factor of {ALIKE:g}"
+    table = _table(title, "of", "what", "flight", "simulation", "")
+    for row in rows:
+        numbers = ("" if math.isnan(value) else f"{value:.3g} {row.unit}".strip() for value in row[3:5])
+        table.add_row(row.of, row.what, *numbers, _likeness(row))
+    return table
+
+
+def _likeness(row: Row) -> str:
+    if row.alike:
+        return "alike"
+    if math.isnan(row.ratio):
+        return "only the flight has it" if math.isnan(row.simulation) else "only the simulation has it"
+    if row.ratio > 1:
+        return f"[red]the simulation's is {row.ratio:.3g} times as large[/]"
+    return f"[red]the flight's is {1 / row.ratio if row.ratio else math.inf:.3g} times as large[/]"
 
 
 def _table(title: str, *columns: str) -> Table:
