@@ -51,7 +51,7 @@ class Row(NamedTuple):
     @property
     def alike(self) -> bool:
         """Within `ALIKE`; what only one of them has is not."""
-        return 1 / ALIKE <= (1 + ROUNDING) * self.ratio and self.ratio <= (1 + ROUNDING) * ALIKE
+        return (1 + ROUNDING) * self.ratio >= 1 / ALIKE and self.ratio <= (1 + ROUNDING) * ALIKE
 
 
 def compare(flight: Survey, simulation: Survey) -> list[Row]:
