@@ -18,7 +18,14 @@ GOLDEN = Path(__file__).parent / "golden"
 
 
 def test_the_promised_scenarios_are_shipped() -> None:
-    promised = {"loiter_gnss_outage", "u_turn", "survey_racetrack_wind", "jammer_zone", "static_bench"}
+    promised = {
+        "loiter_gnss_outage",
+        "denied_walking_wind",
+        "u_turn",
+        "survey_racetrack_wind",
+        "jammer_zone",
+        "static_bench",
+    }
     promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
     promised |= {"regression"}
     promised |= {f"closed_loop_{x}" for x in ("gnss_outage", "ahrs_only", "spoofed", "pitot_blocked", "gyro_failed")}
