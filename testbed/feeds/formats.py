@@ -32,6 +32,7 @@ FORMATS = (
     Format("PX4 ULog", (b"ULog\x01\x12\x35",), "px4"),
     Format("npz", (b"PK\x03\x04",), "table"),
     Format("MATLAB", (b"MATLAB 5.0 MAT-file",), "table"),
+    Format("Parquet", (b"PAR1",), "table"),
 )
 CSV = Format("CSV", (), "table")  # text, whatever it begins with
 
@@ -83,8 +84,6 @@ def known(path: Path) -> Format:
     for one in FORMATS:
         if head.startswith(one.begins):
             return one
-    if head.startswith(b"PAR1"):
-        raise UserError(f"{path}: is Parquet, which is not read: write it as .npz or .csv")
     if _is_text(head):
         return CSV
     if head[8:9] in (b"\xfd", b"\xfe"):

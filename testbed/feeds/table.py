@@ -1,4 +1,4 @@
-"""A table as a log: .npz, .csv or .mat, of which the scenario says what each column is (`testbed.motion.logged`)."""
+"""A table as a log: .npz, .csv, .mat or .parquet. The scenario says what each column is (`testbed.motion.logged`)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from testbed.feeds.stamps import integrated, ordered
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
+PARQUET = b"PAR1"
 Table: TypeAlias = Mapping[str, Array]
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -103,13 +104,24 @@ def load(path: Path) -> dict[str, Array]:
             return dict(_numbers(_flat(loadmat(path, simplify_cells=True))))
         import pandas
 
+        if head.startswith(PARQUET):
+            frame = pandas.read_parquet(path, engine="pyarrow")
+            return dict(_numbers((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
         frame = pandas.read_csv(path, skipinitialspace=True)
         return dict(_numbers((str(name), frame[name].to_numpy()) for name in frame.columns))
+    except ImportError:
+        raise UserError(f"{path}: is Parquet, for which pyarrow is needed: pip install pyarrow") from None
     except (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
         # NotImplementedError is scipy's word for a MATLAB file of version 7.3.
         raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
     except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
+
+
+def _stacked(values: Any) -> Any:
+    """A column of lists that are equally long as (N, k), any other as it is."""
+    lengths = {len(one) if isinstance(one, np.ndarray) else -1 for one in values} if values.dtype == object else {-1}
+    return np.stack(values) if lengths not in ({-1}, set()) and len(lengths) == 1 else values
 
 
 def _numbers(columns: Any) -> Iterator[tuple[str, Array]]:

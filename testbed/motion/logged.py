@@ -94,7 +94,7 @@ class LogTruth(Section):
     source: Literal["log"]
     file: str = Field(
         description="the log, seen from this file: ArduPilot .bin or .log, PX4 .ulg, run.nc, or a table: "
-        ".npz, .csv, .mat"
+        ".npz, .csv, .mat, .parquet"
     )
     aircraft: str | None = Field(
         default=None, description="an aircraft that flies as this one did, for what estimators expect; none: any body"

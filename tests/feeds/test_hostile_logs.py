@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from worlds import log_writers
 from worlds.recordings import log_of
@@ -30,6 +32,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     from scipy.io import savemat
 
     savemat(folder / "a.mat", {"log": {"t": t, "w": np.zeros((400, 3)), "f": np.full((400, 3), -9.8)}})
+    rows = pd.DataFrame({"t": t, "w": [[0.0, 0.0, 0.0]] * 400, "f": [[0.0, 0.0, -9.8]] * 400, "note": ["a"] * 400})
+    rows.to_parquet(folder / "a.parquet")
     return {
         "nc": folder / "run.nc",
         "bin": log_writers.dataflash(log_writers.dataflash_rows(dataset), folder / "a.bin"),
@@ -38,12 +42,14 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "csv": log_writers.csv(dataset, folder / "a.csv"),
         "npz": folder / "a.npz",
         "mat": folder / "a.mat",
+        "parquet": folder / "a.parquet",
     }
 
 
 COLUMNS: dict[str, Any] = {
     "csv": log_writers.CSV,
     "npz": {"imu": {"time": "t", "gyro": "w", "accel": "f"}},
+    "parquet": {"imu": {"time": "t", "gyro": "w", "accel": "f"}},
     "mat": {"imu": {"time": "log.t", "gyro": "log.w", "accel": "log.f"}},
 }
 
@@ -53,13 +59,21 @@ def read(path: Path, name: str) -> Log:
     return formats.read(path, truth.columns)
 
 
-@pytest.mark.parametrize("name", ["nc", "bin", "log", "ulg", "csv", "npz", "mat"])
+@pytest.mark.parametrize("name", ["nc", "bin", "log", "ulg", "csv", "npz", "mat", "parquet"])
 def test_every_format_is_known_by_its_content(files: dict[str, Path], name: str, tmp_path: Path) -> None:
     disguised = tmp_path / "flight.dat"
     disguised.write_bytes(files[name].read_bytes())
     log = read(disguised, name)
     assert len(log.imus["imu"]) > 300
     assert log.t0 >= 0
+
+
+def test_parquet_without_its_library_is_refused_with_its_name(
+    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UserError, match="pip install pyarrow"):
+        read(files["parquet"], "parquet")
 
 
 def broken(name: str, whole: bytes, kind: str, rng: np.random.Generator) -> bytes:
@@ -76,7 +90,7 @@ def broken(name: str, whole: bytes, kind: str, rng: np.random.Generator) -> byte
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("name", ["nc", "bin", "log", "ulg", "csv", "npz", "mat"])
+@pytest.mark.parametrize("name", ["nc", "bin", "log", "ulg", "csv", "npz", "mat", "parquet"])
 @pytest.mark.parametrize("kind", ["cut", "flipped", "noise"])
 def test_a_broken_log_is_read_as_far_as_it_goes_or_refused(
     files: dict[str, Path], name: str, kind: str, tmp_path: Path
