@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -38,6 +38,8 @@ COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the headi
 HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
+UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its field is of another length than the Earth's
+FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 STEP = 1e-6  # of each input, relative, in the differences
 
 
@@ -45,7 +47,8 @@ STEP = 1e-6  # of each input, relative, in the differences
 class InitialState:
     """Where an estimator begins: motion at ``t`` with the covariance (9, 9) of [phi, dv, dp].
 
-    ``correlated`` gives, by block name, the covariance (9, k) of that motion error with the error of further blocks.
+    ``correlated`` gives, by block name, the covariance (9, k) of that motion error with the error of further blocks;
+    ``widened`` the 1-sigma of blocks that turned out to be worse than the filter was told.
     """
 
     t: float
@@ -56,17 +59,21 @@ class InitialState:
     q_nb: Array
     covariance: Array
     correlated: Mapping[str, Array] = field(default_factory=dict)
+    widened: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class AidSigmas:
-    """What alignment is told of the aids [1-sigma]: field in T, correlated GNSS errors in m, m/s NED; wind in m/s."""
+    """What alignment is told of the aids [1-sigma]: field in T (noise, constant, bent by iron), correlated GNSS errors
+    in m, m/s NED; wind in m/s.
+    """
 
     field: float
     field_bias: float
     gnss_position: Array
     gnss_velocity: Array
     wind: float
+    field_bend: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +111,7 @@ class Alignment:
         sigmas = AidSigmas(
             field=magnetometer.sigma,
             field_bias=magnetometer.bias_sigma,
+            field_bend=math.hypot(magnetometer.anomaly_sigma, magnetometer.error_sigma),
             gnss_position=np.array(gnss.position_error_sigma),
             gnss_velocity=np.array(gnss.velocity_error_sigma),
             wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),
@@ -166,7 +174,8 @@ class Alignment:
             self.problem = f"accelerometers and GNSS velocity disagree by {mismatch / T:.3g} m/s^2"
             self._restart(fix)
             return None
-        heading = self._heading(C_b0, first, fix, T, field_n)
+        field_bias = self._field_bias(field_n)
+        heading = self._heading(C_b0, first, fix, T, field_n, field_bias)
         if heading is None:
             if np.linalg.norm(fix.v_n) > REST_SPEED:
                 self._restart(fix)
@@ -176,7 +185,10 @@ class Alignment:
             C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
             dv_n = self._specific_force_n(first, fix, T) - C_nb @ swing_b
         self.problem = ""
-        return self._state(fix, T, dv_b, dv_n, heading)
+        initial = self._state(fix, T, dv_b, dv_n, heading)
+        if field_bias > self.aids.field_bias:
+            initial = replace(initial, widened={"magnetometer_bias": field_bias})
+        return initial
 
     def _specific_force_n(self, first: GnssSample, fix: GnssSample, T: float) -> Array:
         """Integral of specific force in n between the fixes: velocity change less gravity and Coriolis."""
@@ -186,19 +198,35 @@ class Alignment:
         change[2] -= gravity(fix.lat, 0.5 * (first.h + fix.h)) * T
         return change
 
+    def _field_bias(self, field_n: Array | None) -> float:
+        """The hard iron [T] that must be reckoned with: as told, or more where the field is not as long as the Earth's.
+
+        The difference of the lengths is the least that the errors can be: a magnetometer that nobody has calibrated.
+        """
+        if self._fields == 0 or field_n is None or self.aids.field_bias == 0.0:
+            return self.aids.field_bias
+        excess = abs(float(np.linalg.norm(self._field_0)) / self._fields - float(np.linalg.norm(field_n)))
+        known = math.hypot(self.aids.field_bias, self.aids.field, self.aids.field_bend)
+        return excess if excess > UNCALIBRATED * known else self.aids.field_bias
+
     def _heading(
-        self, C_b0: Array, first: GnssSample, fix: GnssSample, T: float, field_n: Array | None
+        self, C_b0: Array, first: GnssSample, fix: GnssSample, T: float, field_n: Array | None, field_bias: float
     ) -> _Heading | None:
         speed = math.hypot(fix.v_n[0], fix.v_n[1])
-        if self._fields > 0 and field_n is not None:
-            variance = self.aids.field_bias**2 + self.aids.field**2 / self._fields
+        told = field_bias == self.aids.field_bias
+        if (
+            self._fields > 0
+            and field_n is not None
+            and (told or field_bias <= FIELD_HEADING_LIMIT * math.hypot(field_n[0], field_n[1]))
+        ):
+            variance = field_bias**2 + self.aids.field**2 / self._fields
             return _Heading(
                 C_b0 @ self._field_0 / self._fields,
                 field_n,
                 variance * np.eye(3),
                 block="magnetometer_bias",
                 gain=1.0,
-                bias_variance=self.aids.field_bias**2,
+                bias_variance=field_bias**2,
             )
         if speed >= COURSE_SPEED:
             course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
@@ -206,19 +234,20 @@ class Alignment:
                 np.array([1.0, 0.0, 0.0]), course, np.zeros((3, 3)), heading_sigma=min(1.0, self.aids.wind / speed)
             )
         if max(speed, float(np.linalg.norm(first.v_n))) > REST_SPEED:
-            self.problem = "no magnetometer and too slow for the course: waiting for flight"
+            lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
+            self.problem = f"{lacking}, and it is too slow for the course: waiting for flight"
             return None
-        return self._gyrocompass(C_b0, fix, T)
+        return self._gyrocompass(C_b0, fix, T, told)
 
-    def _gyrocompass(self, C_b0: Array, fix: GnssSample, T: float) -> _Heading | None:
+    def _gyrocompass(self, C_b0: Array, fix: GnssSample, T: float, told: bool) -> _Heading | None:
         earth_n = earth_rate_n(fix.lat)
         level_rate = abs(float(earth_n[0]))
         bias_variance = self.imu.gyro_bias_sigma**2 + self.imu.gyro_drift_sigma**2
         sigma = math.sqrt(bias_variance) / level_rate
         if sigma > HEADING_SIGMA_LIMIT:
-            self.problem = (
-                f"no magnetometer, and gyrocompassing would leave {math.degrees(sigma):.3g} deg: waiting for flight"
-            )
+            lacking = "no magnetometer" if told else "no calibrated magnetometer"
+            left = f"gyrocompassing would leave {math.degrees(sigma):.3g} deg"
+            self.problem = f"{lacking}, and {left}: waiting for flight"
             return None
         needed = (self.imu.gyro_noise / (NOISE_SHARE * HEADING_SIGMA_LIMIT * level_rate)) ** 2
         if needed > T:

@@ -102,6 +102,11 @@ class Reference:
         for i, model in enumerate(self.models):
             P[i, range(model.size), range(model.size)] = model.sigma**2
             P[i, :MOTION, :MOTION] = initial.covariance
+            for given, sigma in initial.widened.items():
+                name = names[i].get(given, given) if names else given
+                if name in model.slices:
+                    own = np.arange(model.size)[model.slices[name]]
+                    P[i, own, own] = sigma**2
             for given, covariance in initial.correlated.items():
                 name = names[i].get(given, given) if names else given
                 if name in model.slices:

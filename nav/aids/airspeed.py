@@ -17,6 +17,8 @@ from nav.samples import AirspeedSample, Array, Outcome, Sample
 
 AIRSPEED_LIMITS = (-10.0, 300.0)  # what an instrument could possibly report [m/s]
 TOO_SLOW = Ruling(Outcome.OUT_OF_RANGE, "too slow for the pitot tube")
+STANDING = Ruling(Outcome.OUT_OF_RANGE, "standing, and blown upon")
+STANDING_SPEED = 2.0  # over ground: what blows at a vehicle at rest tells of gusts near the ground only [m/s]
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,8 @@ class AirspeedAid:
         assert isinstance(sample, AirspeedSample)
         state, (wind, gust, scale) = at.state, at.starts
         slow = None if sample.eas >= self.minimum else TOO_SLOW
+        if slow is None and float(state.v_n @ state.v_n) < STANDING_SPEED**2:
+            slow = STANDING
         if part == "airspeed":
             nu, H = airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, sample.eas)
             return Measurement(nu, H, self._R[0], slow)

@@ -10,7 +10,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Measurement, OperatingPoint, position_problem, put_skew
-from nav.earth import displacement_n, earth_rate_n, wrap_longitude
+from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov
 from nav.rotation import cross, dcm_from_quat, quat_rotate
 from nav.samples import Array, GnssSample, Sample
@@ -34,7 +34,12 @@ class Course:
 
 @dataclass(frozen=True)
 class GnssAid:
-    """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED)."""
+    """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED).
+
+    Where it is not known to ``latency_sigma`` when a sample was valid, position is uncertain by the velocity times that
+    and velocity by the acceleration, beside the sigmas. A velocity older by ``velocity_lag`` than the position of the
+    same sample, as of receivers that smooth it, is held against the velocity at that time, to first order.
+    """
 
     sensor: str = "gnss"
     arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to antenna [m]
@@ -44,6 +49,8 @@ class GnssAid:
     velocity_error_sigma: Axes = (0.0, 0.0, 0.0)  # [m/s]
     velocity_error_correlation_s: float = 20.0
     course: Course | None = None
+    latency_sigma: float = 0.0  # how well it is known when a sample was valid [s]
+    velocity_lag: float = 0.0  # by which its velocity is older than its position [s]
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
@@ -80,7 +87,8 @@ class GnssAid:
         state = at.state
         if part == "gnss_position":
             nu, H = gnss_position(state.q_nb, state.lla, at.x, self.arm, at.starts[0], sample.lat, sample.lon, sample.h)
-            return Measurement(nu, H, _white(sample.sigma_position_n, self._correlated[0]))
+            R = _white(sample.sigma_position_n, self._correlated[0])
+            return Measurement(nu, H, R + (self.latency_sigma * state.v_n) ** 2 if self.latency_sigma else R)
         if not has_velocity(sample):
             return None
         if part == "gnss_course":
@@ -90,7 +98,14 @@ class GnssAid:
             self.arm, at.starts[1], sample.v_n,
         )  # fmt: skip
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
-        return Measurement(nu, H, _white(sample.sigma_velocity_n, self._correlated[1]), unknown)
+        R = _white(sample.sigma_velocity_n, self._correlated[1])
+        if self.latency_sigma or self.velocity_lag:
+            acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
+            if state.rates[1].any():
+                acceleration[2] += gravity(float(state.lla[0]), float(state.lla[2]))
+            R = R + (self.latency_sigma * acceleration) ** 2
+            nu += self.velocity_lag * acceleration
+        return Measurement(nu, H, R, unknown)
 
     def _course(self, sample: GnssSample, at: OperatingPoint) -> Measurement | None:
         assert self.course is not None

@@ -19,7 +19,11 @@ FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Ear
 
 @dataclass(frozen=True)
 class MagnetometerAid:
-    """Three axes; without a reference field it is not used."""
+    """Three axes; without a reference field it is not used.
+
+    A current beside it bends the field and makes it longer or shorter: by as much of that as the ``doubt`` says each
+    axis is doubted, whatever the attitude.
+    """
 
     sensor: str = "magnetometer"
     sigma: float = 0.5e-6  # [T]
@@ -27,6 +31,7 @@ class MagnetometerAid:
     anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
     error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
     error_correlation_s: float = 30.0
+    doubt: float = 0.0  # of what the field's length is off by, the share that each axis may be, beside the noise
 
     parts = (("magnetometer", 3),)
 
@@ -56,7 +61,11 @@ class MagnetometerAid:
             return None
         field_n = at.reference.field_n(state.lla)
         nu, H = magnetometer(state.q_nb, at.x, bias, error, anomaly, field_n, sample.field_b)
-        return Measurement(nu, H, self._R)
+        if not self.doubt:
+            return Measurement(nu, H, self._R)
+        rest = sample.field_b - (at.x[bias : bias + 3] if bias >= 0 else 0.0)
+        length = math.hypot(*rest.tolist()) - math.hypot(*field_n.tolist())
+        return Measurement(nu, H, self._R + (self.doubt * length) ** 2)
 
 
 def problem(sample: MagnetometerSample) -> str:

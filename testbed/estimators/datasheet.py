@@ -120,6 +120,8 @@ def aid_of(
                 position_error_correlation_s=e.position_tau,
                 velocity_error_sigma=tuple(e.velocity_correlated_n),
                 velocity_error_correlation_s=e.velocity_tau,
+                latency_sigma=e.latency_sigma,
+                velocity_lag=e.velocity_lag,
             )
         case BarometerConfig():
             b = section.errors()
@@ -129,17 +131,20 @@ def aid_of(
             m = section.errors()
             iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
             bias = math.hypot(m.hard_iron, m.current * usual.current_a)
-            return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron)
+            return MagnetometerAid(
+                name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt
+            )
         case AirspeedConfig():
             a = section.errors()
+            gust = max(air.gust, section.gust_mps)
             return AirspeedAid(
                 name,
-                sigma=math.hypot(a.noise, SHORT_GUSTS * air.gust),
+                sigma=math.hypot(a.noise, SHORT_GUSTS * gust),
                 scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
-                sideslip_sigma=math.hypot(SIDESLIP, SHORT_GUSTS * air.gust),
-                wind_walk=air.wind_walk,
-                gust_sigma=air.gust,
-                gust_correlation_s=GUST_LENGTH / usual.airspeed_mps,
+                sideslip_sigma=None if section.slips else math.hypot(SIDESLIP, SHORT_GUSTS * gust),
+                wind_walk=max(air.wind_walk, section.wind_walk_mps_per_sqrt_s),
+                gust_sigma=gust,
+                gust_correlation_s=section.gust_time_s or GUST_LENGTH / usual.airspeed_mps,
             )
         case BodyVelocityConfig():
             v = section.errors()

@@ -262,6 +262,7 @@ def lane(section: FederatedSection, rig: Rig, config: Config) -> Lane:
         used,
         handover_errors(section.handover, imu.errors().lever_arm_b, rig.seed),
         voter,
+        spacing_s=rig.spacing_s(used),
     )
 
 

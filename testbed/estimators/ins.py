@@ -139,6 +139,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
         used,
         handover_errors(section.handover, errors.lever_arm_b, rig.seed),
         voter,
+        spacing_s=rig.spacing_s(used),
     )
 
 

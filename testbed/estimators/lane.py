@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
@@ -17,6 +17,8 @@ from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Handover
 from testbed.noise import stream
+
+JITTER = 0.05  # of the distance that samples must keep
 
 
 class Tracked(NamedTuple):
@@ -62,7 +64,7 @@ class Lane:
 
     ``imus`` has how each IMU is mounted, C_sb (3, 3), by name; of several the ``voter`` makes one. The estimate is of
     the point where the first sits. ``commanded`` is for one that listens to the autopilot. With ``handover`` it does
-    not align but waits for `start`.
+    not align but waits for `start`. Of sensors in ``spacing_s`` [s] it is handed only samples so far apart.
     """
 
     horizon: FusionHorizon
@@ -71,6 +73,8 @@ class Lane:
     handover: HandoverErrors | None = None
     voter: Voter | None = None
     commanded: Callable[[Commanded], None] | None = None
+    spacing_s: Mapping[str, float] = field(default_factory=dict)
+    _taken: dict[str, float] = field(default_factory=dict)
 
     def start(self, initial: InitialState) -> None:
         """Begin with a state that is handed over."""
@@ -84,9 +88,19 @@ class Lane:
         if self.commanded is not None:
             self.commanded(commanded)
         increments, votes = self.increments(imu)
-        handed = [sample for aid in self.sensors for sample in samples[aid]]
+        handed = [sample for aid in self.sensors for sample in samples[aid] if self._spaced(aid, sample)]
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
+
+    def _spaced(self, sensor: str, sample: Sample) -> bool:
+        """Whether a sample is far enough from the last one that was handed over of its sensor."""
+        least = self.spacing_s.get(sensor)
+        if least is None:
+            return True
+        if sample.t - self._taken.get(sensor, -math.inf) < least * (1 - JITTER):
+            return False
+        self._taken[sensor] = sample.t
+        return True
 
     @property
     def failure(self) -> str:

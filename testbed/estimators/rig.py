@@ -58,6 +58,15 @@ class Rig:
             expected.gust if gust_mps is None else gust_mps, expected.wind_walk if wind_walk is None else wind_walk
         )
 
+    def spacing_s(self, names: Iterable[str]) -> dict[str, float]:
+        """How far apart [s] the samples of these sensors must be that a filter takes, where that is limited."""
+        sections = {name: self.sensors[name] for name in names}
+        return {
+            name: 1 / section.fused_hz
+            for name, section in sections.items()
+            if not isinstance(section, ImuConfig) and section.fused_hz is not None
+        }
+
     def lag_s(self, names: Iterable[str]) -> float:
         """The largest latency [s] of the aids of these names."""
         sections = [self.sensors[name] for name in names]

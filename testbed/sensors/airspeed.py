@@ -25,7 +25,18 @@ GRADES: dict[str, dict[str, Any]] = {
     "mems": {"scale_percent": 1.0, "bias_pa": 3.0, "noise_pa": 2.0},
     # The same kind of part on a hobby airframe, its tube not calibrated and in the propeller's wake: assumed, at the
     # size that innovations on recorded flights have.
-    "hobby": {"scale_percent": 5.0, "bias_pa": 15.0, "noise_pa": 15.0},
+    # Near the ground the wind itself walks by 2 m/s in minutes, and gusts turn these small aircraft sideways by degrees
+    # for seconds: 1.8 m/s against a constant wind, so that no sideslip is no constraint.
+    "hobby": {
+        "scale_percent": 5.0,
+        "bias_pa": 15.0,
+        "noise_pa": 15.0,
+        "wind_walk_mps_per_sqrt_s": 0.1,
+        "gust_mps": 2.0,
+        "gust_time_s": 3.0,
+        "slips": True,
+        "fused_hz": 10.0,
+    },
 }
 
 
@@ -54,6 +65,15 @@ class AirspeedConfig(AidingTiming):
     scale_percent: float = Field(0.0, ge=0, le=50, description="of dynamic pressure: half of it in speed")
     bias_pa: float = Field(0.0, ge=0, le=1e4, description="constant offset of the differential pressure")
     noise_pa: float = Field(0.0, ge=0, le=1e4, description="white noise of the differential pressure")
+
+    wind_walk_mps_per_sqrt_s: float = Field(
+        0.0, ge=0, le=10, description="told to filters: how the mean wind walks, at least"
+    )
+    gust_mps: float = Field(0.0, ge=0, le=50, description="told to filters: gusts, per axis, at least")
+    gust_time_s: float | None = Field(
+        None, gt=0, le=1e3, description="told to filters: how long a gust lasts; none: as long as the aircraft is in it"
+    )
+    slips: bool = Field(False, description="told to filters: it slips, so that no sideslip is no constraint")
 
     @model_validator(mode="before")
     @classmethod

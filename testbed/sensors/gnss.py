@@ -90,18 +90,19 @@ GRADES: dict[str, dict[str, Any]] = {
         "hdop": 0.6,
         "vdop": 0.9,
     },
-    # u-blox NEO-M8 data sheet UBX-15031086: 2.5 m CEP, 2.1 m per axis. Its velocity, 0.05 m/s, is late by 0.2 s, as
-    # recorded flights show against their inertial units, and not known to 0.1 s: 0.4 m/s where a small aircraft turns.
+    # u-blox NEO-M8 data sheet UBX-15031086: 2.5 m CEP, 2.1 m per axis, most of it the same for minutes; velocity 0.05
+    # m/s. It is late by 0.2 s, as recorded flights show against their inertial units, and not known to 0.1 s.
     "u-blox-m8": {
-        "horizontal_white_m": 1.5,
-        "horizontal_correlated_m": 1.5,
-        "vertical_white_m": 2.5,
-        "vertical_correlated_m": 3.0,
+        "horizontal_white_m": 1.0,
+        "horizontal_correlated_m": 1.0,
+        "vertical_white_m": 1.5,
+        "vertical_correlated_m": 2.0,
         "correlation_time_s": 300.0,
-        "horizontal_velocity_white_mps": 0.4,
+        "horizontal_velocity_white_mps": 0.2,
         "horizontal_velocity_correlated_mps": 0.05,
-        "vertical_velocity_white_mps": 0.6,
+        "vertical_velocity_white_mps": 0.3,
         "vertical_velocity_correlated_mps": 0.1,
+        "latency_sigma_s": 0.1,
         "velocity_correlation_time_s": 10.0,
         "latency_s": 0.2,
         "reacquire_s": 2.0,
@@ -128,7 +129,7 @@ class GnssErrors:
 
     ``position_white_n``, ``position_correlated_n`` (3,) [m] with ``position_tau`` [s]; ``velocity_white_n``,
     ``velocity_correlated_n`` (3,) [m/s] with ``velocity_tau`` [s]; ``lever_arm_b`` (3,) [m] from the centre of gravity
-    to the antenna; ``latency`` [s].
+    to the antenna; ``latency`` [s], known to ``latency_sigma``, and by how much more velocity is late.
     """
 
     position_white_n: Array
@@ -139,6 +140,8 @@ class GnssErrors:
     velocity_tau: float
     lever_arm_b: Array
     latency: float
+    latency_sigma: float
+    velocity_lag: float
 
 
 class GnssConfig(AidingTiming):
@@ -173,6 +176,10 @@ class GnssConfig(AidingTiming):
     satellites: int = Field(12, ge=MIN_SATELLITES, le=60, description="usual number of satellites in use")
     hdop: float = Field(0.9, gt=0, le=50, description="reported horizontal dilution of precision")
     vdop: float = Field(1.4, gt=0, le=50, description="reported vertical dilution of precision")
+    latency_sigma_s: float = Field(0.0, ge=0, le=10, description="told to filters: how well the latency is known")
+    velocity_lag_s: float = Field(
+        0.0, ge=-10, le=10, description="told to filters: by which velocity is older than the position beside it"
+    )
     lever_arm_m: LeverArm = Field(
         (0.0, 0.0, 0.0), description="from the centre of gravity to the antenna, forward, right, down"
     )
@@ -205,6 +212,8 @@ class GnssConfig(AidingTiming):
             velocity_tau=self.velocity_correlation_time_s,
             lever_arm_b=np.array(self.lever_arm_m, dtype=float),
             latency=self.latency_s,
+            latency_sigma=self.latency_sigma_s,
+            velocity_lag=self.velocity_lag_s,
         )
 
 

@@ -41,6 +41,8 @@ GRADES: dict[str, dict[str, Any]] = {
         "hard_iron_ut": 6.0,
         "soft_iron_percent": 5.0,
         "current_ut_per_a": 0.1,
+        "doubt_percent": 100.0,
+        "fused_hz": 10.0,
         "range_ut": 400.0,
     },
 }
@@ -144,7 +146,7 @@ def _interpolate(corners: Array, x: float, y: float, z: float) -> Array:
 @dataclass(frozen=True, slots=True)
 class MagnetometerErrors:
     """The sensor's datasheet in SI, 1 sigma per axis: ``noise``, ``hard_iron`` [T], ``soft_iron`` [1],
-    ``current`` [T/A], ``latency`` [s].
+    ``current`` [T/A], ``latency`` [s]; ``doubt`` [1] as `nav.aids.MagnetometerAid` has it.
     """
 
     noise: float
@@ -152,6 +154,7 @@ class MagnetometerErrors:
     soft_iron: float
     current: float
     latency: float
+    doubt: float
 
 
 class MagnetometerConfig(AidingTiming):
@@ -172,6 +175,9 @@ class MagnetometerConfig(AidingTiming):
     current_ut_per_a: float = Field(
         0.0, ge=0, le=100, description="stray field of the wiring per axis and ampere of the aircraft's current"
     )
+    doubt_percent: float = Field(
+        0.0, ge=0, le=1000, description="told to filters: doubt of each axis, of what the field's length is off by"
+    )
     range_ut: float | None = Field(None, gt=0, le=1e6, description="largest field per axis; none: no limit")
 
     @model_validator(mode="before")
@@ -187,6 +193,7 @@ class MagnetometerConfig(AidingTiming):
             soft_iron=self.soft_iron_percent * PERCENT,
             current=self.current_ut_per_a * MICROTESLA,
             latency=self.latency_s,
+            doubt=self.doubt_percent * PERCENT,
         )
 
 

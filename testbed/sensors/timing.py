@@ -58,6 +58,12 @@ class AidingTiming(Section):
     rate_hz: float = Field(10.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
     offset_s: float = Field(0.0, ge=0, le=3600, description="time of the first sample, a whole number of ticks")
     latency_s: float = Field(0.0, ge=0, le=10, description="from the time of validity to the time of arrival")
+    fused_hz: float | None = Field(
+        default=None,
+        gt=0,
+        le=10_000,
+        description="an INS takes no more of its samples per second: errors of closer ones are alike; none: all",
+    )
 
 
 def patience(rate_hz: float) -> float:

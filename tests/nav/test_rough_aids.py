@@ -1,0 +1,123 @@
+"""Aids as hobby autopilots have them: late by an unknown time, bent by currents, blown upon, not calibrated."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from worlds.ins import CONSUMER, FIELD_N, flight, gnss, imu, magnetometer
+
+from nav.aids import AirspeedAid, GnssAid, MagnetometerAid
+from nav.aids.base import OperatingPoint
+from nav.alignment import InitialState
+from nav.earth import gravity
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.reference import Reference
+from nav.samples import AirspeedSample, FixType, GnssSample, ImuSamples, MagnetometerSample, Outcome
+
+SPEED, TURN = 20.0, 0.5  # of a level circle [m/s, rad/s]
+LAT, H = math.radians(47.0), 300.0
+
+
+def circling(aid, t=0.7, v_n=None):
+    """A filter on the circle at ``t``, its IMU having felt the force of it; and what it measures there from."""
+    ins = Ins(InsConfig(CONSUMER, (aid,)), lambda *_: FIELD_N)
+    heading = TURN * t
+    bank = math.atan(SPEED * TURN / gravity(LAT, H))
+    attitude = Rotation.from_euler("ZYX", [heading, 0.0, bank])
+    v_n = velocity(t) if v_n is None else v_n
+    initial = InitialState(t, LAT, 0.1, H, v_n, attitude.as_quat(scalar_first=True), np.eye(9))
+    reference = Reference([ins.model], [1.0], 10, lambda *_: FIELD_N)
+    state = reference.start(initial)
+    force_n = np.array([-SPEED * TURN * math.sin(heading), SPEED * TURN * math.cos(heading), -gravity(LAT, H)])
+    state.rates[:] = attitude.inv().apply([[0.0, 0.0, TURN], force_n])
+    starts = tuple(map(ins.model.start, aid.states))
+    return OperatingPoint(reference, state, state.x[0], starts)
+
+
+def velocity(t):
+    return SPEED * np.array([math.cos(TURN * t), math.sin(TURN * t), 0.0])
+
+
+def fix(v_n):
+    sigma = np.full(3, 0.1)
+    return GnssSample(0.7, 0.7, LAT, 0.1, H, v_n, 10 * sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+
+
+def test_an_uncertain_latency_counts_with_velocity_and_acceleration():
+    """0.1 s at 20 m/s is 2 m along the track; at 10 m/s^2 across it 1 m/s."""
+    aid, at = GnssAid(latency_sigma=0.1), circling(GnssAid(latency_sigma=0.1))
+    along, across = velocity(0.7) / SPEED, np.array([-math.sin(0.35), math.cos(0.35), 0.0])
+    position = aid.measure("gnss_position", fix(velocity(0.7)), at)
+    np.testing.assert_allclose(position.R, 1.0 + (0.1 * SPEED * along) ** 2)
+    speed = aid.measure("gnss_velocity", fix(velocity(0.7)), at)
+    np.testing.assert_allclose(speed.R, 0.01 + (0.1 * SPEED * TURN * across) ** 2, atol=1e-9)
+
+
+@pytest.mark.parametrize("lag", [0.1, -0.1, 0.2])
+def test_a_velocity_older_than_its_position_is_held_against_its_own_time(lag):
+    """What is left is of second order: half of a turn's v w^2 lag^2."""
+    aid = GnssAid(velocity_lag=lag)
+    measured = aid.measure("gnss_velocity", fix(velocity(0.7 - lag)), circling(aid))
+    assert np.linalg.norm(measured.nu) < 0.5 * SPEED * TURN**2 * lag**2 * 1.05
+    plain = GnssAid().measure("gnss_velocity", fix(velocity(0.7 - lag)), circling(GnssAid()))
+    assert np.linalg.norm(plain.nu) == pytest.approx(SPEED * TURN * abs(lag), rel=0.01)
+
+
+def test_a_field_of_the_wrong_length_is_doubted_by_as_much():
+    aid = MagnetometerAid(sigma=1e-6, doubt=1.0)
+    at = circling(aid)
+    C_bn = Rotation.from_quat(at.state.q_nb, scalar_first=True).inv()
+    sound = aid.measure("magnetometer", MagnetometerSample(0.7, 0.7, C_bn.apply(FIELD_N)), at)
+    np.testing.assert_allclose(sound.R, 1e-12, rtol=1e-9)
+    bent = aid.measure("magnetometer", MagnetometerSample(0.7, 0.7, 1.4 * C_bn.apply(FIELD_N)), at)
+    np.testing.assert_allclose(bent.R, 1e-12 + (0.4 * np.linalg.norm(FIELD_N)) ** 2)
+
+
+def test_a_pitot_that_is_blown_upon_at_rest_tells_nothing_of_the_wind():
+    sample = AirspeedSample(0.7, 0.7, 14.0)
+    at_rest = AirspeedAid().measure("airspeed", sample, circling(AirspeedAid(), v_n=np.array([0.3, 0.0, 0.0])))
+    assert at_rest.withheld is not None
+    assert at_rest.withheld.outcome is Outcome.OUT_OF_RANGE
+    flown = AirspeedAid().measure("airspeed", sample, circling(AirspeedAid()))
+    assert flown.withheld is None
+
+
+def aligned(seconds, hard_iron, **aids):
+    """An INS given a flight with a magnetometer that has this hard iron, until it is aligned."""
+    truth, rng = flight(seconds), np.random.default_rng(3)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    samples = gnss(truth, rng, 4.0) + magnetometer(truth, rng, hard_iron)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(), MagnetometerAid(**aids))), lambda *_: FIELD_N)
+    horizon = FusionHorizon(ins)
+    for k in range(4 * seconds):
+        rows = slice(50 * k, 50 * k + 50)
+        block = ImuSamples(increments.t[rows], increments.dt[rows], increments.dtheta[rows], increments.dv[rows])
+        horizon.push(block, [s for s in samples if 0.25 * k - 1e-6 <= s.t < 0.25 * (k + 1) - 1e-6])
+        if ins.aligned:
+            break
+    estimate = ins.estimate()
+    row = round(estimate.t * 200)
+    off = (
+        Rotation.from_quat(estimate.q_nb, scalar_first=True)
+        * Rotation.from_quat(truth.q_nb[row], scalar_first=True).inv()
+    )
+    return ins, estimate, -off.as_rotvec()
+
+
+def test_a_magnetometer_that_nobody_calibrated_tells_no_heading_but_is_learned():
+    """Hard iron as large as the field: the course begins, which knows no wind, and the samples then tell the bias."""
+    hard_iron = np.array([40e-6, -15e-6, 40e-6])
+    _, estimate, phi = aligned(30, hard_iron)
+    bias, sigma = estimate.extra["magnetometer_bias"]
+    assert (np.abs(bias - hard_iron) < 4 * sigma).all()
+    assert (np.abs(bias) > 5e-6).any()  # many times what it was told
+    claimed = math.sqrt(estimate.covariance[8, 8])
+    assert abs(phi[2]) < 3 * claimed
+    assert claimed > math.radians(5)
+    _, calibrated, _ = aligned(30, 1e-6 * np.ones(3))
+    assert math.sqrt(calibrated.covariance[8, 8]) < math.radians(4)
+    assert (calibrated.extra["magnetometer_bias"][1] < MagnetometerAid().bias_sigma).all()
