@@ -19,6 +19,7 @@ from nav.aids import Aid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Measurement, Ruling, refusals, report_on, without_position
 from nav.alignment import Alignment, InitialState
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
+from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance
@@ -36,6 +37,7 @@ from nav.reference import (
     Reference,
     align,
     describe,
+    doubted,
     forget,
     nothing_known,
     spread,
@@ -57,7 +59,10 @@ from nav.weighting import InOrder, Policy, Weight
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
 LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
-REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
+PROBATION_S, RECOVERY_S = (
+    1.0,
+    4.0,
+)  # fixes that agree with each other for so long are a doubt, and overrule, as in `Ins`
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
 
@@ -94,8 +99,8 @@ class Federated:
         self._common = self._reference.common
         self._state: State | None = None
         self._last_bad = self._last_fused = -math.inf
-        self._refused_since = self._last_refused = -math.inf  # positions, without one fused in between
         self._fused_at = self._remembered_at = -math.inf
+        self._doubts = Doubts(self.locals, config.patience_s, gate.threshold(3))
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
@@ -251,10 +256,12 @@ class Federated:
             report = self._use_part(state, filter_, sample, part, measurement, withheld)
             if part == "gnss_position":
                 if report.weight > 0:
-                    self._last_fused, self._last_refused = sample.t, -math.inf
+                    self._last_fused = sample.t
+                    self._doubts.fused()
                 else:
                     withheld = without_position(Ruling(report.outcome, report.reason))
-                    self._recover(state, sample)
+                if self._doubts.overruled(state, sample, measurement.nu, report):
+                    self._give_in(state, sample)
             reports.append(report)
         return reports
 
@@ -393,24 +400,18 @@ class Federated:
                 self._note(t, filter_, sensor, part, monitor)
         self._start_again(state, filter_, sensor)
 
-    def _recover(self, state: State, sample: Sample) -> None:
-        """Give up positions and velocities when every fix was refused for long."""
+    def _give_in(self, state: State, sample: Sample) -> None:
+        """Believe the fixes: receivers are sound from now on, positions and velocities are given up."""
         config = self.config
-        if sample.t - self._last_refused > REFUSAL_GAP_S:
-            self._refused_since = sample.t
-        self._last_refused = sample.t
-        if sample.t - self._refused_since < config.patience_s:
-            return
         for filter_, local in zip(self.locals, config.locals, strict=True):
             for monitored in local.sensors:
-                if isinstance(monitored.aid, GnssAid) and any(
-                    w.suspect for w in filter_.of_sensor[monitored.aid.sensor]
-                ):
+                monitors = filter_.of_sensor[monitored.aid.sensor]
+                if isinstance(monitored.aid, GnssAid) and any(w.suspect for w in monitors):
                     filter_.monitor(monitored, config.isolate_after, config.readmit_after)
                     for part, monitor in zip(monitored.aid.parts, filter_.of_sensor[monitored.aid.sensor], strict=True):
                         self._note(sample.t, filter_, monitored.aid.sensor, part[0], monitor)
         self._widen(state, sample)
-        self._last_refused = -math.inf
+        self._doubts.fused()
 
     def _widen(self, state: State, sample: Sample) -> None:
         filter_ = self._users[sample.sensor][0]
@@ -426,6 +427,9 @@ class Federated:
                 continue
             for i, share in enumerate(np.tile(self._reset_shares(), self._copies)):
                 forget(state.P[i], start, (nu**2 + np.diag(S)) / share)
+            if part == "gnss_velocity":
+                for local in self.locals:
+                    local.forget_air(state)
 
     # --- the master
 
@@ -487,7 +491,7 @@ class Federated:
         master = self._combine(state, np.ones(len(self.locals)))
         inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
         P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
-        covariance, sigma = spread(P, self.config.mounting_sigma**2)
+        covariance, sigma = spread(doubted(P, self._doubts.off), self.config.mounting_sigma**2)
         imu = state.imu.copy()
         common = ((name, at) for name, at in self.model.slices.items() if at.start < self._common)
         extra = {name: (imu[at], sigma[at]) for name, at in common if name not in REPORTED}

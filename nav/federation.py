@@ -23,7 +23,8 @@ Faults
     When all filters have an isolated part, they are left as they are.
 
     When every position was refused for ``patience_s``, the filters' covariances were too small: their positions and
-    velocities are given up as in `nav.ins`, and the next fixes are believed.
+    velocities are given up as in `nav.ins`, and the next fixes are believed. So they are, as there, after 4 s of fixes
+    that agree with each other where the wind speaks for them (`nav.doubts`).
 
 Which structure finds faults
     With ``no_reset`` a fault stays in its own filter until it is found, but a filter that is alone with a poor IMU

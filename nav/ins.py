@@ -20,7 +20,7 @@ from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState
 from nav.detection import ChiSquareGate, GnssMonitor, Verdict
-from nav.error_model import POS, VEL, ImuModel
+from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
@@ -35,6 +35,7 @@ from nav.reference import (
     Reference,
     align,
     describe,
+    doubted,
     forget,
     nothing_known,
     spread,
@@ -122,6 +123,8 @@ class Ins:
         self._monitor = GnssMonitor(
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
+        self._winds = self._filter.wind_memory()
+        self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
@@ -243,12 +246,17 @@ class Ins:
         )
         threshold = self._gate.threshold(3)
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
-        verdict = self._monitor.judge(replace(sample, sigma_position_n=sigma_p), v_n, sigma_v, nis <= threshold)
+        odds = self._filter.odds(self._winds, state, v_n, sample.t) if nis > threshold else 0.0
+        verdict = self._monitor.judge(replace(sample, sigma_position_n=sigma_p), v_n, sigma_v, nis <= threshold, odds)
+        self._doubt[:] = 0.0
+        if self._monitor.contradicted:
+            self._doubt[POS : POS + 3], self._doubt[VEL : VEL + 3] = nu, v_n - state.v_n
         use_velocity = with_velocity and aid.use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]
         if verdict is Verdict.FUSE:
+            self._filter.remember_wind(self._winds, state, sample.t)
             ruling = self._filter.weigh(self._reference, state, sample, "gnss_position", measurement, S)
         elif verdict is Verdict.RECOVER:
             wide = self._filter.measure(self._reference, state, aid, "gnss_position", sample)
@@ -271,7 +279,7 @@ class Ins:
     ) -> None:
         """Make the covariance as wide as the innovation says; the rest of the state keeps what it knows.
 
-        When velocity is off as well, it goes too, and with it the wind that was estimated from it.
+        When velocity is off as well, it goes too, and with it wind and gusts that were estimated from it.
         """
         P = state.P[0]
         if use_velocity:
@@ -281,9 +289,7 @@ class Ins:
             S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, velocity.at_points)
             if not nis <= self._gate.threshold(3):
                 forget(P, VEL, nu_v**2 + np.diag(S_v))
-                wind = self.model.start("wind")
-                if wind >= 0:
-                    forget(P, wind, self.model.sigma[wind : wind + 2] ** 2)
+                self._filter.forget_air(state)
         forget(P, POS, nu**2 + np.diag(S))
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
@@ -297,6 +303,6 @@ class Ins:
         self._reference.settle(state)
         P, x = state.P[0], state.x[0].copy()
         x[: len(state.imu)] = state.imu
-        covariance, sigma = spread(P, self.config.mounting_sigma**2)
+        covariance, sigma = spread(doubted(P, self._doubt), self.config.mounting_sigma**2)
         extra = {name: (x[where], sigma[where]) for name, where in self._extra}
         return describe(state, x, P, self.model, t, status, covariance, sigma, extra)

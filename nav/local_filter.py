@@ -14,12 +14,13 @@ import numpy as np
 
 from nav import unscented
 from nav._jit import njit
+from nav.aids.airspeed import AirspeedAid
 from nav.aids.base import FUSED, OUTSIDE, Aid, Measurement, OperatingPoint, Ruling, aid_blocks, report_on
-from nav.detection import ChiSquareGate, Mask
-from nav.error_model import MOTION, ErrorModel, ImuModel, sensor_errors
+from nav.detection import ChiSquareGate, Mask, WindMemory
+from nav.error_model import MOTION, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid
-from nav.reference import Reference, remove_open
+from nav.reference import Reference, forget, remove_open
 from nav.samples import Array, Outcome, Sample, UpdateReport
 from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
@@ -73,6 +74,37 @@ class LocalFilter:
                 self.noises[part] = noise
             if rest is not None:
                 self.policies[part] = rest
+
+    def wind_memory(self) -> WindMemory | None:
+        """An empty memory of the wind that this filter estimates, None when it estimates none."""
+        aid = next((aid for aid in self.aids.values() if isinstance(aid, AirspeedAid)), None)
+        return None if aid is None else WindMemory(aid.wind_walk, aid.gust_sigma)
+
+    def remember_wind(self, memory: WindMemory | None, state: State, t: float) -> None:
+        """Put the mean wind into the ``memory``, if there is one."""
+        if memory is not None:
+            wind = self.model.slices["wind"]
+            memory.remember(t, state.x[self.row, wind], state.P[self.row].diagonal()[wind])
+
+    def odds(self, memory: WindMemory | None, state: State, v_n: Array, t: float) -> float:
+        """What the ``memory`` of the wind says for a velocity (3,) against this filter's own: `WindMemory.odds`."""
+        if memory is None:
+            return 0.0
+        own = state.x[self.row]
+        v_own = state.v_n if self.closed else state.v_n + own[VEL : VEL + 3]
+        air = own[self.model.slices["wind"]].copy()
+        if "gust" in self.model.slices:
+            air += own[self.model.slices["gust"]]
+        return memory.odds(t, air, (v_n - v_own)[:2])
+
+    def forget_air(self, state: State) -> None:
+        """Give wind and gusts, if there are any, the variances that they began with."""
+        for name in ("wind", "gust"):
+            where = self.model.slices.get(name)
+            if where is not None:
+                forget(state.P[self.row], where.start, self.model.sigma[where] ** 2)
+        if "gust" in self.model.slices:
+            state.x[self.row, self.model.slices["gust"]] = 0.0
 
     def _noise(self, sensor: str, part: str) -> SageHusa | None:
         """What learns the variances of one part of a sensor's samples."""

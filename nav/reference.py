@@ -285,6 +285,18 @@ def forget(P: Array, start: int, variance: Array) -> None:
     P[block, block] = np.diag(variance)
 
 
+def doubted(P: Array, off: Array) -> Array:
+    """The covariance of a motion that is off by ``off`` (9,) or right, nobody knows which: half of its square on top.
+
+    That is the second moment about the estimate where both are as likely. Zeros give ``P`` itself.
+    """
+    if not off.any():
+        return P
+    P = P.copy()
+    P[:MOTION, :MOTION] += 0.5 * np.outer(off, off)
+    return P
+
+
 def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str) -> tuple[Array, Array]:
     """Bias of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
     bias = model.slices[f"{sensor}_bias"]

@@ -20,8 +20,10 @@ from nav.detection.gnss import GnssMonitor, Verdict
 from nav.detection.means import Mean, RunningMean, WindowMean, exponential, plain
 from nav.detection.sequential import Evidence, Quadratic, Recursive, Reset, SampleTest, Sprt
 from nav.detection.snapshot import ChiSquare, ChiSquareGate, Eraim, Never, w_tests
+from nav.detection.witness import SURE, WindMemory
 
 __all__ = [
+    "SURE",
     "ChiSquare",
     "ChiSquareGate",
     "Decision",
@@ -41,6 +43,7 @@ __all__ = [
     "SampleTest",
     "Sprt",
     "Verdict",
+    "WindMemory",
     "WindowMean",
     "chi_square_threshold",
     "exponential",

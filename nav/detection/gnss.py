@@ -8,6 +8,7 @@ from enum import Enum, auto
 
 import numpy as np
 
+from nav.detection.witness import SURE
 from nav.earth import displacement_n
 from nav.samples import Array, GnssSample
 
@@ -34,7 +35,8 @@ class GnssMonitor:
     rejected, and only a streak that stays outside for ``patience_s`` is believed against the filter. After an outage of
     ``outage_s`` the filter's covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
     has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
-    ``recovery_s`` the streak is believed.
+    ``recovery_s`` the streak is believed. So it is without an outage where the wind is a witness that the filter was
+    led astray (`nav.detection.witness`), as when a spoofer lets go.
     """
 
     outage_s: float
@@ -43,6 +45,7 @@ class GnssMonitor:
     patience_s: float
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
+    contradicted: bool = False  # by the latest fixes, which agree with each other and lie outside the gate
     _streak_start: float = math.nan
     _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
     _heard: float = math.nan  # when the last of them was
@@ -55,21 +58,25 @@ class GnssMonitor:
             self._interval = min(self._interval, t - self._heard)
         self._heard = t
 
-    def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool) -> Verdict:
-        """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate."""
+    def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool, odds: float = 0.0) -> Verdict:
+        """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate.
+
+        ``odds`` are those for the fix against the filter by what else is known [nats].
+        """
         self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
             self._streak_start = fix.t
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
-        wait = self.patience_s if self._was_aided else self.recovery_s
+        wait = self.patience_s if self._was_aided and odds < SURE else self.recovery_s
         if not self._was_aided and lasted < self.probation_s:
             verdict = Verdict.PROBATION
         elif inside_gate:
             verdict = Verdict.FUSE
         else:
             verdict = Verdict.RECOVER if lasted >= wait else Verdict.REJECT
+        self.contradicted = verdict is Verdict.REJECT and lasted >= self.probation_s
         if verdict in (Verdict.FUSE, Verdict.RECOVER):
             self.last_fused = fix.t
             self._was_aided = True
@@ -84,11 +91,15 @@ class GnssMonitor:
         if self._previous is None:
             return False
         before, v0_n = self._previous
-        dt = fix.t - before.t
-        if dt > self._longest_gap():
-            return False
-        moved = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
-        jump = moved - 0.5 * dt * (v0_n + v_n)
-        variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
-        variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
-        return float(np.sum(jump * jump / variance)) <= self.consistency_gate
+        return (
+            fix.t - before.t <= self._longest_gap() and jump(before, fix, v0_n + v_n, sigma_v) <= self.consistency_gate
+        )
+
+
+def jump(before: GnssSample, fix: GnssSample, velocities: Array, sigma_v: Array) -> float:
+    """Squared distance, chi-square of three, of a fix from where the one before and both velocities' sum say [m/s]."""
+    dt = fix.t - before.t
+    off = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h) - 0.5 * dt * velocities
+    variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
+    variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
+    return float(np.sum(off * off / variance))

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import chi2
 from worlds.covariances import lost_position, position_and_its_error, scaled_eigenvalues
 from worlds.federated import DETECTORS, differ, field, fly, horizontal, ramp, three, true_start, world
-from worlds.ins import CONSUMER, DEG, DT, error, feed, gnss
+from worlds.ins import CONSUMER, DEG, DT, airspeed, error, feed, gnss
 
-from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.detection import Decision, Event
 from nav.error_model import POS
 from nav.federated import Federated
@@ -409,6 +409,23 @@ def test_the_single_filter_follows_the_spoofer():
         config = InsConfig(CONSUMER, (GnssAid(), BarometerAid(), MagnetometerAid()), false_rejection=false_rejection)
         estimates, _ = feed(FusionHorizon(Ins(config, field)), increments, spoofed + others)
         assert max(horizontal(estimates, truth, 50).values()) > 50
+
+
+@pytest.mark.ci
+def test_when_a_spoofer_lets_go_of_the_only_receiver_the_wind_speaks_for_it():
+    """Off by 90 m and 3 m/s at the end: back within 10 s, never much farther off, and not sure of being elsewhere."""
+    truth, increments, one, _, others = world(160)
+    others = others + airspeed(truth, np.random.default_rng(3))
+    spoofed = accelerating(one, 60, 120, 0.05)
+    first, _, air = three()
+    pitot = MonitoredAid(AirspeedAid(sideslip_sigma=None))
+    config = Config(CONSUMER, (first, Local("air", (*air.sensors, pitot))), structure="full_reset")
+    _, estimates, _ = fly(config, spoofed + others, increments, 0.2)
+    off = horizontal(estimates, truth, 50)
+    assert max(distance for t, distance in off.items() if t > 120) < off[119.8] + 10 * 3
+    assert max(distance for t, distance in off.items() if t > 130) < 5.0
+    claimed = {round(e.t, 3): math.sqrt(e.covariance[0, 0] + e.covariance[1, 1]) for e in estimates}
+    assert all(claimed[t] > off[t] / 3 for t in off if t > 121.2)
 
 
 @pytest.mark.ci

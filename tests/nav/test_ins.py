@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from worlds.ins import (
     CONSUMER,
     DEG,
@@ -24,7 +25,7 @@ from worlds.ins import (
 
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.alignment import InitialState
-from nav.detection import GnssMonitor, Verdict
+from nav.detection import SURE, GnssMonitor, Verdict, WindMemory
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
@@ -128,8 +129,9 @@ def test_covariance_period_loses_nothing(period):
     assert (np.abs(difference) < 0.02 * sigma).all()
 
 
-def moved(fix, north_m):
-    return dataclasses.replace(fix, lat=fix.lat + north_m / 6.37e6)
+def moved(fix, north_m, east_m=0.0):
+    east = east_m / (6.37e6 * math.cos(fix.lat))
+    return dataclasses.replace(fix, lat=fix.lat + north_m / 6.37e6, lon=fix.lon + east)
 
 
 def aided(samples, seconds, config=CONFIG, seed=4, duration=120):
@@ -216,6 +218,53 @@ def test_a_lasting_jump_is_believed_only_after_patience():
     fused = [r.t for r in reports if r.t >= 60 and r.weight == 1]
     assert 79.5 < fused[0] < 81
     assert len(fused) > 150
+
+
+def dragged(fixes, start, stop, acceleration):
+    """Eastwards from the true position away, with the velocity that belongs to it."""
+
+    def one(fix):
+        tau = fix.t - start
+        if not 0 <= tau < stop - start:
+            return fix
+        v_n = fix.v_n + np.array([0.0, acceleration * tau, 0.0])
+        return moved(dataclasses.replace(fix, v_n=v_n), 0.0, 0.5 * acceleration * tau**2)
+
+    return [one(fix) for fix in fixes]
+
+
+@pytest.mark.ci
+def test_when_a_spoofer_lets_go_the_wind_speaks_for_the_genuine_fixes():
+    """Off by 90 m and 3 m/s at the end: believed after `recovery_s`, claimed as far off as it is before that."""
+    truth = flight(160)
+    increments, fixes, others = everything(truth, np.random.default_rng(5))
+    estimates, _ = feed(FusionHorizon(Ins(CONFIG, field)), increments, dragged(fixes, 60, 120, 0.05) + others, 0.2)
+    estimates = [e for e in estimates if e.t > 50]
+    off = {round(e.t, 3): np.hypot(*error(e, truth)[:2]) for e in estimates}
+    claimed = {round(e.t, 3): math.sqrt(e.covariance[0, 0] + e.covariance[1, 1]) for e in estimates}
+    assert 80 < off[119.8] < 95
+    assert max(distance for t, distance in off.items() if t > 120) < off[119.8] + 4.4 * 3
+    assert max(distance for t, distance in off.items() if t > 124.6) < 5.0
+    assert all(claimed[t] > off[t] / 3 for t in off if 121.2 < t < 124)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("velocity", [0.0, 6.0])
+def test_a_receiver_that_jumps_away_for_a_while_is_not_followed(velocity):
+    """Twenty seconds 60 m off, with its own velocity or another: it says nothing that the wind would bear out."""
+
+    def away(fix):
+        if not 100 <= fix.t < 120:
+            return fix
+        v_n = fix.v_n + np.array([0.0, velocity, 0.0])
+        return moved(dataclasses.replace(fix, v_n=v_n), 60.0, velocity * (fix.t - 100))
+
+    truth = flight(160)
+    increments, fixes, others = everything(truth, np.random.default_rng(6))
+    ins = Ins(CONFIG, field)
+    estimates, reports = feed(FusionHorizon(ins), increments, [away(fix) for fix in fixes] + others, 0.2)
+    assert all(r.weight == 0 for r in reports if r.aid == "gnss_position" and 100 <= r.t < 120)
+    assert max(np.hypot(*error(e, truth)[:2]) for e in estimates if e.t > 60) < 5.0
 
 
 @pytest.mark.ci
@@ -385,3 +434,38 @@ def test_an_outage_right_after_the_first_fix_is_one():
     for k in range(2, 200):
         monitor.heard(0.2 * k)
     assert judged(40.0) is Verdict.PROBATION
+
+
+@pytest.mark.parametrize(("odds", "after"), [(5.0, 4.0), (0.0, 30.0), (-5.0, 30.0)])
+def test_fixes_that_contradict_the_filter_are_believed_sooner_where_something_speaks_for_them(odds, after):
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma = np.full(3, 1.0)
+    believed, contradicted = None, []
+    for k in range(1, 200):
+        t = 0.2 * k
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        if monitor.judge(fix, np.zeros(3), 0.1 * sigma, False, odds) is Verdict.RECOVER:
+            believed = t
+            break
+        contradicted.append(monitor.contradicted)
+    assert believed == pytest.approx(after + 0.2, abs=0.21)
+    assert not any(contradicted[:4])
+    assert all(contradicted[6:])
+
+
+def test_the_wind_speaks_for_who_brings_it_back_to_what_it_was():
+    """Against the ratio of two normal densities; nothing is said where velocities agree, or nothing is remembered."""
+    memory = WindMemory(walk=0.02, gust=0.8)
+    before, air, change = np.array([2.0, 5.0]), np.array([4.0, 9.0]), np.array([-2.2, -3.5])
+    assert memory.odds(300.0, air, change) == 0.0
+    memory.remember(100.0, before, np.array([0.09, 0.16]))
+    memory.remember(105.0, air, np.zeros(2))  # too soon to be remembered
+    sigma = np.sqrt(np.array([0.09, 0.16]) + 0.8**2 + 0.02**2 * 200)
+    expected = norm.logpdf(air + change, before, sigma).sum() - norm.logpdf(air, before, sigma).sum()
+    assert memory.odds(300.0, air, change) == pytest.approx(expected)
+    assert expected > SURE
+    assert memory.odds(300.0, air + change, -change) == pytest.approx(-expected)
+    assert memory.odds(300.0, air, np.zeros(2)) == 0.0
+    memory.remember(801.0, air, np.zeros(2))
+    assert memory.odds(801.0, air, change) < 0.0  # the first is forgotten
