@@ -11,8 +11,9 @@ of correlation time tau, driven by accelerations of the spectral density S, so t
 
     v(t + T) - r v(t) = noise of variance S tau (1 - r^2) / 2
 
-An estimate of v, driven by f, is an error state: delta v' = g [phi_E, -phi_N]. S follows the variance of the specific
-force in the last seconds, about its mean, so that a tilt does not make itself believed an acceleration. The magnetic
+An estimate of v, driven by f, is an error state: delta v' = g [phi_E, -phi_N]. S follows the variance of the smoothed
+specific force in the last seconds, about its mean, so that a tilt does not make itself believed an acceleration; where
+airspeed tells nothing, a lasting turn may hide more. The magnetic
 field turns the heading alone; it is used while its size and dip are those of the last minutes. At rest the gyros show
 their biases. All that is found is corrected at once.
 
@@ -36,6 +37,7 @@ from nav.samples import Array, Outcome, UpdateReport
 
 REST_GATE = 16.3  # chi-square of three, 99.9 %
 MOST_TILT = math.radians(60)  # claimed of a first levelling
+STEEPEST = 0.05  # a field with less of it level points nowhere
 FORCE = 0.5, 2.0  # in g: a body that feels less or more than this is not levelled at first
 
 
@@ -49,12 +51,12 @@ class AnyMotionLevelling:
         self, config: AhrsConfig, told: AnyMotion, further: FurtherStates, g: float, earth_n: Array, H_heading: Array
     ) -> None:
         self.config, self.told = config, told
-        self._velocity = further.velocity
+        self._further, self._velocity = further, further.velocity
         self._g, self._earth_n = g, earth_n
         self._H_heading = H_heading
-        n = STATES + further.count
-        self._gain_n = np.zeros((2, n))  # of velocity by tilt [m/s^2]
-        self._gain_n[0, PHI + 1], self._gain_n[1, PHI] = g, -g
+        self._lasting_s = (
+            4 * told.acceleration_smoothing_s
+        )  # density over variance: twice that of white noise, smoothed
 
     def tilt_variance(self, f_n: Array, rate: float, compensated: bool) -> float:
         """Of a first levelling by a mean specific force (3,), turning at ``rate`` [rad/s]; NaN when it shows none."""
@@ -73,24 +75,43 @@ class AnyMotionLevelling:
     ) -> tuple[Array, Array]:
         """``H`` (2, n) with the velocity's columns and R (2,) of the mean horizontal specific force over ``T`` [s].
 
-        ``acceleration`` [m/s^2] is what was seen of it lately, horizontal rms.
+        ``acceleration`` [m/s^2] is what is expected of it, as `acceleration` says.
         """
         told, tau = self.told, self.told.velocity_correlation_s
         kept = math.exp(-T / tau)
-        density = told.least_acceleration_density + 0.5 * acceleration**2 * told.acceleration_correlation_s
+        density = told.least_acceleration_density + self._lasting_s * acceleration**2
         variance = 0.5 * density * tau * (1 - kept**2) + self.config.imu.accel_noise**2 * T
         if compensated:
             variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b) * told.airspeed_error_s * T
         H[:, self._velocity] += np.eye(2) * ((1 - kept) / T)
         return H, np.full(2, variance / T**2)
 
-    def watch(self, s: State, f_n: Array, T: float) -> None:
-        """Follow mean and variance of the horizontal specific force ``f_n`` (2,) [m/s^2]."""
+    def watch(self, s: State, f_n: Array, omega_b: Array, T: float) -> None:
+        """Follow the horizontal specific force ``f_n`` (2,) [m/s^2] and the rate ``omega_b`` (3,) [rad/s]."""
+        m, told = s.in_motion, self.told
+        smoothing, memory, turning = (
+            -math.expm1(-T / time)
+            for time in (told.acceleration_smoothing_s, told.acceleration_memory_s, told.turn_memory_s)
+        )
+        m.force_n += smoothing * (f_n - m.force_n)
+        m.mean_force_n += memory * (m.force_n - m.mean_force_n)
+        beside = m.force_n - m.mean_force_n
+        m.force_variance += memory * (0.5 * float(beside @ beside) - m.force_variance)
+        m.turn_rate += turning * (float(dcm_from_quat(s.q_nb)[2] @ omega_b) - m.turn_rate)
+        m.rate_square += turning * (float(omega_b @ omega_b) - m.rate_square)
+
+    def acceleration(self, s: State, compensated: bool) -> float:
+        """What to expect of horizontal acceleration, rms of an axis [m/s^2]: what varies, and unless airspeed tells it
+        what a lasting turn may hide.
+
+        A turn of the rate w at the speed v accelerates by v w in a direction that lasts for 1 / w: a density of
+        2 v^2 w. It is believed in by the share of w^2 in the mean square of the rate: a hand swings, and does not turn.
+        """
         m = s.in_motion
-        share = -math.expm1(-T / self.told.acceleration_memory_s)
-        m.acceleration_n += share * (f_n - m.acceleration_n)
-        beside = f_n - m.acceleration_n
-        m.acceleration_variance += share * (0.5 * float(beside @ beside) - m.acceleration_variance)
+        hidden = 0.0
+        if not compensated and m.rate_square > 0:
+            hidden = 2 * self.told.unknown_speed**2 * abs(m.turn_rate) ** 3 / m.rate_square
+        return math.sqrt(m.force_variance + hidden / self._lasting_s)
 
     def unexplained(self, s: State, f_n: Array, T: float) -> Array:
         """What of the mean horizontal specific force (2,) the decay of the velocity does not explain."""
@@ -100,24 +121,26 @@ class AnyMotionLevelling:
     def move(self, s: State, f_n: Array, T: float) -> None:
         """Take velocity and its error states over a period with the mean horizontal specific force (2,)."""
         s.in_motion.velocity_n += f_n * T
-        whole = np.eye(len(s.x))
-        whole[self._velocity] += self._gain_n * T
+        gain = np.zeros_like(s.P)
+        self._further.drive(gain)
+        whole = np.eye(len(s.x)) + T * gain
         s.x[:] = whole @ s.x
         s.P[:] = whole @ s.P @ whole.T
 
-    def _undisturbed(self, s: State, field_n: Array, T: float) -> bool:
-        """Whether size and dip of a field (3,) are the usual ones, which follow it slowly then; or have come to be."""
+    def _undisturbed(self, s: State, seen: Array, T: float) -> bool:
+        """Whether a field (2,), level and down, is the usual one, which follows it slowly then; or has come to be."""
         m, told = s.in_motion, self.told
-        level = math.hypot(field_n[0], field_n[1])
-        seen = np.array([math.hypot(level, field_n[2]), math.atan2(field_n[2], level)])
+        if not seen[0] > STEEPEST * math.hypot(*seen):
+            return False
         if math.isnan(m.field[0]):
             m.field = seen
-        share = min(T / told.field_memory_s, 1.0)
-        if self._alike(seen, m.field):
+        m.field_s = min(m.field_s + T, told.field_memory_s)
+        share = T / m.field_s
+        if self._alike(seen, m.field, s):
             m.other_s = 0.0
             m.field = m.field + share * (seen - m.field)
             return True
-        if m.other_s > 0 and self._alike(seen, m.other):
+        if m.other_s > 0 and self._alike(seen, m.other, s):
             m.other = m.other + share * (seen - m.other)
         else:
             m.other, m.other_s = seen, 0.0
@@ -126,25 +149,37 @@ class AnyMotionLevelling:
             m.field, m.other_s = m.other, 0.0
         return False
 
-    def _alike(self, seen: Array, usual: Array) -> bool:
-        size, dip = np.abs(seen - usual).tolist()
-        return bool(size <= self.told.field_tolerance * usual[0] and dip <= self.told.dip_tolerance)
+    def _alike(self, seen: Array, usual: Array, s: State) -> bool:
+        """Whether two fields are of the same size and dip, as nearly as the tilt is known."""
+        (size, dip), (usual_size, usual_dip) = ((math.hypot(*one), math.atan2(one[1], one[0])) for one in (seen, usual))
+        told = self.told
+        return (
+            abs(size - usual_size) <= told.field_tolerance * usual_size and abs(dip - usual_dip) <= told.dip_tolerance
+        )
 
     def turn(self, s: State, z: float, variance: float, t: float, field_n: Array, T: float) -> UpdateReport:
         """Take the heading ``z`` [rad] of a mean field (3,) for what it is, unless the field is disturbed.
 
-        It moves heading and the gyros' bias about the vertical, no other state; the covariance is that of the gain that
-        is used (Joseph's form).
+        A disturbance shows by two of its three components, level along the field and down; the third, which turns the
+        heading, is taken for as large as either (half of the sum of their squares), and as noise that lasts (twice its
+        time over the period) adds to the ``variance`` of the mean. The heading
+        moves heading and the gyros' bias about the vertical, no other state; the covariance is that of the gain that is
+        used (Joseph's form).
         """
-        H = self._H_heading
+        seen = np.array([math.hypot(field_n[0], field_n[1]), field_n[2]])
+        undisturbed = self._undisturbed(s, seen, T)
+        H, R = self._H_heading, variance
+        if undisturbed:
+            beside = (seen - s.in_motion.field) / seen[0]
+            R += float(beside @ beside) * self.told.disturbance_s / T
         PH = s.P @ H[0]
-        S = float(H[0] @ PH) + variance
+        S = float(H[0] @ PH) + R
         nu = z - float(H[0] @ s.x)
         report = UpdateReport(
             t, s.in_motion.sensor, MAGNETIC_HEADING, np.array([nu]), np.array([[S]]), nu * nu / S, math.inf, 1.0,
             Outcome.FUSED,
         )  # fmt: skip
-        if not self._undisturbed(s, field_n, T):
+        if not undisturbed:
             return replace(report, weight=0.0, outcome=Outcome.OUTSIDE_GATE, reason="the field is disturbed")
         gain = np.zeros(len(s.x))
         gain[PHI + 2] = PH[PHI + 2] / S
@@ -152,7 +187,7 @@ class AnyMotionLevelling:
         gain[BIAS:STATES] = down_b * float(down_b @ PH[BIAS:STATES]) / S
         s.x += gain * nu
         rest = np.eye(len(s.x)) - gain[:, None] * H
-        s.P[:] = rest @ s.P @ rest.T + variance * gain[:, None] * gain
+        s.P[:] = rest @ s.P @ rest.T + R * gain[:, None] * gain
         return report
 
     def rest(self, s: State, T: float) -> None:

@@ -36,21 +36,23 @@ class AnyMotion:
     """
 
     velocity_correlation_s: float = 4.0  # how long a velocity lasts that nothing on board tells
-    acceleration_correlation_s: float = 0.8  # over which the means of a period count as one
-    acceleration_memory_s: float = 2.0  # time over which accelerations are measured
+    acceleration_smoothing_s: float = 0.5  # quicker accelerations average out by themselves
+    acceleration_memory_s: float = 4.0  # time over which accelerations are measured
     least_acceleration_density: float = 1e-3  # of horizontal accelerations, where none are seen [(m/s^2)^2 s]
     airspeed_error_s: float = 1.0  # how long ``airspeed_sigma`` has one sign
     gyro_share: float = 3e-3  # of the rate of turn that is an error, by misalignment and scale, over a second
-    unknown_speed: float = 10.0  # at which the body may be turning while it is first levelled [m/s]
+    unknown_speed: float = 15.0  # at which the body may be turning where airspeed does not tell [m/s]
+    turn_memory_s: float = 8.0  # time over which a turn is told from a swing
 
     field_tolerance: float = 0.1  # of the size of the magnetic field: further off it tells no heading
     dip_tolerance: float = 6 * DEG
+    disturbance_s: float = 10.0  # how long what disturbs the field lasts
     field_memory_s: float = 20.0  # time over which size and dip are learned
     field_patience_s: float = 20.0  # time after which another field that stays is taken for the right one
 
     rest_rate: float = 0.5 * DEG  # by how much rates vary over a period at rest, beside the gyros' noise [rad/s]
     rest_force: float = 0.1  # the same of specific force [m/s^2]
-    rest_periods: int = 4  # that have to be quiet in a row
+    rest_periods: int = 8  # that have to be quiet in a row
     rest_sigma: float = 0.03 * DEG  # of a second's mean rate, taken for bias [rad/s]
 
 
@@ -98,7 +100,7 @@ class AhrsConfig:
 
     def in_any_motion(self, told: AnyMotion | None = None) -> AhrsConfig:
         """The same that levels whatever the body does (`nav.ahrs.any_motion`): the one configuration for all bodies."""
-        return replace(self, period_s=0.4, tilt_sigma=3 * DEG, any_motion=told or AnyMotion())
+        return replace(self, period_s=0.2, tilt_sigma=3 * DEG, any_motion=told or AnyMotion())
 
     def __post_init__(self) -> None:
         unknown = set(self.aids) - set(KINDS.values())

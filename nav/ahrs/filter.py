@@ -288,10 +288,12 @@ class Ahrs:
     def _level_in_motion(self, s: State, how: AnyMotionLevelling, t: float, reports: list[UpdateReport]) -> None:
         """Level by what a period of any motion shows, turn by the field's mean, and correct all that was found."""
         T = float(s.elapsed[1])
+        if T == 0.0:
+            return
         f_n, compensated = self._steady_force(s, t)
         omega_b = s.angle / T - s.gyro_bias
-        how.watch(s, f_n[:2], T)
-        acceleration = math.sqrt(2 * s.in_motion.acceleration_variance)
+        how.watch(s, f_n[:2], omega_b, T)
+        acceleration = how.acceleration(s, compensated)
         s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
         s.mode_counter += 1
         H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, T)
@@ -314,7 +316,7 @@ class Ahrs:
         """H (2, n) and R (2,) of a levelling at the attitude ``q_nb`` and the rate ``omega_b``, with the acceleration
         taken off or without.
 
-        In any motion also by the horizontal ``acceleration`` seen of late [m/s^2], rms, and the period ``T`` [s].
+        In any motion also by the horizontal ``acceleration`` expected [m/s^2], rms of an axis, over ``T`` [s].
         """
         variance = self.config.force_sigma**2
         if compensated:

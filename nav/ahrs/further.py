@@ -8,6 +8,7 @@ import numpy as np
 
 from nav.ahrs.config import AhrsConfig
 from nav.ahrs.state import PHI, STATES
+from nav.earth import gravity
 from nav.rotation import dcm_from_quat
 from nav.samples import Array
 
@@ -48,6 +49,7 @@ class FurtherStates:
         ratio = config.gust_correlation_s / config.period_s
         power = 2 * config.gust_sigma**2 * ratio
         variance = power * (1 + ratio * math.expm1(-1 / ratio))
+        self._g = float(gravity(config.lat, config.h))
         velocity = 0.0 if config.any_motion is None else VELOCITY_SIGMA
         sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance), velocity
         sizes = [len(names) if sigma > 0 else 0 for names, sigma in zip(NAMES, sigmas, strict=True)]
@@ -81,6 +83,12 @@ class FurtherStates:
         """
         if self.misalignment.stop > self.misalignment.start:
             whole[PHI : PHI + 3, self.misalignment] = turned * yaw_rate
+
+    def drive(self, F: Array) -> None:
+        """Put what tilt makes of the velocity into the system matrix ``F`` (n, n) [1/s]."""
+        if self.velocity.stop > self.velocity.start:
+            north, east = range(self.velocity.start, self.velocity.stop)
+            F[north, PHI + 1], F[east, PHI] = self._g, -self._g
 
     def columns(self, H: Array, q_nb: Array) -> None:
         """Put theirs into ``H`` (2, n) of the mean horizontal specific force of a body at the attitude ``q_nb``."""

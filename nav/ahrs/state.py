@@ -21,12 +21,16 @@ class InMotion:
     """What `nav.ahrs.any_motion` keeps in mind: velocity, accelerations, the magnetic field, rest."""
 
     velocity_n: Array  # (2,) north and east, beside what airspeed tells
-    acceleration_n: Array  # (2,) mean of the last seconds
-    acceleration_variance: float  # about that mean, of one axis
+    force_n: Array  # (2,) horizontal specific force, smoothed [m/s^2]
+    mean_force_n: Array  # (2,) its mean of the last seconds
+    force_variance: float  # about that mean, of one axis
+    turn_rate: float  # about the vertical, mean of the last seconds [rad/s]
+    rate_square: float  # of the rate about any axis, mean of the last seconds
     fields: int  # samples in `State.field_n` since the period began
     sensor: str  # whose they are
-    field: Array  # (2,) size and dip that count as undisturbed, NaN before the first
-    other: Array  # (2,) of a field that may replace it
+    field: Array  # (2,) level and downward part of what counts as the undisturbed field [T], NaN before the first
+    field_s: float  # for how long it has been learned
+    other: Array  # (2,) the same of a field that may replace it
     other_s: float  # for how long that has been seen
     quiet: int  # periods in a row
 
@@ -92,7 +96,21 @@ def fresh(period_end: float, n: int) -> State:
         force=np.zeros(3),
         elapsed=np.zeros(3),
         sums=np.zeros((3, 3)),
-        in_motion=InMotion(np.zeros(2), np.zeros(2), 0.0, 0, "", UNKNOWN[:2], UNKNOWN[:2], 0.0, 0),
+        in_motion=InMotion(
+            velocity_n=np.zeros(2),
+            force_n=np.zeros(2),
+            mean_force_n=np.zeros(2),
+            force_variance=0.0,
+            turn_rate=0.0,
+            rate_square=0.0,
+            fields=0,
+            sensor="",
+            field=UNKNOWN[:2],
+            field_s=0.0,
+            other=UNKNOWN[:2],
+            other_s=0.0,
+            quiet=0,
+        ),
     )
 
 

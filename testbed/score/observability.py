@@ -145,12 +145,15 @@ def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visi
     compensated = "airspeed" in ahrs.config.aids
     further, n = ahrs.further, STATES + ahrs.further.count
     F, measurements = np.tile(np.diag(np.concatenate([np.zeros(STATES), -further.decay_rate])), (len(level), 1, 1)), []
+    own = f"estimators/{name}"
+    seen = np.interp(way.middle, column(dataset, f"{own}/time"), column(dataset, f"{own}/judged_acceleration").ravel())
     for k, q_nb in enumerate(way.q_nb):
         earth_n = earth_rate_n(float(way.lla[k, 0]))
         C_nb = dcm_from_quat(q_nb)
         F[k, :3, :STATES] = transition(C_nb, earth_n, 1.0) - np.eye(3, STATES)
         further.turn(F[k], C_nb, way.omega_b[k, 2])
-        levelling = (*ahrs.level_measurement(q_nb, way.omega_b[k], compensated), level[k])
+        further.drive(F[k])
+        levelling = (*ahrs.level_measurement(q_nb, way.omega_b[k], compensated, float(seen[k])), level[k])
         measurements.append(_stacked([levelling, (*ahrs.heading_measurement, heading[k])], n))
     names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
     names += further.names

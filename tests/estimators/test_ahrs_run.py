@@ -18,7 +18,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from worlds.lanes import lanes
 
-from nav.ahrs import Ahrs
+from nav.ahrs import Ahrs, AnyMotion
 from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
@@ -75,6 +75,10 @@ def config(*chosen: str, overrides: tuple[str, ...] = ()) -> Any:
         ('{name="a", aids=["gnss"], level={}}', "level: is a key of kind 'ahrs', not of 'ins'"),
         ('{name="a", kind="ahrs", aids=[], heading_deg=0, level={test="nrm"}}', 'level.test: can\'t be "nrm"'),
         ('{name="a", kind="ahrs", aids=[], heading_deg=3, literal=true}', "literal: unknown key"),
+        (
+            '{name="a", kind="ahrs", aids=[], heading_deg=3, profile="any_motion", level={}}',
+            'level: says how profile "jiang2021" levels',
+        ),
         ('{name="a", kind="ahrz", aids=[]}', 'kind: there is no kind "ahrz": did you mean ahrs'),
     ],
 )
@@ -107,6 +111,14 @@ def test_it_is_told_how_to_level() -> None:
     told = config(AHRS.replace("}", f", level={{{keys}}}}}"))
     assert told.motion == told.compensated_motion == LowDynamics(0.5, math.radians(1), math.radians(3), "vector")
     assert (told.force_sigma, told.phi_limit, told.gyro_bias_feedback) == (0.2, math.radians(0.4), True)
+
+
+def test_it_is_told_to_level_in_any_motion() -> None:
+    told, house = config(AHRS.replace("}", ', profile="any_motion"}')), config(AHRS)
+    assert house.any_motion is None
+    assert told.any_motion == AnyMotion()
+    assert told.imu.gyro_bias_walk < house.imu.gyro_bias_walk  # turns widen the attitude's noise instead
+    assert told.magnetometer_sigma == house.magnetometer_sigma
 
 
 # --- a run

@@ -172,11 +172,13 @@ def test_one_filter_of_all_aids_stands_for_a_federation() -> None:
 def test_an_ahrs_never_sees_its_heading_without_a_magnetometer() -> None:
     estimators = (
         '{name="plain",kind="ahrs",aids=["airspeed"],heading_deg=30},{name="magnetic",kind="ahrs",aids=["airspeed","magnetometer"]},'
-        '{name="gyros",kind="ahrs",aids=[],heading_deg=30,levelling=false}'
+        '{name="gyros",kind="ahrs",aids=[],heading_deg=30,levelling=false},'
+        '{name="any",kind="ahrs",aids=["airspeed","magnetometer"],profile="any_motion"}'
     )
     found = seen(Scenario.load("kinematic_u_flight", [*overridden(estimators), "duration_s=60"]))
-    assert list(found) == ["plain", "magnetic", "gyros"]
-    for name in ("plain", "magnetic"):
+    assert list(found) == ["plain", "magnetic", "gyros", "any"]
+    assert found["any"].names[-2:] == ["velocity north", "velocity east"]
+    for name in ("plain", "magnetic", "any"):
         assert found[name].names[:3] == ["phi north", "phi east", "phi down"]
         assert (found[name].seen_from()[:2] < 8).all()  # 2 s of alignment, and a segment
     assert np.isinf(found["plain"].seen_from()[2])

@@ -22,10 +22,10 @@ from worlds.real_flights import FOLDER
 
 DEG = math.pi / 180
 LAT, FIELD_N = 52.5 * DEG, np.array([18.6e-6, 0.0, 45.9e-6])  # Berlin, from magnetic north
-IRON, IRON_S = 2 * DEG, 15.0  # of the heading by a magnetometer's residual errors, and for how long
+IRON, IRON_S = 2 * DEG, 10.0  # of the heading by a magnetometer's residual errors, and for how long
 # What data sheets of such parts say: no figure of a trial.
 IMU = ImuModel(
-    gyro_noise=0.02 * DEG, accel_noise=3e-3, gyro_bias_sigma=0.5 * DEG, accel_bias_sigma=0.05, gyro_bias_walk=2e-3 * DEG
+    gyro_noise=0.02 * DEG, accel_noise=3e-3, gyro_bias_sigma=0.5 * DEG, accel_bias_sigma=0.05, gyro_bias_walk=5e-3 * DEG
 )
 
 

@@ -1,0 +1,214 @@
+"""The attitude filter that levels in any motion, on a body in a hand: exact motion, by scipy's rotations."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from worlds.ahrs import airspeed, errors, imu, level_flight
+from worlds.ahrs import run as fly
+
+from nav.ahrs import Ahrs, AhrsConfig
+from nav.earth import earth_rate_n, gravity
+from nav.error_model import ImuModel
+from nav.horizon import FusionHorizon
+from nav.samples import ImuSamples, MagnetometerSample, Outcome
+
+DEG = math.pi / 180
+LAT, DT = 0.9, 0.01
+G = float(gravity(LAT, 0.0))
+FIELD_N = np.array([19e-6, 1e-6, 45e-6])
+PART = ImuModel(gyro_noise=0.02 * DEG, accel_noise=3e-3, gyro_bias_sigma=0.5 * DEG, accel_bias_sigma=0.0)
+CONFIG = AhrsConfig(PART, LAT, aids=("magnetometer",), magnetometer_sigma=2 * DEG * math.sqrt(2 * 10 / (4 * DT)))
+TOLD = CONFIG.in_any_motion()
+BLIND = replace(TOLD, aids=())
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Attitudes at the edges of the increments, and these."""
+
+    attitude: Rotation
+    imu: ImuSamples
+
+    @property
+    def q_nb(self):
+        return self.attitude.as_quat(scalar_first=True)
+
+
+def made(t, attitude, acceleration_n, bias=(0.0, 0.0, 0.0)):
+    """Increments of a body with these attitudes at ``t`` (N + 1,) and mean accelerations (N, 3) between, NED."""
+    turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    half_way = attitude[:-1] * Rotation.from_rotvec(turns / 2)
+    dt = np.diff(t)
+    earth = half_way.inv().apply(earth_rate_n(LAT)) * dt[:, None]
+    force = half_way.inv().apply(acceleration_n - [0.0, 0.0, G])
+    return Motion(attitude, ImuSamples(t[1:], dt, turns + earth + np.array(bias) * dt[:, None], force * dt[:, None]))
+
+
+def in_hand(seconds, rest_s=0.0, size_m=0.1, bias=(0.0, 0.0, 0.0)):
+    """Swung by tens of degrees and by a decimetre about once a second, after ``rest_s`` of rest."""
+    t = np.arange(round(seconds / DT) + 1) * DT
+    moving = np.clip((t - rest_s) / 2, 0, 1)[:, None]
+    angles = 40 * DEG * np.sin(t[:, None] * [1.9, 2.3, 1.1] + [0.3, 1.0, 2.0]) * moving
+    attitude = Rotation.from_euler("ZYX", angles + np.array([0.7, 0.1, -0.2]))
+    place = size_m * np.sin(t[:, None] * [5.1, 6.3, 7.2] + [0.2, 1.4, 2.5]) * moving
+    velocity = np.gradient(place, DT, axis=0)
+    return made(t, attitude, np.diff(velocity, axis=0) / DT, bias)
+
+
+def fields(motion, field_n=lambda t: FIELD_N):
+    t = motion.imu.t[::4]
+    seen = motion.attitude[1::4].inv().apply([field_n(now) for now in t.tolist()])
+    return [MagnetometerSample(now, now, b) for now, b in zip(t.tolist(), seen, strict=True)]
+
+
+def track(motion, told=TOLD, samples=(), every=100):
+    """Times, phi (N, 3) [rad], covariances (N, 3, 3) of attitude, estimates and reports."""
+    rows = np.arange(round(3 / DT), len(motion.imu.t), every)
+    times = motion.imu.t[rows]
+    reports, found = FusionHorizon(Ahrs(told, FIELD_N)).track(motion.imu, samples, times.tolist())
+    turned = Rotation.from_quat([one.q_nb for one in found], scalar_first=True) * motion.attitude[rows + 1].inv()
+    return times, -turned.as_rotvec(), np.array([one.covariance[6:, 6:] for one in found]), found, reports
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@pytest.fixture(scope="module")
+def swung():
+    return in_hand(60.0)
+
+
+def test_levels_a_body_that_never_is_at_rest(swung):
+    """Accelerations of 4 m/s^2 average out: the first levelling is degrees off, what stays is less than one."""
+    t, phi, covariance, _, reports = track(swung, samples=fields(swung))
+    assert np.abs(phi[0, :2]).max() > 1 * DEG
+    assert np.abs(phi[t > 30]).max() < 1.2 * DEG
+    assert np.abs(phi[t > 30, :2]).max() < 0.6 * DEG
+    assert np.all(np.abs(phi) < 4 * np.sqrt(covariance.diagonal(axis1=1, axis2=2)))
+    assert {report.aid for report in reports} == {"level", "magnetic_heading"}
+
+
+def test_a_heading_is_followed_and_does_not_tilt(swung):
+    """A field turned by 30 deg, of the same size and dip, turns the estimate: no gate tells it. The horizon stays, but
+    for what the gyros' bias about the vertical, believed to have changed, makes of it as the body turns over."""
+    turned = Rotation.from_rotvec([0, 0, 30 * DEG]).apply(FIELD_N)
+    _, right, *_ = track(swung, samples=fields(swung))
+    _, wrong, *_ = track(swung, samples=fields(swung, lambda t: FIELD_N if t < 20 else turned))
+    assert abs(wrong[-1, 2]) > 10 * DEG
+    tilt = np.hypot(*right.T[:2]), np.hypot(*wrong.T[:2])
+    assert np.abs(tilt[0] - tilt[1]).max() < 1.2 * DEG
+
+
+def test_a_disturbed_field_is_left_out_and_in_time_believed():
+    motion = in_hand(70.0)
+    other = Rotation.from_rotvec([0, 0, 20 * DEG]).apply(FIELD_N) * 1.3
+    t, phi, _, _, reports = track(motion, samples=fields(motion, lambda t: FIELD_N if t < 20 else other))
+    outcomes = {report.t: report.outcome for report in reports if report.aid == "magnetic_heading"}
+    refused = [now for now, outcome in outcomes.items() if outcome == Outcome.OUTSIDE_GATE]
+    assert min(now for now in refused if now > 4) == pytest.approx(20.2, abs=0.3)
+    assert 39 < max(refused) < 41  # `AnyMotion.field_patience_s`
+    assert np.abs(phi[(t > 15) & (t < 38), 2]).max() < 2 * DEG
+    assert abs(phi[-1, 2]) > 3 * DEG
+
+
+def test_no_field_is_no_heading():
+    motion = in_hand(10.0)
+    _, phi, _, found, reports = track(
+        motion, samples=fields(motion, lambda t: FIELD_N if t < 5 else np.array([0.0, 0.0, 45e-6]))
+    )
+    assert np.isfinite(phi).all()
+    assert np.isfinite(found[-1].covariance[6:, 6:]).all()
+    assert [r.outcome for r in reports if r.aid == "magnetic_heading"][-1] == Outcome.OUTSIDE_GATE
+
+
+def test_rest_shows_the_biases_of_all_gyros():
+    bias = np.array([0.6, -0.4, 0.5]) * DEG
+    _, _, _, found, _ = track(in_hand(12.0, rest_s=1e3, bias=bias), BLIND)
+    np.testing.assert_allclose(found[-1].gyro_bias, bias, atol=0.02 * DEG)
+    assert np.all(found[-1].sigma_gyro_bias < 0.05 * DEG)
+
+
+def test_motion_shows_the_biases_too():
+    bias = np.array([0.6, -0.4, 0.5]) * DEG
+    motion = in_hand(60.0, bias=bias)
+    t, phi, _, found, _ = track(motion, samples=fields(motion))
+    np.testing.assert_allclose(found[-1].gyro_bias, bias, atol=0.25 * DEG)
+    assert np.abs(phi[t > 30, :2]).max() < 1 * DEG
+
+
+def test_a_steady_turn_is_no_rest():
+    """Of 2 deg/s in calm air, where nothing varies: with a part whose biases are a twentieth of that."""
+    part = replace(PART, gyro_bias_sigma=0.1 * DEG)
+    t = np.arange(3001) * DT
+    turning = made(t, Rotation.from_rotvec(np.outer(t, [0, 0, 2 * DEG])), np.zeros((3000, 3)))
+    _, phi, _, found, _ = track(turning, replace(BLIND, imu=part))
+    assert abs(found[-1].gyro_bias[2]) < 0.02 * DEG
+    assert abs(phi[-1, 2] - phi[0, 2]) < 1 * DEG
+
+
+def test_first_levelling_in_motion_claims_what_it_errs():
+    """In a turn that nobody tells it of, specific force shows no tilt at all."""
+    truth = level_flight(6.0, (-10.0, 100.0), duration_s=10.0, speed=15.0)
+    filter_ = Ahrs(BLIND)
+    increments = imu(truth, 1)
+    _, (first,) = FusionHorizon(filter_).track(increments, (), [2.05])
+    error = errors(first.q_nb[None], truth.q_nb[[410]])[0]
+    claimed = np.degrees(np.sqrt(first.covariance[6:8, 6:8].diagonal()))
+    assert abs(error[0]) > 5
+    assert abs(error[0]) < 2.5 * claimed.max()
+
+
+def test_airspeed_levels_in_a_turn():
+    """100 s of turns at 3 deg/s and 50 m/s: 15 deg of bank, of which airspeed leaves less than one."""
+    truth = level_flight(3.0, (50.0, 550.0))
+    told = replace(BLIND, aids=("airspeed",))
+    _, error, _, _ = fly(told, truth, imu(truth, 1), airspeed(), tilt_deg=3.0)
+    assert np.abs(error[100:, :2]).max() < 1.0
+
+
+@pytest.mark.parametrize("size", [1, 7, 64])
+def test_blocks_make_no_difference(swung, size):
+    whole, parts = Ahrs(BLIND), Ahrs(BLIND)
+    rows = slice(0, 1500)
+    given = [getattr(swung.imu, key)[rows] for key in ("t", "dt", "dtheta", "dv")]
+    whole.propagate(ImuSamples(*given))
+    for start in range(0, 1500, size):
+        parts.propagate(ImuSamples(*(one[start : start + size] for one in given)))
+    np.testing.assert_array_equal(parts.estimate().q_nb, whole.estimate().q_nb)
+    np.testing.assert_array_equal(parts.estimate().covariance, whole.estimate().covariance)
+
+
+def test_prediction_is_the_future_and_changes_nothing(swung):
+    cut = [ImuSamples(*(getattr(swung.imu, key)[rows] for key in ("t", "dt", "dtheta", "dv"))) for rows in (
+        slice(0, 800), slice(800, 1200))]  # fmt: skip
+    filter_ = Ahrs(BLIND)
+    filter_.propagate(cut[0])
+    before, ahead = filter_.estimate(), filter_.predict(cut[1])
+    np.testing.assert_array_equal(filter_.estimate().q_nb, before.q_nb)
+    filter_.propagate(cut[1])
+    np.testing.assert_array_equal(filter_.estimate().q_nb, ahead.q_nb)
+    np.testing.assert_array_equal(filter_.estimate().covariance, ahead.covariance)
+
+
+@pytest.mark.ci
+def test_it_errs_as_it_claims_where_velocities_are_as_it_thinks():
+    """Velocities that are Gauss-Markov, noise of the data sheet: NEES of tilt per degree of freedom, eight draws."""
+    found = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        t = np.arange(6001) * DT
+        velocity = np.zeros((6001, 3))
+        for k in range(6000):
+            velocity[k + 1] = velocity[k] * math.exp(-DT / 4) + 0.5 * math.sqrt(2 * DT / 4) * rng.normal(size=3)
+        attitude = Rotation.from_euler("ZYX", 0.5 * np.sin(t[:, None] * [0.3, 0.5, 0.4] + rng.uniform(0, 6, 3)))
+        motion = made(t, attitude, np.diff(velocity, axis=0) / DT, 0.3 * DEG * rng.normal(size=3))
+        motion.imu.dtheta[:] += PART.gyro_noise * math.sqrt(DT) * rng.normal(size=(6000, 3))
+        at, phi, covariance, *_ = track(motion, BLIND)
+        phi, covariance = phi[at > 20, :2], covariance[at > 20, :2, :2]
+        found.append(np.einsum("ni,nij,nj->n", phi, np.linalg.inv(covariance), phi).mean() / 2)
+    print(np.round(found, 2))
+    assert 0.3 < np.mean(found) < 1.5
