@@ -16,7 +16,19 @@ from testbed import papers
 from testbed.feeds.simulated import motion
 from testbed.papers.misprints import weights_by_sum
 from testbed.papers.zhou2025 import PAPER, fusion, replays
-from testbed.papers.zhou2025.fusion import ALONE, CASES, FKF, GLR, HEALTHY, IMPROVED, LITERAL, PRINTED, STEEP, TOLD
+from testbed.papers.zhou2025.fusion import (
+    ALONE,
+    CASES,
+    CROSS,
+    FKF,
+    GLR,
+    HEALTHY,
+    IMPROVED,
+    LITERAL,
+    PRINTED,
+    STEEP,
+    TOLD,
+)
 from testbed.papers.zhou2025.replays import COMPLETE, FADING, Case, Hard, Replayed, Soft
 
 
@@ -48,6 +60,10 @@ def test_the_scenario_is_that_of_the_tables() -> None:
     assert [(f.channel, f.slope, f.window) for f in ramp] == [("north", 0.02, (90, 130)), ("east", 0.02, (90, 130))]
     noise = [f.factor for f in scenario.fault if f.kind == "noise"]
     assert noise == pytest.approx([math.sqrt(1.1)] * 7, rel=1e-4)
+    crossed = fusion.built(scenario, 1, CROSS).horizon.estimator
+    assert isinstance(crossed, Federated)
+    assert crossed.config.cross_check
+    assert crossed.config.structure == "no_reset"
     steep = papers.scenario("zhou2025", CASES[STEEP])
     assert [f.slope for f in steep.fault if f.kind == "ramp"] == [0.1, 0.1]
 
@@ -84,7 +100,7 @@ def flown() -> dict[str, dict[str, fusion.Flown]]:
 def test_the_improved_fusion_does_not_follow_the_faults(flown: dict[str, dict[str, fusion.Flown]]) -> None:
     """One draw; over all of them the ratios are the claims."""
     faulty = flown[PRINTED]
-    assert set(faulty) == {FKF, IMPROVED, ALONE}
+    assert set(faulty) == {FKF, IMPROVED, GLR, ALONE, TOLD}
     assert (faulty[IMPROVED].rmse < 0.7 * faulty[FKF].rmse).all()
     assert faulty[IMPROVED].delay[0] <= 3
     assert math.isinf(faulty[FKF].delay[0])
@@ -92,6 +108,7 @@ def test_the_improved_fusion_does_not_follow_the_faults(flown: dict[str, dict[st
     assert len(error) == pytest.approx(216 * fusion.RECORD_HZ, abs=2)
     assert np.sqrt(np.mean(error**2, axis=0)) == pytest.approx(faulty[FKF].rmse)
     assert (flown[STEEP][TOLD].rmse < 0.6 * flown[STEEP][FKF].rmse).all()
+    assert flown[STEEP][TOLD].rmse == pytest.approx(faulty[TOLD].rmse, rel=1e-6)  # what it left out was another fault
     healthy = flown[HEALTHY]
     assert healthy[FKF].refused[0] == 0
     assert healthy[LITERAL].sigma > 1.2 * healthy[FKF].sigma
