@@ -19,7 +19,7 @@ import numpy as np
 from nav._jit import njit
 from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
 from nav.aids.gnss import has_velocity
-from nav.earth import earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
+from nav.earth import displacement_n, earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, ImuModel
 from nav.rotation import (
     cross,
@@ -36,6 +36,8 @@ RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [ra
 REST_SPEED = 0.5  # slower than this is standing [m/s]
 COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
 HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
+DIFFERENCE_S, USUAL_ACCELERATION = 1.0, 3.0  # of positions that tell a velocity; of small vehicles [s, m/s^2]
+WITHOUT_VELOCITY_S = 10.0  # so long must it take then: as long as errors of such velocities are small beside gravity's
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
 UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its field is of another length than the Earth's
@@ -100,6 +102,7 @@ class Alignment:
         self.names: dict[str, str] = {}  # of the blocks in `InitialState.correlated`, where a filter has others
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
+        self._places: list[GnssSample] = []  # of a receiver that tells no velocity, the last ones
         self._restart(None)
 
     @classmethod
@@ -149,16 +152,22 @@ class Alignment:
 
     def add_gnss(self, fix: GnssSample, field_n: Array | None) -> InitialState | None:
         """Add a sound fix at the current time, ``field_n`` the reference field there [T]; the state once known."""
-        if not has_velocity(fix):
-            self.problem = "waiting for GNSS velocity"
-            return None
+        told, duration_s = fix, self.duration_s
+        if not has_velocity(told):
+            differenced, duration_s = self._differenced(fix), max(duration_s, WITHOUT_VELOCITY_S)
+            if differenced is None:
+                self.problem = "no GNSS velocity: waiting for positions that tell it"
+                return None
+            fix = differenced
         first = self._first
         if first is None:
-            self.problem = "collecting"
+            self.problem = (
+                "collecting" if duration_s == self.duration_s else "collecting, for long without GNSS velocity"
+            )
             self._restart(fix)
             return None
         T = fix.t - first.t
-        if self.duration_s - 1e-6 > T:
+        if duration_s - 1e-6 > T:
             return None
         C_b0 = np.ascontiguousarray(dcm_from_quat(self._q_0b).T)
         dv_b = C_b0 @ self._dv_0
@@ -189,6 +198,23 @@ class Alignment:
         if field_bias > self.aids.field_bias:
             initial = replace(initial, widened={"magnetometer_bias": field_bias})
         return initial
+
+    def _differenced(self, fix: GnssSample) -> GnssSample | None:
+        """The fix with the velocity that positions tell, None as long as none is `DIFFERENCE_S` older.
+
+        It is the mean velocity since then: wrong by what both positions are, and by half of a usual acceleration.
+        """
+        self._places = [one for one in self._places if fix.t - one.t <= 2 * DIFFERENCE_S] + [fix]
+        old = [one for one in self._places if fix.t - one.t >= DIFFERENCE_S - 1e-6]
+        if not old:
+            return None
+        before = old[-1]
+        dt = fix.t - before.t
+        v_n = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h) / dt
+        sigma = np.sqrt(
+            (fix.sigma_position_n**2 + before.sigma_position_n**2) / dt**2 + (USUAL_ACCELERATION * dt / 2) ** 2
+        )
+        return replace(fix, v_n=v_n, sigma_velocity_n=sigma)
 
     def _specific_force_n(self, first: GnssSample, fix: GnssSample, T: float) -> Array:
         """Integral of specific force in n between the fixes: velocity change less gravity and Coriolis."""

@@ -143,8 +143,12 @@ class ImuModel:
 
     @property
     def in_motion(self) -> Array:
-        """Squares (3,) of the shares by which noise follows motion and vibration."""
-        return np.array([self.gyro_motion, self.accel_motion, self.vibration]) ** 2
+        """Squares (4,) of the shares by which noise follows motion and vibration; last 1 if any does, else 0.
+
+        That one is how much of an unseen motion is reckoned with where increments are missing.
+        """
+        shares = np.array([self.gyro_motion, self.accel_motion, self.vibration]) ** 2
+        return np.append(shares, float(shares.any()))
 
     def blocks(self) -> list[Block]:
         """The motion (its noise is the sensors' white noise) and the sensor errors that drive it."""

@@ -82,7 +82,7 @@ class Reference:
             self._decay_rate[i, : model.size] = model.decay_rate
             self._noise[i, : model.size] = model.density**2
         self._variance_rate = self._noise.copy()
-        self._in_motion = np.zeros((filters, 3))
+        self._in_motion = np.zeros((filters, 4))
         self._room, self._work = np.zeros(2 * MOTION * self.common + 2 * n), scratch(n)
         self._scratch = (*working(self._room, self.common, n), self._work)
         self.share_noise(shares)

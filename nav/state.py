@@ -22,6 +22,7 @@ from nav.unscented import remove
 
 FIXED = 66  # numbers in a `State` of any size
 SAME = 1e-9  # rates this close, relative, are those of one increment
+BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # what a small vehicle may do unseen, for a second each [rad/s, m/s^2]
 SHAKEN_S = 1.0  # over which the noise of increments is averaged
 
 
@@ -165,7 +166,7 @@ def _covariance_step(
 def _add_motion(half_noise: Array, in_motion: Array, sums: Array, shaking: Array, lla: Array, T: float) -> None:
     """Add what motion and vibration over ``T`` seconds do to half of the noise of attitude and velocity.
 
-    ``in_motion`` (3,) is `error_model.ImuModel.in_motion`: of the mean rate and of the mean force less gravity a share
+    ``in_motion`` (4,) is `error_model.ImuModel.in_motion`: of the mean rate and of the mean force less gravity a share
     that is another one each second, so that its density is that share times one root of a second.
     """
     if in_motion[0] == 0.0 and in_motion[1] == 0.0 and in_motion[2] == 0.0:
@@ -278,6 +279,10 @@ def propagate(
                     rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
             else:
                 bad = k
+                for f in range(filters):
+                    for i in range(3):  # in_motion is zero of filters that are told nothing of motion
+                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * BRIDGED_RATE**2 * T
+                        P[f, VEL + i, VEL + i] += in_motion[f, 3] * BRIDGED_FORCE**2 * T
             for i in range(3):
                 angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
                 push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])

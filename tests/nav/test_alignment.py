@@ -1,6 +1,7 @@
 """The initial state from sensors: at rest, in a turn, with and without magnetometer, and how sure it says it is."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -149,3 +150,20 @@ def test_a_broken_increment_starts_the_alignment_again(broken):
     assert initial is not None
     assert initial.t > 1.3 + 2.0 - 1e-6
     np.testing.assert_allclose(initial.q_nb, [1, 0, 0, 0], atol=0.01)
+
+
+def test_a_receiver_without_velocity_aligns_slower_and_claims_less():
+    truth, rng = flight(40), np.random.default_rng(5)
+    increments_, *_ = imu(truth, CONSUMER, rng)
+    nothing = np.full(3, np.nan)
+    samples = [replace(fix, v_n=nothing, sigma_velocity_n=nothing) for fix in gnss(truth, rng, 4.0)]
+    samples += magnetometer(truth, rng)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(), MagnetometerAid())), lambda *_: FIELD_N)
+    estimates, _ = feed(FusionHorizon(ins), increments_, samples)
+    first = next(e for e in estimates if math.isfinite(e.h))
+    assert 10.0 < first.t < 20.0
+    wrong, sigma = error(first, truth), np.sqrt(np.diag(first.covariance))
+    assert (np.abs(wrong) < 3.5 * sigma).all()
+    assert 0.5 < sigma[3] < 5.0
+    assert np.linalg.norm(error(estimates[-1], truth)[:3]) < 5.0
+    assert ins.problem == ""

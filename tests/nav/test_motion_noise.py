@@ -98,3 +98,21 @@ def test_vibration_is_learned_from_second_differences_however_increments_are_cut
 def test_slow_motion_is_no_vibration():
     density, _ = shaken((0.0, 0.0), 0.0, swing=1.0)
     assert density[0] < (1e-3) ** 2 / HZ
+
+
+def test_a_gap_widens_what_is_claimed_by_what_may_happen_unseen():
+    """Two seconds without increments: half a radian and 3 m/s per root of a second, and their part in the position."""
+    model = replace(QUIET, gyro_motion=0.01)
+    reference = Reference([ErrorModel(model)], [1.0], 10, None)
+    start = InitialState(0.0, LAT, 0.1, 300.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros((MOTION, MOTION)))
+    state = reference.start(start)
+    dt = np.full(200, 0.01)
+    force = np.outer(dt, [0.0, 0.0, -gravity(LAT, 300.0)])
+    reference.run(state, ImuSamples(np.cumsum(dt), dt, 0 * force, force), settle=True)
+    before = np.sqrt(state.P[0].diagonal())
+    reference.run(state, ImuSamples(2 + np.cumsum(dt), dt, np.nan * force, np.nan * force), settle=True)
+    sigma = np.sqrt(state.P[0].diagonal())
+    assert before[VEL : VEL + 3].max() < 1e-3
+    np.testing.assert_allclose(sigma[PHI : PHI + 3], 0.5 * math.sqrt(2), rtol=0.01)
+    assert (sigma[VEL : VEL + 3] > 3 * math.sqrt(2) * 0.99).all()
+    assert (sigma[6:9] > 3 * math.sqrt(2**3 / 3) * 0.95).all()  # an integrated random walk
