@@ -35,6 +35,7 @@ AIDS = frozenset({"barometer", "magnetometer", "airspeed"})
 FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
 LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
 IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at 0.06 rad/s: so much more than noise
+BIASES_FOLLOWED = 3.0  # of the gyros, 1 sigma: the drift that corrections are never slower than
 NEVER_LEVEL = LowDynamics(roll_rate_limit=-1.0)
 LEVEL_BANK = math.radians(5.0)  # commanded; a straight in light turbulence takes 2.5 (99 % of the time)
 
@@ -171,6 +172,9 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
             gust_sigma=level.gust_mps2,
             gust_correlation_s=level.gust_correlation_s,
         )
+    drift = BIASES_FOLLOWED * config.imu.gyro_bias_sigma * config.period_s
+    if level is None:  # a limit below what the gyros drift in a period never brings the horizon back
+        config = replace(config, phi_limit=max(config.phi_limit, drift))
     if section.profile == "any_motion":
         config = config.in_any_motion()
     if not section.levelling:

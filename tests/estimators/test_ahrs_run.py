@@ -113,6 +113,14 @@ def test_it_is_told_how_to_level() -> None:
     assert (told.force_sigma, told.phi_limit, told.gyro_bias_feedback) == (0.2, math.radians(0.4), True)
 
 
+def test_corrections_are_never_slower_than_the_drift() -> None:
+    assert config(BLIND).phi_limit == math.radians(0.2)
+    hobby = config(BLIND, overrides=("sensors.imu.grade=mems-hobby",))
+    assert hobby.phi_limit > 3 * math.radians(1000 / 3600)  # what the grade says of turn-on, in a period of a second
+    told = config(BLIND.replace("}", ", level={limit_deg=0.3}}"), overrides=("sensors.imu.grade=mems-hobby",))
+    assert told.phi_limit == math.radians(0.3)
+
+
 def test_it_is_told_to_level_in_any_motion() -> None:
     told, house = config(AHRS.replace("}", ', profile="any_motion"}')), config(AHRS)
     assert house.any_motion is None
