@@ -37,7 +37,7 @@ class Flight:
         self.feed = Recorded(scenario, 1)
         section = next(one for one in scenario.estimator if one.name == "ins")
         self.lane = registry.build([section], scenario.rig(1))["ins"]
-        self.t = 0.0
+        self.t = self.known = 0.0  # and up to where there are increments
 
     def branch(self) -> Flight:
         """The same from here on, with an estimator of its own."""
@@ -62,14 +62,15 @@ class Flight:
                 and not (denied and isinstance(one, GnssSample))
                 and self.lane._spaced(name, one)
             ]
-            here = [t for t in times if self.t < t <= (imu.t[stop - 1] if stop else 0.0)]
+            known = float(imu.t[stop - 1]) if stop else 0.0
+            here = [t for t in times if self.known < t <= known]
             for estimate in self.lane.horizon.track(block, samples, here)[1]:
                 fix = next(one for one in self.feed._samples["gnss"] if one.t == estimate.t)
                 off = displacement_n(estimate.lat, estimate.lon, estimate.h, fix.lat, fix.lon, fix.h)
                 claimed = estimate.covariance[:3, :3]
                 nees = off @ np.linalg.solve(claimed + np.diag(fix.sigma_position_n**2), off) / 3
                 found.append((float(np.hypot(*off[:2])), float(nees), float(np.sqrt(claimed[0, 0] + claimed[1, 1]))))
-            self.t = end
+            self.t, self.known = end, known
         return found
 
 
