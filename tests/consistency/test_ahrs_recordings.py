@@ -51,7 +51,7 @@ def test_broad() -> None:
 
 @pytest.mark.parametrize("name", ["thor", "quad"])
 def test_flights(name: str, tmp_path: Path) -> None:
-    """Within 3 deg of the attitude on board, where the filter of Jiang et al. loses the horizon."""
+    """Within 3 deg of the attitude on board, and less than half of what low dynamics alone give."""
     head, ahrs = real_flights.FLIGHTS[name].split('[[estimator]]\nname = "ins"')
     told = ahrs[ahrs.index("[[estimator]]") :]
     path = tmp_path / "flight.toml"
@@ -59,4 +59,4 @@ def test_flights(name: str, tmp_path: Path) -> None:
     scores = run(Scenario.load(path), out=tmp_path).metrics
     print(name, {key: round(value, 2) for key, value in scores.items() if "roll_pitch" in key or "nees" in key})
     assert scores["any.roll_pitch_rms_deg"] < {"thor": 3.0, "quad": 1.0}[name]
-    assert scores["ahrs.roll_pitch_rms_deg"] > 10.0
+    assert scores["any.roll_pitch_rms_deg"] < 0.5 * scores["ahrs.roll_pitch_rms_deg"]
