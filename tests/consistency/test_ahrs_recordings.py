@@ -1,7 +1,7 @@
 """The attitude filter that levels in any motion, on recordings that are not part of the project.
 
 `worlds.broad` and `worlds.real_flights` say what lies where. The configuration was chosen on the trials of BROAD that
-are named `CHOSEN_ON` and on the aeroplane's and the quadcopter's flights; the others were looked at once, afterwards.
+are named `CHOSEN_ON` and on the aeroplane's and the quadcopter's flights; the others were looked at twice.
 """
 
 from __future__ import annotations
