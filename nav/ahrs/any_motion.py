@@ -54,9 +54,8 @@ class AnyMotionLevelling:
         self._further, self._velocity = further, further.velocity
         self._g, self._earth_n = g, earth_n
         self._H_heading = H_heading
-        self._lasting_s = (
-            4 * told.acceleration_smoothing_s
-        )  # density over variance: twice that of white noise, smoothed
+        # Density over variance: twice that of white noise, smoothed.
+        self._lasting_s = 4 * told.acceleration_smoothing_s
 
     def tilt_variance(self, f_n: Array, rate: float, compensated: bool) -> float:
         """Of a first levelling by a mean specific force (3,), turning at ``rate`` [rad/s]; NaN when it shows none."""
