@@ -19,7 +19,7 @@ from testbed.feeds import draft, formats
 from testbed.feeds.log import Log
 from testbed.feeds.survey import survey
 from testbed.loop.loop import RunResult
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 
 BIN = data_dir("scenarios") / "recorded_flight.bin"
 SECONDS = 70.0
@@ -150,9 +150,11 @@ def test_without_accuracies_the_grade_is_declared(log: Log, tmp_path: Path) -> N
 
 
 @pytest.mark.ci
-def test_without_velocity_it_runs_and_says_that_it_never_aligned(log: Log, tmp_path: Path) -> None:
+def test_without_velocity_it_aligns_later_by_positions(log: Log, tmp_path: Path) -> None:
     result = fly(arrays(log), tmp_path, 'sigma_position = "sp"')
-    assert any("never aligned" in remark for remark in result.remarks)
+    assert 10 <= scored(result)["ins.aligned_s"] <= 20
+    e = accuracy.errors(result.dataset, "ins", settling_s=30.0)
+    assert np.sqrt(np.mean(e.horizontal[e.valid] ** 2)) < 3.0
 
 
 def test_an_unknown_reference_is_not_judged(log: Log, tmp_path: Path) -> None:
