@@ -24,6 +24,8 @@ from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, M
 class External:
     """Kind ``./external.py:External`` with the key ``command``, a list: the program and its arguments."""
 
+    program = None
+
     def __init__(self, rig, command):
         self.program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
@@ -59,6 +61,8 @@ class External:
         return Estimate.of(t, q_nb=q_nb, lla=lla, v_n=v_n, status=Status.ALIGNED)
 
     def __del__(self):
+        if self.program is None:  # it could not be started
+            return
         self.program.stdin.close()
         self.program.stdout.close()
         self.program.wait()
