@@ -135,7 +135,8 @@ def test_there_is_nothing_that_is_not_looked_at() -> None:
 def test_page_works(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")  # as who can say testbed
+    # As who can say testbed, can say python.
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.chdir(tmp_path)
     whole = [block.text for source in (page, DOCS / "scenarios.md") for block in blocks(source) if is_whole(block)]
     for block in blocks(page):
