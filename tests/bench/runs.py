@@ -91,7 +91,7 @@ def _step(scenario: Scenario) -> None:
     truth = scenario.truth
     assert isinstance(truth, FlightTruth)
     aircraft = Aircraft(truth.aircraft, truth.rate_hz)
-    aircraft.start(truth.start, [(0.0, 0.0, 0.0)])
+    aircraft.start(truth.start)
     aircraft.turbulence(truth.wind.turbulence, 1)
     run = aircraft.fdm.run
     for _ in range(round(scenario.duration_s * truth.rate_hz)):
