@@ -9,13 +9,12 @@ import numpy as np
 
 from nav.aids import GnssAid
 from nav.aids.gnss import has_velocity
-from nav.detection import SURE, GnssMonitor, Verdict
+from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Verdict
 from nav.error_model import MOTION, POS, VEL
 from nav.local_filter import LocalFilter
 from nav.samples import Array, GnssSample, Outcome, Sample, UpdateReport
 from nav.state import State
 
-PROBATION_S, RECOVERY_S = 1.0, 4.0  # fixes that agree for so long are a doubt, and overrule the filters: as in `Ins`
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 

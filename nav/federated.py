@@ -59,10 +59,6 @@ from nav.weighting import InOrder, Policy, Weight
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
 LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
-PROBATION_S, RECOVERY_S = (
-    1.0,
-    4.0,
-)  # fixes that agree with each other for so long are a doubt, and overrule, as in `Ins`
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
 

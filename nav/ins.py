@@ -19,7 +19,7 @@ from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState
-from nav.detection import ChiSquareGate, GnssMonitor, Verdict
+from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Verdict
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
@@ -81,8 +81,8 @@ class InsConfig:
     # Belief
     false_rejection: float = 1e-3  # probability that the gate turns a sound measurement away; 0: there is no gate
     outage_s: float = 10.0  # this long without a fused position is an outage
-    probation_s: float = 1.0  # fixes must agree with each other for this long after it
-    recovery_s: float = 4.0  # after an outage, fixes that agree for this long overrule the filter
+    probation_s: float = PROBATION_S  # fixes must agree with each other for this long after it
+    recovery_s: float = RECOVERY_S  # after an outage, fixes that agree for this long overrule the filter
     patience_s: float = 30.0  # and this long when they left the gate without an outage
 
     alignment_s: float = 2.0  # shortest time over which the initial attitude is found

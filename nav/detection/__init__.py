@@ -16,13 +16,15 @@ Siegmund, Sequential Analysis (1985). Evidence is a logarithm of a likelihood ra
 
 from nav.detection.base import Decision, Detector, Event, Mask, chi_square_threshold, whiten
 from nav.detection.glr import Glr, glr_false_alarm, glr_threshold
-from nav.detection.gnss import GnssMonitor, Verdict
+from nav.detection.gnss import PROBATION_S, RECOVERY_S, GnssMonitor, Verdict
 from nav.detection.means import Mean, RunningMean, WindowMean, exponential, plain
 from nav.detection.sequential import Evidence, Quadratic, Recursive, Reset, SampleTest, Sprt
 from nav.detection.snapshot import ChiSquare, ChiSquareGate, Eraim, Never, w_tests
 from nav.detection.witness import SURE, WindMemory
 
 __all__ = [
+    "PROBATION_S",
+    "RECOVERY_S",
     "SURE",
     "ChiSquare",
     "ChiSquareGate",

@@ -14,6 +14,7 @@ from nav.samples import Array, GnssSample
 
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
 TURN_ERROR = 0.6
+PROBATION_S, RECOVERY_S = 1.0, 4.0  # fixes that agree for so long may be used after an outage, overrule the filter
 JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
 
 

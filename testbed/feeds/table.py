@@ -120,8 +120,8 @@ def load(path: Path) -> dict[str, Array]:
 
 def _stacked(values: Any) -> Any:
     """A column of lists that are equally long as (N, k), any other as it is."""
-    lengths = {len(one) if isinstance(one, np.ndarray) else -1 for one in values} if values.dtype == object else {-1}
-    return np.stack(values) if lengths not in ({-1}, set()) and len(lengths) == 1 else values
+    lists = values.dtype == object and all(isinstance(one, np.ndarray) for one in values)
+    return np.stack(values) if lists and len({len(one) for one in values}) == 1 else values
 
 
 def _numbers(columns: Any) -> Iterator[tuple[str, Array]]:

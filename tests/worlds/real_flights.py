@@ -19,27 +19,27 @@ lon = "gnss_lon"
 height = "gnss_h"
 velocity = "gnss_vel"
 """
-# Every sensor is told to be a hobby autopilot's.
-AEROPLANE = """
+GRADES = {"gnss": "u-blox-m8", "barometer": "hobby", "airspeed": "hobby", "magnetometer": "hobby"}
+
+
+def flown_with(*aids: str) -> str:
+    """Sensors, each told to be a hobby autopilot's, and an INS and an AHRS with them."""
+    sensors = "".join(f'[sensors.{name}]\ngrade = "{GRADES[name]}"\n' for name in aids)
+    return f"""
 [sensors.imu]
 grade = "mems-hobby"
-[sensors.gnss]
-grade = "u-blox-m8"
-[sensors.barometer]
-grade = "hobby"
-[sensors.airspeed]
-grade = "hobby"
-[sensors.magnetometer]
-grade = "hobby"
-[[estimator]]
+{sensors}[[estimator]]
 name = "ins"
 kind = "ins"
-aids = ["gnss", "barometer", "airspeed", "magnetometer"]
+aids = {list(aids)}
 [[estimator]]
 name = "ahrs"
 kind = "ahrs"
-aids = ["barometer", "airspeed", "magnetometer"]
+aids = {list(aids[1:])}
 """
+
+
+AEROPLANE = flown_with("gnss", "barometer", "airspeed", "magnetometer")
 THOR = f"""
 title = "Ultra Stick, 696 s at 50 Hz"
 duration_s = 600
@@ -111,23 +111,7 @@ field = {{ column = "mag", unit = "mG" }}
 [truth.columns.reference]
 time = "ref_t"
 attitude = "ref_q"
-[sensors.imu]
-grade = "mems-hobby"
-[sensors.gnss]
-grade = "u-blox-m8"
-[sensors.barometer]
-grade = "hobby"
-[sensors.magnetometer]
-grade = "hobby"
-[[estimator]]
-name = "ins"
-kind = "ins"
-aids = ["gnss", "barometer", "magnetometer"]
-[[estimator]]
-name = "ahrs"
-kind = "ahrs"
-aids = ["barometer", "magnetometer"]
-"""
+{flown_with("gnss", "barometer", "magnetometer")}"""
 FLIGHTS = {"thor": THOR, "swiss": SWISS, "quad": QUAD}
 
 
