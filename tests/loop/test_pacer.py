@@ -92,7 +92,7 @@ def test_on_the_real_clock():
     start = time.monotonic()
     for k in range(51):
         paced.wait(k * 0.04)
-    assert 0.2 <= time.monotonic() - start < 1.0, "waits don't add up; the machine may be busy"
+    assert time.monotonic() - start >= 0.2  # that waits don't add up is shown above, on a clock that nothing delays
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, float("nan"), float("inf")])
