@@ -497,6 +497,17 @@ def record_format() -> str:
     return "\n\n".join(parts)
 
 
+def export_formats() -> str:
+    """What a record can be turned into."""
+    from testbed.exports import FORMATS
+
+    rows = []
+    for one in FORMATS.values():
+        extra = f" (extra `{one.extra}`)" if one.extra else ""
+        rows.append((f"`{one.name}`", one.holds + extra, one.readers))
+    return _table(("format", "what is in it", "who reads it"), rows)
+
+
 def _order_of_groups(path: str) -> tuple[int, str]:
     order = ("truth", "sensors", "estimators", "events", "faults")
     top = path.strip("/").partition("/")[0]
@@ -526,6 +537,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "aircraft_modes": aircraft_modes,
     "envelopes": envelopes,
     "record_format": record_format,
+    "export_formats": export_formats,
     **{f"grades_{kind}": _grade_part(kind) for kind in KINDS},
 }
 

@@ -9,7 +9,6 @@ import math
 import sys
 import tomllib
 from collections.abc import Sequence
-from enum import StrEnum
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -21,6 +20,7 @@ if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is th
 
 import typer
 
+from testbed.commands.export import export
 from testbed.commands.log import log
 from testbed.commands.run import run
 from testbed.commands.shared import (
@@ -48,13 +48,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-class ExportFormat(StrEnum):
-    """What a run file can be turned into."""
-
-    csv = "csv"
-    mat = "mat"
 
 
 def main() -> None:
@@ -185,17 +178,7 @@ def report(run_file: RunFile, force: Force = False) -> None:
     conclude(dataset, computed, run_file, True, force)
 
 
-@app.command()
-def export(
-    run_file: RunFile,
-    format: Annotated[ExportFormat, typer.Option(help="One CSV file per table, or one MATLAB file.")],
-    out: Annotated[Path | None, typer.Option(metavar="PATH", help="Where to; beside the run file.")] = None,
-    force: Force = False,
-) -> None:
-    """Turn a run file into CSV or MATLAB."""
-    from testbed.record.export import export as write
-
-    print(printable(str(write(run_file, format.value, out, force))))
+app.command()(export)
 
 
 @app.command()

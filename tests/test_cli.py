@@ -182,7 +182,7 @@ print("heavy:", sorted(heavy & sys.modules.keys()))
         (["report", "none.nc"], "testbed: none.nc: no such file"),
         (["report", "."], "testbed: .: is a folder"),
         (["export", "none.nc", "--format", "csv"], "testbed: none.nc: no such file"),
-        (["export", "none.nc", "--format", "xls"], "'xls'"),
+        (["export", "none.nc", "--format", "xls"], 'there is no format "xls"'),
         (["campaign", "u_turn", "--runs", "0"], "--runs"),
         (["campaign", "u_turn", "--runs", "2", "--vary", "seed"], "testbed: --vary seed: give it as key=a,b,c"),
         (["campaign", "u_turn", "--runs", "2", "--set", "sed=3"], "(--set sed=3): sed: unknown key"),

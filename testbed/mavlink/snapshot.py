@@ -25,12 +25,10 @@ from nav.samples import (
 )
 from testbed.mavlink.encode import boot_ms, microseconds
 from testbed.mavlink.identity import Identity
-from testbed.motion.table import TruthBlock
+from testbed.motion.table import FLYING_MPS, TruthBlock
 
 S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
 Point: TypeAlias = tuple[float, float, float]
-
-FLYING_MPS = 8.0  # faster than this, through the air or over ground, is flight: well below any stall speed
 
 # Blocks of an estimate's covariance.
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)

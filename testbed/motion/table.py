@@ -24,6 +24,7 @@ from nav.samples import Array
 from testbed.errors import UserError
 
 SAVE_TICKS = 20_000  # rows of a motion being stored that are in memory at a time
+FLYING_MPS = 8.0  # faster than this, through the air or over ground, is flight: well below any stall speed
 
 
 @dataclass(frozen=True, slots=True)

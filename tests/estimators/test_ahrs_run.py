@@ -23,11 +23,11 @@ from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
+from testbed.exports import export
 from testbed.many import campaign
 from testbed.many.campaign import CampaignResult, Combination
 from testbed.mavlink import MavlinkPublisher
 from testbed.record import reader as record
-from testbed.record.export import export
 from testbed.record.recorder import Recorder
 from testbed.report import campaign as campaign_report
 from testbed.report import campaign_figures, tables

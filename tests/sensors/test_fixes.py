@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from worlds.sensor_truth import RATE_HZ, lively, still
 
 from testbed import Scenario, run
-from testbed.record.export import export
+from testbed.exports import export
 from testbed.report.page import write_report
 from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
 from testbed.sensors.position_fix import PositionFix, PositionFixConfig

@@ -14,7 +14,7 @@ from worlds.full_disk import file_size_limit
 
 from testbed import results
 from testbed.errors import UserError
-from testbed.record.export import export
+from testbed.exports import export
 from testbed.record.recorder import load
 
 
