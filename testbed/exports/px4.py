@@ -18,14 +18,14 @@ projection, geo.cpp there, which is Snyder, Map Projections (1987), Eq 5-3 and 2
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from nav.earth import SEA_LEVEL_DENSITY, isa_density, isa_temperature, pressure_altitude
 from nav.samples import Array, Status
-from testbed.exports.ulog import Rows, Topic, encode, rows
+from testbed.exports.stream import START_US, Rows, Stamps, stamps
+from testbed.exports.ulog import Topic, encode, rows
 from testbed.exports.view import Columns, View, carried, fixed
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import FLYING_MPS
@@ -36,9 +36,6 @@ from testbed.sensors.gnss import GnssConfig
 if TYPE_CHECKING:
     import xarray
 
-Stamps: TypeAlias = npt.NDArray[np.int64]
-
-START_US = 1_000_000
 NEVER = 32767  # in ekf2_timestamps, of what is not new [0.1 ms]
 STEP_US = 100  # of ekf2_timestamps
 LATEST_STEPS = 32_000  # a sample is not told of after that
@@ -80,11 +77,6 @@ def content(tree: xarray.DataTree, version: str) -> bytes:
         "estimators": ", ".join(view.estimators),
     }
     return encode(topics, version, START_US, parameters=_parameters(view), infos=infos, texts=texts)
-
-
-def stamps(t: Array) -> Stamps:
-    """Times from the start of the run [s] on the log's clock (N,) [us]."""
-    return START_US + np.rint(np.asarray(t, float) * 1e6).astype(np.int64)
 
 
 def local(lat: Array, lon: Array, lat0: float, lon0: float) -> Array:
@@ -249,7 +241,7 @@ def _states(view: View, own: Columns) -> dict[str, dict[str, Any]]:
         return said
     own = {name: values[known] for name, values in own.items()}
     t, lat, lon, h, v = t[known], own["lat"], own["lon"], own["h"], own["v_n"]
-    lat0, lon0, h0 = _origin(view)
+    lat0, lon0, h0 = view.origin()
     place = local(lat, lon, lat0, lon0)
     blank = np.zeros((len(t), 3))
     sigma, sigma_v = own.get("sigma_position_n", blank), own.get("sigma_velocity_n", blank)
@@ -273,15 +265,6 @@ def _states(view: View, own: Columns) -> dict[str, dict[str, Any]]:
         "lat_lon_valid": True, "alt_valid": True, "terrain_alt": np.nan, **accuracy,
     }  # fmt: skip
     return said
-
-
-def _origin(view: View) -> tuple[float, float, float]:
-    """The first place that truth has, else an estimate: latitude, longitude [rad], height [m]."""
-    for own in (view.truth, *view.estimators.values()):
-        known = np.flatnonzero(np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"]))
-        if len(known):
-            return tuple(float(own[name][known[0]]) for name in ("lat", "lon", "h"))  # type: ignore[return-value]
-    return 0.0, 0.0, 0.0
 
 
 def _innovations(view: View, version: str) -> Iterator[Topic]:

@@ -53,6 +53,13 @@ FORMATS: dict[str, Format] = {
             version="1.16",
         ),
         Format("ulg-1.15", ".ulg", "px4", "the same by the messages of PX4 1.15", "EKF2 replay (1.15)", version="1.15"),
+        Format(
+            "bin",
+            ".bin",
+            "dataflash",
+            "an ArduPilot log: samples, truth as SIM, estimators as cores of XKF1",
+            "pymavlink, MAVExplorer, Mission Planner, UAV Log Viewer, PlotJuggler",
+        ),
         Format("mat", ".mat", "matlab", "everything, one struct per group", "MATLAB, Octave, scipy"),
     )
 }

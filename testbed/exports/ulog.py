@@ -9,14 +9,13 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from testbed.exports.px4_messages import MESSAGES, VERSIONS
-
-Rows: TypeAlias = npt.NDArray[Any]  # structured: the fields of a message
+from testbed.exports.stream import Bytes, Rows, in_order
 
 TYPES = {
     "Q": "uint64_t", "I": "uint32_t", "H": "uint16_t", "B": "uint8_t", "i": "int32_t", "h": "int16_t", "b": "int8_t",
@@ -94,7 +93,7 @@ def encode(
     for t, severity, words in texts:
         said = _message(b"L", LEVELS[severity] + struct.pack("<Q", t) + words.encode())
         parts.append((np.array([t], np.uint64), np.frombuffer(said, np.uint8)[None]))
-    return b"".join(head) + _in_order(parts)
+    return b"".join(head) + in_order(parts)
 
 
 def _message(kind: bytes, body: bytes) -> bytes:
@@ -105,28 +104,10 @@ def _named(kind: bytes, key: str, value: bytes) -> bytes:
     return _message(kind, bytes([len(key.encode())]) + key.encode() + value)
 
 
-def _framed(number: int, own: Rows) -> Rows:
+def _framed(number: int, own: Rows) -> Bytes:
     """Each row as a message of data (N, size)."""
     size = own.dtype.itemsize
     framed = np.empty((len(own), size + 5), np.uint8)
     framed[:, :5] = np.frombuffer(struct.pack("<H", size + 2) + b"D" + struct.pack("<H", number), np.uint8)
     framed[:, 5:] = np.ascontiguousarray(own).view(np.uint8).reshape(len(own), size)
     return framed
-
-
-def _in_order(parts: Sequence[tuple[Rows, Rows]]) -> bytes:
-    """Messages (N, size) of several sizes, with the times of each, one after the other as time goes on."""
-    if not parts:
-        return b""
-    sizes = np.concatenate([np.full(len(framed), framed.shape[1]) for _, framed in parts])
-    order = np.argsort(np.concatenate([stamps for stamps, _ in parts]), kind="stable")
-    starts = np.empty(len(sizes), int)
-    starts[order] = np.cumsum(sizes[order]) - sizes[order]
-    whole = np.empty(sizes.sum(), np.uint8)
-    done = 0
-    for _, framed in parts:
-        at = starts[done : done + len(framed)]
-        for k, column in enumerate(framed.T):
-            whole[at + k] = column
-        done += len(framed)
-    return whole.tobytes()

@@ -116,6 +116,15 @@ class View:
         said = json.loads(self._tree.attrs.get("estimated_point_b_m", "{}"))
         return {name: np.array(arm, float) for name, arm in said.items()}
 
+    def origin(self) -> tuple[float, float, float]:
+        """The first place that truth has, else an estimate: latitude, longitude [rad], height [m]."""
+        for own in (self.truth, *self.estimators.values()):
+            known = np.flatnonzero(np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"]))
+            if len(known):
+                lat, lon, h = (float(own[name][known[0]]) for name in ("lat", "lon", "h"))
+                return lat, lon, h
+        return 0.0, 0.0, 0.0
+
     def reports(self, estimator: str, aid: str) -> Columns:
         """What became of the samples of one aid, none where it is not used."""
         return self.group(f"estimators/{estimator}/innovations/{aid}")

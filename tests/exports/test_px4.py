@@ -12,8 +12,9 @@ import pytest
 from pyulog import ULog
 
 from testbed.exports import export
-from testbed.exports.px4 import NEVER, START_US, local
+from testbed.exports.px4 import NEVER, local
 from testbed.exports.px4_messages import MESSAGES, VERSIONS
+from testbed.exports.stream import START_US
 from testbed.exports.ulog import layout
 from testbed.feeds import px4
 from testbed.record.reader import load
