@@ -84,7 +84,7 @@ class Federated:
         for local, filter_ in zip(config.locals, self.locals, strict=True):
             for monitored in local.sensors:
                 self._users.setdefault(monitored.aid.sensor, []).append(filter_)
-                filter_.monitor(monitored, config.isolate_after, config.readmit_after)
+                filter_.monitor(monitored, config.patience)
         # Rows of the state: the filters, then, with a recall, their younger shadows and their older ones.
         self._copies = 1 if config.recall_s is None else 3
         self._reference = Reference(
@@ -403,7 +403,7 @@ class Federated:
             for monitored in local.sensors:
                 monitors = filter_.of_sensor[monitored.aid.sensor]
                 if isinstance(monitored.aid, GnssAid) and any(w.suspect for w in monitors):
-                    filter_.monitor(monitored, config.isolate_after, config.readmit_after)
+                    filter_.monitor(monitored, config.patience)
                     for part, monitor in zip(monitored.aid.parts, filter_.of_sensor[monitored.aid.sensor], strict=True):
                         self._note(sample.t, filter_, monitored.aid.sensor, part[0], monitor)
         self._widen(state, sample)

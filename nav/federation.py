@@ -12,9 +12,9 @@ Structure
 
 Faults
     Each part of a sensor's samples has a monitor (`nav.monitor.Monitor`): its detector judges the innovation against
-    the local filter; axes that it refuses are left out, and isolated when that lasts. A sensor with one part isolated
-    on every axis is isolated as a whole. While any part of a sensor is isolated, it is judged against the fused
-    solution of the filters without an isolated part, since its own filter drifts, or is wrong.
+    the local filter; axes that it refuses are left out, and isolated when that lasts (`nav.monitor.Patience`). A sensor
+    with one part isolated on every axis is isolated as a whole. While any part of a sensor is isolated, it is judged
+    against the fused solution of the filters without an isolated part, since its own filter drifts, or is wrong.
 
     A fault that grows slowly has pulled its filter before it is found. Therefore, on every isolation, all filters start
     again from the fused solution of those without an isolated part, P_i = P_g / beta_i: nothing of the faulty sensor
@@ -76,7 +76,7 @@ Recall
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -84,7 +84,7 @@ import numpy as np
 from nav.aids.base import Aid
 from nav.error_model import ImuModel
 from nav.fusion import Combination, Weigh, weights_by_covariance
-from nav.monitor import MonitoredAid
+from nav.monitor import MonitoredAid, Patience
 from nav.samples import Array
 from nav.unscented import Scaling
 from nav.weighting import Normalise, normalised_weights
@@ -125,8 +125,7 @@ class Config:
     weigh: Weigh = weights_by_covariance
     normalise: Normalise = normalised_weights
     fusion_period_s: float = 1.0  # at the first aiding epoch after this; 0 is at every one
-    isolate_after: int = 3  # consecutive condemned measurements
-    readmit_after: int = 10  # consecutive sound measurements
+    patience: Patience = field(default_factory=Patience)
     recall_s: float | None = None  # age of what an isolated filter goes back to; None: to the others' solution
     cross_check: bool = False  # of the filters' solutions, at every fusion
     patience_s: float = 30.0  # of refused positions and none fused

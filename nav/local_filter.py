@@ -19,7 +19,7 @@ from nav.aids.base import FUSED, OUTSIDE, Aid, Measurement, OperatingPoint, Ruli
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
-from nav.monitor import Monitor, MonitoredAid
+from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
 from nav.samples import Array, Outcome, Sample, UpdateReport
 from nav.state import State, absorb
@@ -57,12 +57,12 @@ class LocalFilter:
         self.fadings: Mapping[str, Fading] = {}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
 
-    def monitor(self, monitored: MonitoredAid, isolate_after: int, readmit_after: int) -> None:
+    def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
         """Monitor each part of a sensor's samples, from a clean record."""
         sensor, policy = monitored.aid.sensor, monitored.policy
         for part, size in monitored.aid.parts:
             self.monitors[sensor, part] = Monitor(
-                monitored.detector(), policy() if policy else None, size, isolate_after, readmit_after
+                monitored.detector(), policy() if policy else None, size, patience, monitored.coloured
             )
         self.of_sensor[sensor] = [self.monitors[sensor, part] for part, _ in monitored.aid.parts]
 

@@ -12,20 +12,34 @@ from typing import NamedTuple
 import numpy as np
 
 from nav.aids.base import Aid
-from nav.detection import ChiSquare, Decision, Detector, Mask, chi_square_threshold
+from nav.detection import ChiSquare, Decision, Detector, LongRunVariance, Mask, chi_square_threshold
 from nav.samples import Array
 from nav.weighting import Policy, split
 
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Monitor`
+ROUNDING = 1e-6  # of times [s]
 
 
 @dataclass(frozen=True)
 class MonitoredAid:
-    """A sensor of a local filter; detector and policy are made anew for each part of its samples."""
+    """A sensor of a local filter; detector and policy are made anew for each part of its samples.
+
+    ``coloured`` says that its detector gathers evidence over samples, which may be coloured (`LongRunVariance`).
+    """
 
     aid: Aid
     detector: Callable[[], Detector] = lambda: ChiSquare(1e-3)
     policy: Callable[[], Policy] | None = None
+    coloured: bool = False
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a sensor must have been condemned to be isolated, and sound to be readmitted."""
+
+    isolate_after: int = 3  # consecutive condemned samples
+    isolate_s: float = 0.0  # and from the first of them to the last
+    readmit_after: int = 10  # consecutive sound samples
 
 
 class Change(Enum):
@@ -54,31 +68,34 @@ class Monitor:
 
     Of its policy ``noise`` is what learns R, before the detector judges, and ``policy`` the rest (`split`).
 
-    A refused measurement goes axis by axis (`Decision.axis_mask`). An axis that the detector refused ``isolate_after``
-    times in a row is isolated. It is readmitted when it has been sound ``readmit_after`` times in a row, or when all
-    isolated axes would each be sound alone `PATIENT` times as often: while a sensor is isolated nothing estimates its
-    slow errors, its innovations are correlated, and a detector that gathers them might never let it go. The detector
-    begins anew then.
+    A refused measurement goes axis by axis (`Decision.axis_mask`). An axis that the detector refused as often in a row,
+    and for as long, as `Patience` says is isolated. It is readmitted when it has been sound ``readmit_after`` times in
+    a row, or when all isolated axes would each be sound alone `PATIENT` times as often: while a sensor is isolated
+    nothing estimates its slow errors, its innovations are correlated, and a detector that gathers them might never let
+    it go. The detector begins anew then; what was learned of the colour of its innovations is kept.
 
     ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
     measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement [s].
     """
 
     def __init__(
-        self, detector: Detector, policy: Policy | None, size: int, isolate_after: int, readmit_after: int
+        self, detector: Detector, policy: Policy | None, size: int, patience: Patience, coloured: bool = False
     ) -> None:
         self.detector = detector
         self.noise, self.policy = split(policy)
-        self._isolate_after, self._readmit_after = isolate_after, readmit_after
+        self._patience, self._variance = patience, LongRunVariance() if coloured else None
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
         self.suspicion, self.judged = 0.0, -math.inf
         self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
+        self._bad_since = np.full(size, math.inf)  # time of the first of those in a row
         self._clean = True
         self._new_detector = deepcopy(detector)
 
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on a measurement, and what it changes; an axis isolated outweighs one readmitted."""
+        if self._variance is not None:
+            S = self._variance.widened(nu, S, t, sound=self._clean)
         decision = self.detector.step(nu, S, t)
         ratio = decision.statistic / decision.threshold
         self.suspicion, self.judged = max(ratio, 0.0) if ratio == ratio else math.inf, t
@@ -86,12 +103,15 @@ class Monitor:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated
         self._bad = np.where(sound, 0.0, self._bad + 1.0)
+        self._bad_since = np.where(sound, math.inf, np.minimum(self._bad_since, t))
         self._good = np.where(sound, self._good + 1.0, 0.0)
         alone = nu * nu <= chi_square_threshold(ALONE_FALSE_ALARM, 1) * S.diagonal()
         self._alone = np.where(before & alone, self._alone + 1.0, 0.0)
-        patient = self.suspect and bool((self._alone[before] >= PATIENT * self._readmit_after).all())
-        kept = before & (self._good < self._readmit_after) & (not patient)
-        self.isolated = kept | (~before & (self._bad >= self._isolate_after))
+        patience = self._patience
+        patient = self.suspect and bool((self._alone[before] >= PATIENT * patience.readmit_after).all())
+        kept = before & (self._good < patience.readmit_after) & (not patient)
+        lasting = (self._bad >= patience.isolate_after) & (t - self._bad_since >= patience.isolate_s - ROUNDING)
+        self.isolated = kept | (~before & lasting)
         if patient:
             self.detector, self._alone = deepcopy(self._new_detector), np.zeros(len(nu))
         self.suspect, self.out = bool(self.isolated.any()), bool(self.isolated.all())

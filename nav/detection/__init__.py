@@ -8,13 +8,15 @@ A detector holds the state of one sensor: build one for each.
 Which one: `ChiSquare` sees a fault in one sample or not at all; `Eraim` is the same test and keeps the sound axes
 (`nav.detection.snapshot`); `Sprt` gathers evidence over samples, as Zhou et al. 2025 do (`nav.detection.sequential`,
 with what it remembers in `nav.detection.means`); `Glr` finds slow faults sooner and knows best when they end
-(`nav.detection.glr`). `GnssMonitor` decides on the fixes of a receiver (`nav.detection.gnss`).
+(`nav.detection.glr`). Both take innovations for white; `LongRunVariance` says how far that is true
+(`nav.detection.colour`). `GnssMonitor` decides on the fixes of a receiver (`nav.detection.gnss`).
 
 Sources: Zhou et al. 2025 (SINS/GNSS/odometer, completely reset SPRT; "Eq" in this package), Cui et al. 2022 (ERAIM),
 Siegmund, Sequential Analysis (1985). Evidence is a logarithm of a likelihood ratio [nats].
 """
 
 from nav.detection.base import Decision, Detector, Event, Mask, chi_square_threshold, whiten
+from nav.detection.colour import LongRunVariance
 from nav.detection.glr import Glr, glr_false_alarm, glr_threshold
 from nav.detection.gnss import PROBATION_S, RECOVERY_S, GnssMonitor, Verdict
 from nav.detection.means import Mean, RunningMean, WindowMean, exponential, plain
@@ -35,6 +37,7 @@ __all__ = [
     "Evidence",
     "Glr",
     "GnssMonitor",
+    "LongRunVariance",
     "Mask",
     "Mean",
     "Never",

@@ -26,7 +26,7 @@ from nav.detection import (
 from nav.federated import Federated
 from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
-from nav.monitor import MonitoredAid
+from nav.monitor import MonitoredAid, Patience
 from nav.weighting import MahalanobisInflation, Policy, SageHusa
 from testbed.estimators.datasheet import aid_of, imu_model
 from testbed.estimators.ins import scaling
@@ -78,6 +78,9 @@ class DetectorSection(Section):
         le=600,
         description="glr: how long ago the fault may have begun; sprt, mean window: its span",
     )
+    coloured: bool = Field(
+        default=True, description="sprt, glr: widened by how far the innovations turn out not to be white"
+    )
 
     @model_validator(mode="after")
     def _own_keys(self) -> Self:
@@ -86,6 +89,7 @@ class DetectorSection(Section):
             ("forgetting", ("sprt",), ("exponential",)),
             ("reset", ("sprt",), ()),
             ("window_s", ("glr", "sprt"), ("window",)),
+            ("coloured", ("sprt", "glr"), ()),
         ):
             if key in self.model_fields_set and self.kind not in kinds:
                 named = " or ".join(map(repr, kinds))
@@ -161,7 +165,8 @@ class FederatedSection(EstimatorSection):
     fusion_period_s: float = Field(
         default=1.0, ge=0, le=60, description="from one fusion to the next; 0: at every sample"
     )
-    isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples")
+    isolate_after: int = Field(default=3, ge=1, description="consecutive condemned samples until it is left out")
+    isolate_s: float = Field(default=3.0, ge=0, le=60, description="and for at least this long")
     readmit_after: int = Field(default=10, ge=1, description="consecutive sound samples")
     recall_s: float | None = Field(
         default=None, ge=1, le=600, description="isolated, a filter goes back by this; none: to the others' solution"
@@ -224,7 +229,12 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
         Local(
             local.name,
             tuple(
-                MonitoredAid(aids[name], partial(_detector, local.detector), _policy(local.policy))
+                MonitoredAid(
+                    aids[name],
+                    partial(_detector, local.detector),
+                    _policy(local.policy),
+                    local.detector.kind in ("sprt", "glr") and local.detector.coloured,
+                )
                 for name in local.aids
             ),
             local.share,
@@ -241,8 +251,7 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
         retention=section.retention,
         weighting=section.weighting,
         fusion_period_s=section.fusion_period_s,
-        isolate_after=section.isolate_after,
-        readmit_after=section.readmit_after,
+        patience=Patience(section.isolate_after, section.isolate_s, section.readmit_after),
         recall_s=section.recall_s,
         cross_check=section.cross_check,
         mounting_sigma=errors.accel_misalignment,

@@ -14,7 +14,7 @@ from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.local_filter import LocalFilter
-from nav.monitor import Change, Monitor
+from nav.monitor import Change, Monitor, Patience
 from nav.samples import Outcome
 
 
@@ -30,8 +30,8 @@ class Scripted:
         return Decision(mask is not None, 0.0, 1.0, sound, Event.NONE)
 
 
-def changes(masks, isolate_after=3, readmit_after=4):
-    watch = Monitor(Scripted(masks), None, 2, isolate_after, readmit_after)
+def changes(masks, isolate_after=3, readmit_after=4, isolate_s=0.0):
+    watch = Monitor(Scripted(masks), None, 2, Patience(isolate_after, isolate_s, readmit_after))
     rows = []
     for k in range(len(masks)):
         _, change = watch.judge(np.zeros(2), np.eye(2), float(k))
@@ -47,6 +47,12 @@ def test_isolation_needs_consecutive_alarms_on_an_axis():
     assert rows[6][1:] == ((True, True), True, True)
 
 
+def test_isolation_needs_alarms_that_last():
+    bad = (False, True)
+    rows = changes([bad] * 4 + [None] + [bad] * 6, isolate_after=2, isolate_s=4.0)
+    assert [change for change, *_ in rows] == [Change.NONE] * 9 + [Change.ISOLATED, Change.NONE]  # 5 s to 9 s
+
+
 def test_readmission_needs_consecutive_passes():
     bad = (False, True)
     rows = changes([bad] * 3 + [None] * 3 + [bad] + [None] * 4 + [bad] * 2)
@@ -56,7 +62,7 @@ def test_readmission_needs_consecutive_passes():
 
 def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     """Ten times four looks, of all isolated axes; then the detector begins anew."""
-    watch = Monitor(Glr(1e-6), None, 2, 3, 4)
+    watch = Monitor(Glr(1e-6), None, 2, Patience(3, readmit_after=4))
     nu = np.array([1.2, 1.2])  # a sound look, and a fault for one that gathers them
     rows = [watch.judge(nu, np.eye(2), 0.2 * k) for k in range(200)]
     changed = [(k, change) for k, (_, change) in enumerate(rows) if change]
@@ -64,14 +70,14 @@ def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     assert (first, second) == (Change.ISOLATED, Change.READMITTED)
     assert readmitted == isolated + 40
     assert not rows[readmitted + 1][0].alarm
-    watch = Monitor(Glr(1e-6), None, 2, 3, 4)
+    watch = Monitor(Glr(1e-6), None, 2, Patience(3, readmit_after=4))
     for k in range(200):
         watch.judge(np.array([1.2, 5.0]), np.eye(2), 0.2 * k)
     assert watch.suspect  # one of them is not sound
 
 
 def test_an_isolation_from_outside_holds_until_samples_are_sound():
-    watch = Monitor(ChiSquare(1e-3), None, 2, 3, 4)
+    watch = Monitor(ChiSquare(1e-3), None, 2, Patience(3, readmit_after=4))
     watch.isolate()
     assert watch.out
     assert watch.suspect
@@ -150,7 +156,7 @@ def test_a_sensor_can_be_given_to_a_filter_once():
 
 
 def test_a_watch_passes_on_what_its_detector_says():
-    watch = Monitor(ChiSquare(1e-3), None, 1, 1, 2)
+    watch = Monitor(ChiSquare(1e-3), None, 1, Patience(1, readmit_after=2))
     assert not watch.judge(np.array([3.0]), np.eye(1), 0.0)[0].alarm
     decision, change = watch.judge(np.array([3.4]), np.eye(1), 1.0)
     assert decision.alarm
