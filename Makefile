@@ -72,7 +72,7 @@ $(LOWEST)/.ready: requirements-lowest.lock
 lock:
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(COMPILE) --extra dev --extra docs --extra examples --extra parquet --output-file requirements.lock pyproject.toml
+	$(COMPILE) --extra dev --extra docs --extra examples --extra parquet --extra mcap --output-file requirements.lock pyproject.toml
 	$(COMPILE) --resolution lowest-direct --output-file requirements-lowest.lock pyproject.toml
 	$(COMPILE) --group clients --no-deps --constraint requirements.lock --output-file requirements-clients.lock
 

@@ -22,7 +22,8 @@ class Format:
     """One format: its name, the ending that replaces the record's, what is in it, and who reads it.
 
     ``module`` has ``content(tree) -> bytes``; of a folder of files (``many``) ``contents(tree) -> dict of names and
-    bytes``. An ending that begins with ``_`` is that of a folder. ``extra`` is the optional extra of the installation
+    bytes``. An ending without a dot is that of a folder. ``version`` is what one
+    module of several formats is told. ``extra`` is the optional extra of the installation
     that it needs.
     """
 
@@ -37,7 +38,7 @@ class Format:
     @property
     def many(self) -> bool:
         """Whether it is a folder of files."""
-        return self.ending.startswith("_")
+        return "." not in self.ending
 
 
 FORMATS: dict[str, Format] = {
@@ -60,6 +61,22 @@ FORMATS: dict[str, Format] = {
             "an ArduPilot log: samples, truth as SIM, estimators as cores of XKF1",
             "pymavlink, MAVExplorer, Mission Planner, UAV Log Viewer, PlotJuggler",
         ),
+        Format(
+            "mcap",
+            ".mcap",
+            "foxglove",
+            "locations, poses, inertial samples and events, Foxglove's schemas in JSON",
+            "Foxglove, PlotJuggler, mcap",
+            extra="mcap",
+        ),
+        Format("kml", ".kml", "kml", "truth and estimates on the map, denied stretches, 95 % ellipses", "Google Earth"),
+        Format("czml", ".czml", "czml", "the same over time", "Cesium"),
+        Format("gpx", ".gpx", "gpx", "truth, GNSS fixes and estimates as tracks", "GPS viewers, GIS"),
+        Format("pos", "_pos", "rtklib", "truth, each receiver and estimator as a solution", "RTKLIB's RTKPLOT"),
+        Format(
+            "navego", "_navego.mat", "toolboxes", "first IMU and receiver, truth as ref", "NaveGo", version="navego"
+        ),
+        Format("psins", "_psins.mat", "toolboxes", "the same as trj and gps", "PSINS", version="psins"),
         Format("mat", ".mat", "matlab", "everything, one struct per group", "MATLAB, Octave, scipy"),
     )
 }

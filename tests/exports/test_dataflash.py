@@ -15,6 +15,8 @@ from testbed.exports.dataflash import MESSAGES
 from testbed.record.reader import load
 from testbed.score.accuracy import euler
 
+pytestmark = pytest.mark.ci
+
 START_US = 1_000_000
 
 

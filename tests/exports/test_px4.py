@@ -19,6 +19,8 @@ from testbed.exports.ulog import layout
 from testbed.feeds import px4
 from testbed.record.reader import load
 
+pytestmark = pytest.mark.ci
+
 MESSAGE_FOLDERS = "TESTBED_PX4_MSGS"  # PX4's own definitions: the folder of px4_msgs of each version, 1.16=DIR:1.15=DIR
 
 
