@@ -76,7 +76,7 @@ def test_drift_and_scale_factors_are_states_when_asked_for() -> None:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("engine", ["linear", "unscented"])
+@pytest.mark.parametrize("engine", ["linear", pytest.param("unscented", marks=pytest.mark.slow)])
 def test_scale_factors_are_found_in_flight(engine: str) -> None:
     """Against what the unit makes of true increments, without its biases and noise."""
     estimator = (

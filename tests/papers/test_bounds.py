@@ -37,7 +37,7 @@ def test_the_matched_filter_alarms_as_often_as_computed() -> None:
     assert alarms[:, 1:].mean() == pytest.approx(clairvoyant(5, STEEP)[1], abs=0.01)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_no_detector_of_the_library_beats_it() -> None:
     """Neither sooner in the median nor for more of the fault, at the same false alarms."""
     from testbed.papers.zhou2025 import replays

@@ -59,7 +59,7 @@ def test_what_was_never_found_counts_as_the_largest() -> None:
     assert NEARLY_ALL.of(values) == (math.inf, math.inf, math.inf)
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("statistic", "truth"), [(MEDIAN, 0.0), (NEARLY_ALL, stats.norm.ppf(0.95)), (MEAN, 0.0), (RMS, 1.0)]
 )
