@@ -351,7 +351,7 @@ def metric_names() -> str:
     """All metrics: which way is better, and how far a golden value may be off."""
     from testbed import measures
 
-    wanted = {"less": "small", "more": "large", "nearer to one": "1", "none": "–"}
+    wanted = {"less": "small", "more": "large", "nearer to one": "1", "nearer to zero": "0", "none": "–"}
     groups = [
         ("of an estimator, `<estimator>.…`", measures.MEASURES),
         ("of an estimator and a sensor, `<estimator>.….<sensor>`", measures.OF_AIDS),

@@ -16,7 +16,7 @@ events, or samples of a sensor at 5 Hz, are no difference.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import product
 
@@ -29,6 +29,7 @@ class Aim(Enum):
     LESS = "less"
     MORE = "more"
     ONE = "nearer to one"
+    ZERO = "nearer to zero"
     NONE = "none"
 
 
@@ -51,16 +52,22 @@ class Measure:
     def _badness(self, value: float) -> float:
         if self.aim is Aim.ONE:
             return abs(math.log(max(value, 1e-12)))
+        if self.aim is Aim.ZERO:
+            return abs(value)
         return -value if self.aim is Aim.MORE else value
 
 
 def _statistics() -> dict[str, Measure]:
     """The metrics that there are with GNSS and, with ``outage_`` in front, without."""
     position, velocity, angle = (Measure(floor=floor) for floor in (1e-4, 1e-5, 1e-5))
-    of_axes = tuple(product(("north", "east", "down"), ("rms", "max", "std")))
+    axes = ("north", "east", "down")
+    of_axes = tuple(product(axes, ("rms", "max", "std")))
     found = {
         **dict.fromkeys([f"position_{axis}_{statistic}_m" for axis, statistic in of_axes], position),
         **dict.fromkeys([f"velocity_{axis}_{statistic}_mps" for axis, statistic in of_axes], velocity),
+        **{f"position_{axis}_mean_m": replace(position, aim=Aim.ZERO) for axis in axes},
+        **{f"velocity_{axis}_mean_mps": replace(velocity, aim=Aim.ZERO) for axis in axes},
+        **{f"{one}_mean_deg": replace(angle, aim=Aim.ZERO) for one in ("roll", "pitch", "heading")},
         **dict.fromkeys([f"position_horizontal_{statistic}_m" for statistic in ("rms", "max")], position),
         "position_horizontal_over_3sigma_max": Measure(floor=1e-3),
         "position_vertical_rms_m": position,
@@ -79,6 +86,7 @@ def _statistics() -> dict[str, Measure]:
 # Of an estimator, by the name without it,
 MEASURES: dict[str, Measure] = _statistics() | {
     **{f"outage_position_horizontal_at_{mark}s_m": Measure(floor=1e-4) for mark in (60, 120, 300, 600)},
+    **{f"outage_bound_at_{mark}s_m": Measure(Aim.NONE, floor=1e-4) for mark in (60, 120, 300, 600)},
     "aligned_s": Measure(floor=0.5),
     "recovery_s": Measure(floor=0.5),
     "unrecovered_outages": Measure(share=0.0),

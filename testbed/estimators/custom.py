@@ -83,8 +83,7 @@ def build(section: CustomSection, rig: Rig) -> Lane:
     missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     if missing:
         raise UserError(f"estimator {section.name}: {section.kind} lacks {', '.join(missing)}: see docs/extending.md")
-    aiding = tuple(name for name, sensor in rig.sensors.items() if sensor.kind != "imu")
-    used = aiding if section.aids is None else section.aids
+    used = section.aiding(rig.sensors)
     imus, voter = mountings(section, rig)
     coning = rig.imu(section.imu).rate_hz < rig.tick_rate_hz
     return Lane(FusionHorizon(Adapter(inner), rig.lag_s(used), coning=coning), imus, used, voter=voter)

@@ -173,6 +173,10 @@ class FederatedSection(EstimatorSection):
     )
     cross_check: bool = Field(default=False, description="of the local filters with each other; needs no_reset")
 
+    def aiding(self, sensors: Mapping[str, SensorConfig]) -> tuple[str, ...]:
+        """The names of those sensors whose samples it is handed once aligned."""
+        return tuple(dict.fromkeys(name for local in self.locals for name in local.aids))
+
     def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
         """What is wrong with it among these sensors."""
         yield from super().mistakes(sensors)

@@ -74,6 +74,11 @@ class EstimatorSection(Section):
         """Whether it estimates no position and no velocity."""
         return False
 
+    def aiding(self, sensors: Mapping[str, SensorConfig]) -> tuple[str, ...]:
+        """The names of those sensors whose samples it is handed once aligned."""
+        aids: tuple[str, ...] | None = getattr(self, "aids", None)
+        return tuple(name for name, one in sensors.items() if one.kind != "imu") if aids is None else aids
+
     def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
         """What is wrong with it among these sensors."""
         imus = [name for name, sensor in sensors.items() if sensor.kind == "imu"]

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from nav.samples import Array
 from testbed.motion.legs import Leg
 from testbed.motion.sections import FlightTruth
 from testbed.schema import Section
@@ -42,6 +43,22 @@ def gust_sigma(level: str, alt_m: float) -> float:
         return low / math.pow(0.177 + 0.000823 * h, 0.4) * FOOT
     high = float(np.interp(h, HIGH, EXCEEDANCE[curve]))
     return (low + min((h - 1000.0) / 1000.0, 1.0) * (high - low)) * FOOT
+
+
+def gust_statistics(level: str, alt_m: Array) -> tuple[Array, Array]:
+    """Rms [m/s] and length [m] of JSBSim's gusts along, across and down (N, 3) at altitudes over ground (N,).
+
+    They are first-order Gauss-Markov processes of these lengths over the airspeed (MIL-STD-1797A as Yeager 1998 has it,
+    equations 30 to 32): across and down half of Dryden's L_u and L_w, which up to 1000 ft are h / (0.177 + 0.000823
+    h)^1.2 and h.
+    """
+    h = np.maximum(alt_m / FOOT, 10.0)
+    high = 1000.0 + np.clip((h - 1000.0) / 1000.0, 0.0, 1.0) * 750.0
+    along = np.where(h <= 1000.0, h / (0.177 + 0.000823 * h) ** 1.2, high) * FOOT
+    down = np.where(h <= 1000.0, h, high) * FOOT
+    sigma = np.array([gust_sigma(level, float(alt)) for alt in alt_m])
+    vertical = np.where(h <= 1000.0, 0.1 * TURBULENCE[level][0] * FOOT, sigma)
+    return np.column_stack([sigma, sigma, vertical]), np.column_stack([along, along / 2, down / 2])
 
 
 def expected_gust(truth: Section, plan: Sequence[Leg]) -> float:

@@ -15,15 +15,19 @@ import csv
 import io
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from nav.samples import Array
 from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
 from testbed.report.page import Shown, png, render
 from testbed.results import REPORT, write_result
+from testbed.score.accuracy import AXES
+from testbed.score.metrics import OUTAGE_MARKS_S
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,7 +62,9 @@ OF_FAULTS: Mapping[str, str] = {
     "error_over_3sigma": "error / claimed 3 σ",
 }
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})
-CONFIDENCE = 0.95  # of the interval of a quantile
+ERROR_AT, BOUND_AT = "outage_position_horizontal_at_{}s_m", "outage_bound_at_{}s_m"
+CONFIDENCE = 0.95  # of the interval of a quantile, or of a mean
+MEAN_ERROR = re.compile(r"(outage_)?(position|velocity)_(north|east|down)_mean_\w+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,23 +110,64 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True)
+class Mean:
+    """One signed error of one estimator: the mean over the runs of one combination of each run's mean error.
+
+    ``low`` and ``high`` are the ends of Student's 95 % interval, NaN where there is one run only.
+    """
+
+    combination: int
+    estimator: str
+    metric: str
+    mean: float
+    low: float
+    high: float
+    runs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Efficiency:
+    """Horizontal error of one estimator some time into an outage over the bound, both root mean squares over the runs.
+
+    1 is as good as can be. ``low`` and ``high`` are from Student's 95 % interval of the mean square, NaN where there is
+    one run only.
+    """
+
+    combination: int
+    estimator: str
+    metric: str
+    rms: float
+    bound: float
+    efficiency: float
+    low: float
+    high: float
+    runs: int
+
+
+@dataclass(frozen=True, slots=True)
 class Statistics:
     """Everything the tables show."""
 
     spreads: Sequence[Spread]
     consistency: Sequence[Consistency]
+    means: Sequence[Mean] = ()
+    efficiencies: Sequence[Efficiency] = ()
 
 
 def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Statistics:
-    """Spread and consistency of every estimator, one combination after the other."""
+    """Spread, mean errors, efficiency and consistency of every estimator, one combination after the other."""
     spreads: list[Spread] = []
     consistency: list[Consistency] = []
+    means: list[Mean] = []
+    efficiencies: list[Efficiency] = []
     for i, combination in enumerate(combinations):
         own = [outcome for outcome in outcomes if outcome.combination == i]
         for estimator in [e.name for e in combination.scenario.estimator] if own else ():
             spreads += _spreads(i, estimator, own)
             consistency.append(_consistency(i, estimator, own))
-    return Statistics(spreads, consistency)
+            means += _means(i, estimator, own)
+            efficiencies += _efficiencies(i, estimator, own)
+    return Statistics(spreads, consistency, means, efficiencies)
 
 
 def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Spread]:
@@ -136,6 +183,37 @@ def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> I
             worst, seed = (min if small else max)(found, key=lambda pair: pair[0])
             median, p95 = _quantile(values, 0.5), _quantile(values, 0.05 if small else 0.95)
             yield Spread(combination, estimator, metric, *median, *p95, worst, seed, len(found))
+
+
+def _means(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Mean]:
+    keys = dict.fromkeys(key for o in outcomes for key in o.metrics if key.startswith(f"{estimator}."))
+    for key in (key for key in keys if MEAN_ERROR.fullmatch(key.partition(".")[2])):
+        values = np.array([o.metrics[key] for o in outcomes if key in o.metrics])
+        yield Mean(combination, estimator, key.partition(".")[2], *_mean(values), len(values))
+
+
+def _efficiencies(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Efficiency]:
+    for mark in OUTAGE_MARKS_S:
+        keys = [f"{estimator}.{name.format(mark)}" for name in (ERROR_AT, BOUND_AT)]
+        both = np.array([[o.metrics[key] for key in keys] for o in outcomes if all(key in o.metrics for key in keys)])
+        if not len(both) or not both[:, 1].all():
+            continue
+        error, bound = (both**2).T
+        share, low, high = (math.sqrt(max(one, 0.0)) for one in _mean(error / bound.mean()))
+        rms, least = math.sqrt(error.mean()), math.sqrt(bound.mean())
+        name = f"outage_efficiency_at_{mark}s"
+        yield Efficiency(combination, estimator, name, rms, least, share, low, high, len(both))
+
+
+def _mean(values: Array) -> tuple[float, float, float]:
+    """The mean of some values, and the ends of its interval."""
+    from scipy.special import stdtrit  # as scipy.stats, which takes half a second to import
+
+    mean, n = float(values.mean()), len(values)
+    if n < 2:
+        return mean, math.nan, math.nan
+    half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1)) / math.sqrt(n)
+    return mean, mean - half, mean + half
 
 
 def _quantile(values: Sequence[float], p: float) -> tuple[float, float, float]:
@@ -219,6 +297,8 @@ def _json(result: CampaignResult) -> dict[str, Any]:
         "runs": len(result.outcomes),
         "spreads": plain(result.statistics.spreads),
         "consistency": plain(result.statistics.consistency),
+        "means": plain(result.statistics.means),
+        "efficiencies": plain(result.statistics.efficiencies),
         "failures": plain(result.failures),
     }
 
@@ -265,7 +345,34 @@ def texts(result: CampaignResult) -> list[Text]:
         Text("Errors over the runs", errors, 2 + len(keys)),
         *([sure] if enough else []),
         Text("Consistency over the runs", consistency, 1 + len(keys)),
+        *_efficiency(result, keys),
+        *_mean_errors(result, keys),
     ]
+
+
+def _efficiency(result: CampaignResult, keys: Sequence[str]) -> Iterator[Text]:
+    """How near to the bound the horizontal errors in outages are; nothing where there is no bound."""
+    rows = [["estimator", "after", *keys, "rms [m]", "bound [m]", "rms / bound", "95 % interval", "runs"]]
+    for e in result.statistics.efficiencies:
+        after = e.metric.rpartition("_")[2].removesuffix("s")
+        numbers = [_number(e.rms), _number(e.bound), f"{e.efficiency:.2f}", _interval(e.low, e.high), str(e.runs)]
+        rows.append([e.estimator, f"{after} s", *result.combinations[e.combination].values.values(), *numbers])
+    if len(rows) > 1:
+        yield Text("Horizontal error in outages against the bound", rows, 2 + len(keys))
+
+
+def _mean_errors(result: CampaignResult, keys: Sequence[str]) -> Iterator[Text]:
+    """Mean errors by axis with half of their intervals, a line for each quantity."""
+    rows = [["estimator", "mean error", *keys, *(f"{axis} ± 95 %" for axis in AXES), "runs"]]
+    found = {(m.combination, m.estimator, m.metric): m for m in result.statistics.means if m.runs > 1}
+    for combination, estimator, metric in (key for key in found if "_north_" in key[2]):
+        axes = [found[combination, estimator, metric.replace("north", axis)] for axis in AXES]
+        named = metric.replace("outage_", "in outage, ").replace("_north_mean_", " [").replace("mps", "m/s") + "]"
+        numbers = [f"{m.mean:+.3f} ± {m.high - m.mean:.3f}" for m in axes]
+        own = result.combinations[combination].values.values()
+        rows.append([estimator, named, *own, *numbers, str(axes[0].runs)])
+    if len(rows) > 1:
+        yield Text("Mean errors over the runs", rows, 2 + len(keys))
 
 
 def tables(result: CampaignResult) -> list[Table]:

@@ -14,9 +14,10 @@ from nav.samples import Array
 from testbed.errors import UserError
 from testbed.report import style
 from testbed.scenario import Scenario
-from testbed.score import accuracy, detection, observability
+from testbed.score import accuracy, bound, detection, observability
 from testbed.score import metrics as scores
 from testbed.score.accuracy import Errors, column
+from testbed.score.bound import Bound
 from testbed.sensors.imu import ImuConfig, ImuErrors
 
 if TYPE_CHECKING:
@@ -43,6 +44,11 @@ class Run:
     def seen(self) -> dict[str, Visibility]:
         """Which states of each estimator can be seen."""
         return observability.of_run(self.dataset)
+
+    @cached_property
+    def bounds(self) -> dict[str, Bound]:
+        """What no estimator can be better than, by the name of each that has a bound; only of a run with an outage."""
+        return bound.of_run(self.dataset) if self.windows else {}
 
     def truth(self, name: str) -> Array:
         """One column of truth."""

@@ -28,6 +28,7 @@ COLOURS = (
 )  # fmt: skip
 DASHES = ("-", "--", ":", "-.")  # a colour that comes again is dashed
 TRUTH = "#000000"
+BOUND: dict[str, Any] = {"color": "#000000", "lw": 1.1, "ls": (0, (4, 1.5)), "zorder": 4}  # what nobody can be below
 NEUTRAL = "#3A4A5A"  # what belongs to no estimator: a sensor
 GUIDE = "#444444"  # gates, bounds
 PROMISED = "#B06A00"  # by a data sheet

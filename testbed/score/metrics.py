@@ -10,8 +10,10 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
 * An estimator of attitude alone (`Status.ATTITUDE_ONLY`) is judged by its attitude alone.
-* ``north``, ``east``, ``down``, ``roll`` and ``pitch`` are single axes; ``std`` is about the mean error, ``max`` the
-  largest size.
+* ``north``, ``east``, ``down``, ``roll`` and ``pitch`` are single axes; ``mean`` has its sign, ``std`` is about it,
+  ``max`` the largest size.
+* ``outage_bound`` is what no estimator of the same sensors can be better than, on average over draws: the least root
+  mean square of the horizontal error at that time, `testbed.score.bound`. Of simulated runs only.
 * NEES and NIS are per degree of freedom: 1 is perfectly consistent, above is overconfident. NIS is averaged over what
   the gate judged, whether it let it pass or not, and ``rejected_fraction`` is the share that it did not. What was
   withheld for another reason, such as probation after an outage, is in neither.
@@ -53,6 +55,7 @@ from testbed.motion.sections import FlightTruth
 from testbed.record.reader import scenario_of
 from testbed.results import write_result
 from testbed.schema import LONGEST_RUN_S
+from testbed.score import bound
 from testbed.score.accuracy import (
     AXES,
     RECOVERY_WINDOW_S,
@@ -131,8 +134,11 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
         )
     result: dict[str, float] = {}
     windows = outages(dataset)
+    bounds = bound.of_run(dataset) if windows else {}
     for name in names(dataset):
         own = _estimator(dataset, name, windows, settling_s)
+        if name in bounds and "aligned_s" in own:
+            own |= bound.marks(bounds[name], windows, OUTAGE_MARKS_S)
         result |= {f"{name}.{key}": float(value) for key, value in own.items()}
     return result | {f"flight.{key}": float(value) for key, value in _flight(dataset, windows).items()}
 
@@ -256,6 +262,7 @@ def _statistics(e: Errors, mask: Mask, prefix: str) -> dict[str, float]:
     for axis, values, unit in axes:
         result[f"{axis}_rms_{unit}"] = _rms(values)
         result[f"{axis}_max_{unit}"] = float(np.abs(values).max())
+        result[f"{axis}_mean_{unit}"] = float(values.mean())
         result[f"{axis}_std_{unit}"] = float(values.std())
     for what, values in (("position", e.position_nees), ("velocity", e.velocity_nees), ("attitude", e.attitude_nees)):
         finite = values[mask & np.isfinite(values)]

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from distributed import LocalCluster
-from scipy.stats import chi2
+from scipy.stats import chi2, ttest_1samp
 from typer.testing import CliRunner
 from worlds import synthetic_run
 
@@ -537,6 +537,9 @@ def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float 
         "ins.false_alarms_per_h": float(seed % 2),
     }
     metrics |= {"ins.detection_delay_s.jump": 0.1 * seed, "ins.coverage.jump": 1 - 0.01 * seed}
+    mean = {f"ins.outage_velocity_{axis}_mean_mps": 0.3 + 0.01 * seed for axis in ("north", "east", "down")}
+    metrics |= mean | {"ins.heading_mean_deg": 1.0}
+    metrics |= {"ins.outage_position_horizontal_at_600s_m": 60.0 + seed % 2 * 80.0, "ins.outage_bound_at_600s_m": 50.0}
     if seed != 4:
         metrics["ins.recovery_s"] = 10.0 - seed
     return Outcome(combination, seed, metrics, history)
@@ -574,6 +577,26 @@ def test_statistics(tmp_path: Path) -> None:
     assert coverage.p95 == pytest.approx(1 - 0.95 * 0.29)
     shown = "".join(str(cell) for cell in campaign_report.tables(made_up_campaign(tmp_path, ["0"]))[0].columns[1].cells)
     assert "jump: detected after \\[s]" in shown
+
+
+def test_mean_errors_and_efficiency_have_intervals(tmp_path: Path) -> None:
+    result = made_up_campaign(tmp_path, ["0"])
+    mean, _, _ = result.statistics.means  # of axes of position and velocity, nothing else
+    assert (mean.metric, mean.runs) == ("outage_velocity_north_mean_mps", 30)
+    assert mean.mean == pytest.approx(0.445)
+    interval = ttest_1samp(0.3 + 0.01 * np.arange(30), 0.0).confidence_interval(0.95)
+    assert (mean.low, mean.high) == pytest.approx((interval.low, interval.high))
+    (found,) = result.statistics.efficiencies
+    assert (found.metric, found.bound) == ("outage_efficiency_at_600s", pytest.approx(50.0))
+    rms = math.sqrt((60.0**2 + 140.0**2) / 2)
+    assert (found.rms, found.efficiency) == (pytest.approx(rms), pytest.approx(rms / 50.0))
+    interval = ttest_1samp(np.tile([1.2**2, 2.8**2], 15), 0.0).confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx((math.sqrt(interval.low), math.sqrt(interval.high)))
+    (alone,) = made_up_campaign(tmp_path, ["0"], runs=1).statistics.efficiencies
+    assert math.isnan(alone.low)
+    assert alone.efficiency == pytest.approx(1.2)
+    titles = [text.title for text in campaign_report.texts(result)]
+    assert "Horizontal error in outages against the bound" in titles
 
 
 @pytest.mark.ci

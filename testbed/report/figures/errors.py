@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from nav.samples import Array
 from testbed.report.figures.plot import Plot
 from testbed.report.run import Run
-from testbed.report.style import FAINT, FAR, TRUTH, focus_log, layer, sheet, stride, thin
+from testbed.report.style import BOUND, FAINT, FAR, TRUTH, focus_log, layer, sheet, stride, thin
 from testbed.score import accuracy
 from testbed.score.accuracy import Errors
+from testbed.score.bound import Bound
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LOG_LINE = 0.9  # the thinnest line of a logarithmic figure [points]
+LEAST = "Dashed: the least that anybody could claim, where there is an outage."
 SMOOTH_S = 2.0  # the single zero crossings of an error say nothing on a logarithmic axis
 
 
@@ -37,14 +39,15 @@ def comparison(run: Run) -> Figure | None:
     """Size of the errors of all estimators, logarithmic so that a good one stays readable beside a bad one."""
     if not run.aligned:
         return None
-    of_position: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
+    of_position: tuple[tuple[str, Callable[[Errors | Bound], Array]], ...] = (
         ("horizontal\nposition [m]", lambda e: e.horizontal),
         ("height [m]", lambda e: np.abs(e.position[:, 2])),
     )
-    of_attitude: tuple[tuple[str, Callable[[Errors], Array]], ...] = (
+    of_attitude: tuple[tuple[str, Callable[[Errors | Bound], Array]], ...] = (
         ("roll and\npitch [deg]", lambda e: np.rad2deg(e.tilt)),
         ("heading [deg]", lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
+    bounds = {id(bound): bound for bound in run.bounds.values()}.values()  # of estimators with the same sensors, once
     panels = [(run.positioned, *panel) for panel in of_position if run.positioned]
     panels += [(run.aligned, *panel) for panel in of_attitude]
     drawn = sheet(len(panels), height=1.9)
@@ -52,6 +55,8 @@ def comparison(run: Run) -> Figure | None:
         for rank, (name, e) in enumerate(shown.items()):
             line = thin(e.t, np.maximum(moving_rms(e.t, size(e), SMOOTH_S), 1e-6))
             ax.plot(*line, **run.lines[name], **layer(rank, len(shown), LOG_LINE), label=name)
+        for bound in bounds:
+            ax.plot(*thin(bound.t, size(bound)), **BOUND, label="bound")
         ax.set_ylabel(label)
         focus_log(ax, [size(e)[e.valid] for e in shown.values()])
     run.against_time(drawn)
@@ -89,14 +94,24 @@ def _euler_deg(q: Array) -> Array:
     return angles
 
 
-def _error_panels(run: Run, axes: Any, name: str, error: Array, sigma: Array, labels: Sequence[str]) -> None:
-    """Three errors against the bounds that the estimator claims."""
-    t = run.errors[name].t
+class _Sigmas(NamedTuple):
+    """What is claimed (N, 3) of an error, and the least that could be (K, 3), at the times of the bound, if any."""
+
+    claimed: Array
+    least: Array | None
+
+
+def _error_panels(run: Run, axes: Any, name: str, error: Array, sigmas: _Sigmas, labels: Sequence[str]) -> None:
+    """Three errors against what the estimator claims, and against the bound."""
+    t, (sigma, least) = run.errors[name].t, sigmas
     some = stride(len(t))
     for k, ax in enumerate(axes):
         low, high = -3 * sigma[some, k], 3 * sigma[some, k]
         ax.fill_between(t[some], low, high, color=run.colours[name], alpha=FAINT, lw=0, label="±3 sigma, claimed")
         ax.plot(*thin(t, error[:, k]), color=run.colours[name], lw=0.9, label="error")
+        if least is not None:
+            for sign in (-3, 3):
+                ax.plot(*thin(run.bounds[name].t, sign * least[:, k]), **BOUND, label="±3 sigma, bound")
         ax.set_ylabel(labels[k])
 
 
@@ -133,7 +148,9 @@ def position_errors(run: Run, name: str) -> Figure | None:
     for k, (mask, limits) in enumerate(zip(masks[: 2 if any(closer) else 1], reach, strict=False)):
         scale, unit = (1e-3, "km") if np.abs(e.position[mask]).max(initial=0.0) > 5000 else (1.0, "m")
         labels = [f"{axis} [{unit}]" for axis in accuracy.AXES]
-        _error_panels(run, drawn.axes[:, k], name, scale * e.position, scale * e.sigma_position, labels)
+        least = scale * run.bounds[name].position if name in run.bounds else None
+        sigmas = _Sigmas(scale * e.sigma_position, least)
+        _error_panels(run, drawn.axes[:, k], name, scale * e.position, sigmas, labels)
         _reach(drawn.axes[:, k], [scale * limit for limit in limits])
     if any(closer):
         drawn.axes[0, 0].set_title("whole run", fontsize=10, loc="left")
@@ -152,13 +169,16 @@ def motion_errors(run: Run, name: str) -> Figure:
     """Velocity and attitude error with ±3 sigma."""
     e = run.errors[name]
     labels = ("about north [deg]", "about east [deg]", "about down [deg]")
-    columns = [("attitude", np.rad2deg(e.attitude), np.rad2deg(e.sigma_attitude), labels)]
+    bound = run.bounds.get(name)
+    sigmas = _Sigmas(np.rad2deg(e.sigma_attitude), np.rad2deg(bound.attitude) if bound else None)
+    columns = [("attitude", np.rad2deg(e.attitude), sigmas, labels)]
     if not e.attitude_only:
-        columns.insert(0, ("velocity", e.velocity, e.sigma_velocity, ("north [m/s]", "east [m/s]", "down [m/s]")))
+        sigmas = _Sigmas(e.sigma_velocity, bound.velocity if bound else None)
+        columns.insert(0, ("velocity", e.velocity, sigmas, ("north [m/s]", "east [m/s]", "down [m/s]")))
     drawn = sheet(3, len(columns))
-    for k, (title, error, sigma, names) in enumerate(columns):
-        _error_panels(run, drawn.axes[:, k], name, error, sigma, names)
-        _reach(drawn.axes[:, k], _limits(error, sigma, _shown_rows(e)))
+    for k, (title, error, both, names) in enumerate(columns):
+        _error_panels(run, drawn.axes[:, k], name, error, both, names)
+        _reach(drawn.axes[:, k], _limits(error, both.claimed, _shown_rows(e)))
         drawn.axes[0, k].set_title(title, fontsize=10, loc="left")
     run.against_time(drawn, 0.25)
     return drawn.figure
@@ -168,7 +188,8 @@ OF_ALL = (
     Plot(
         "comparison",
         "Size of the errors, logarithmic: root mean square over the last 2 s. Each line is an estimator, wider below"
-        " narrower.",
+        " narrower. Dashed black: the bound, a root mean square over draws that no estimator of these sensors can be"
+        " below; one run may be.",
         comparison,
     ),
     Plot(
@@ -178,10 +199,14 @@ OF_ALL = (
     ),
 )
 OF_EACH = (
-    Plot("{}_position_errors", "Position error. Line: error; band: ±3 sigma as claimed.", position_errors),
+    Plot(
+        "{}_position_errors",
+        f"Position error. Line: error; band: ±3 sigma as claimed. {LEAST}",
+        position_errors,
+    ),
     Plot(
         "{}_motion_errors",
-        "Velocity and attitude errors. Line: error; band: ±3 sigma as claimed.",
+        f"Velocity and attitude errors. Line: error; band: ±3 sigma as claimed. {LEAST}",
         lambda run, name: None if run.errors[name].attitude_only else motion_errors(run, name),
     ),
     Plot(

@@ -1,0 +1,171 @@
+"""How well anybody could have known a simulated run: the posterior Cramér-Rao bound beside each estimator.
+
+Of an estimator without bias, or of any on average over draws, the mean square error is not below the inverse of the
+information that prior, motion and measurements hold. Tichavský, Muravchik and Nehorai, Posterior Cramér-Rao Bounds for
+Discrete-Time Nonlinear Filtering, IEEE Trans. Signal Processing 46 (5), 1998, proposition 1, give its recursion; with
+errors that grow linearly about the true trajectory, and Gaussian noises, it is the covariance of a Kalman filter that
+knows the true trajectory and all statistics, written with information. That covariance is what is computed here, since
+states without driving noise have none of it to invert.
+
+The bound is for the sensors that an estimator is handed. It counts all their samples, as if they were sound, and, with
+airspeed, that the aircraft slips as it did. A recorded flight has no statistics and so no bound. None is given either
+for an estimator that votes on several IMUs, knows wheels that do not slip, has no GNSS among its aids, or takes a
+sensor whose errors are not known in `testbed.score.bound_model`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from nav.samples import Array
+from testbed.errors import UserError
+from testbed.estimators.section import EstimatorSection, Handover
+from testbed.motion.logged import LogTruth
+from testbed.motion.sections import FlightTruth
+from testbed.record.reader import scenario_of
+from testbed.score import accuracy
+from testbed.score.accuracy import Window
+from testbed.score.bound_model import (
+    MOTION,
+    PHI,
+    POS,
+    VEL,
+    Model,
+    add_air,
+    add_imu,
+    add_sensor,
+    way,
+)
+from testbed.sensors.gnss import GnssConfig
+
+if TYPE_CHECKING:
+    import xarray
+
+    from testbed.scenario import Scenario
+
+STEP_S = 0.5  # 0.1 s raise the bound of ten minutes without GNSS by 1.5 %, of two by 0.8 %
+PART = 500  # steps that are in memory at a time
+SHORTEST = 100  # rows of truth of a run that is worth it
+# Whom nobody told anything knows this after aligning at the best: attitude [rad], velocity [m/s], position [m].
+ALIGNED = (0.01, 1.0, 10.0)
+
+Step: TypeAlias = tuple[Array, Array, Array, Array]  # Phi (9, n), decay (n,), variance (n,), H (m, n) of unit noise
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Least 1-sigma of any estimator's errors at ``t`` (K,) [s], each (K, 3) along north, east, down.
+
+    ``position`` [m], ``velocity`` [m/s], ``attitude`` [rad].
+    """
+
+    t: Array
+    position: Array
+    velocity: Array
+    attitude: Array
+
+    @property
+    def horizontal(self) -> Array:
+        """Least root mean square of the length of the horizontal position error (K,) [m]."""
+        return np.hypot(self.position[:, 0], self.position[:, 1])
+
+    @property
+    def tilt(self) -> Array:
+        """Least root mean square of the angle between true and estimated vertical (K,) [rad]."""
+        return np.hypot(self.attitude[:, 0], self.attitude[:, 1])
+
+    def horizontal_at(self, t: float) -> float:
+        """The same at one time [s]."""
+        return float(np.interp(t, self.t, self.horizontal))
+
+
+def of_run(dataset: xarray.DataTree, step_s: float = STEP_S) -> dict[str, Bound]:
+    """The bound of each estimator that has one, by name, in steps of ``step_s``; see the head of this module."""
+    try:
+        scenario = scenario_of(dataset)
+    except UserError:  # `metrics.unscored` says so
+        return {}
+    if isinstance(scenario.truth, LogTruth) or len(accuracy.column(dataset, "truth/time")) < SHORTEST:
+        return {}
+    found: dict[str, Bound] = {}
+    same: dict[tuple[str, ...], Bound | None] = {}
+    for section in scenario.estimator:
+        aids = section.aiding(scenario.sensors)
+        receivers = [aid for aid in aids if isinstance(scenario.sensors[aid], GnssConfig)]
+        told_more = section.spare_imus or getattr(section, "nonholonomic_mps", None) is not None
+        if section.name not in accuracy.names(dataset) or section.attitude_only or not receivers or told_more:
+            continue
+        key = (section.imu, *sorted(aids), str(getattr(section, "handover", None)))
+        if key not in same:
+            same[key] = _bound(dataset, scenario, section, step_s)
+        if (bound := same[key]) is not None:
+            found[section.name] = bound
+    return found
+
+
+def _bound(dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSection, step_s: float) -> Bound | None:
+    errors = scenario.rig(scenario.seed).imu(section.imu).errors()
+    model = Model(way(dataset, errors.C_sb, step_s))
+    add_imu(model, errors)
+    if isinstance(scenario.truth, FlightTruth):
+        add_air(model, scenario.truth)
+    for name in section.aiding(scenario.sensors):
+        if not add_sensor(model, dataset, name, scenario.sensors[name], scenario.date):
+            return None
+    start = model.prior
+    start[range(MOTION), range(MOTION)] = _start(getattr(section, "handover", None)) ** 2
+    variance = np.array([P.diagonal()[:MOTION].copy() for P in covariances(start, steps(model))])
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    return Bound(model.way.t, sigma[:, POS], sigma[:, VEL], sigma[:, PHI])
+
+
+def _start(handover: Handover | None) -> Array:
+    """How well the motion (9,) is known at the start: 1-sigma of attitude, velocity and position."""
+    if handover is None:
+        return np.repeat(ALIGNED, 3)
+    level, heading = np.deg2rad(handover.level_deg), np.deg2rad(handover.heading_deg)
+    return np.array([level, level, heading, *[handover.velocity_mps] * 3, *[handover.position_m] * 3])
+
+
+def steps(model: Model) -> Iterator[Step]:
+    """All steps of a model, one after the other."""
+    for first in range(0, len(model.way), PART):
+        part = slice(first, min(first + PART, len(model.way)))
+        yield from zip(*model.transition(part), model.measured(part), strict=True)
+
+
+def covariances(P: Array, along: Iterable[Step]) -> Iterator[Array]:
+    """The bound (n, n) after each step, from that before the first, ``P``; each is good until the next is asked for."""
+    P = P.copy()
+    for Phi, decay, variance, H in along:
+        moving = len(Phi)
+        P[np.diag_indices_from(P)] += 0.5 * variance
+        moved = Phi @ P
+        P[moving:, moving:] *= np.outer(decay[moving:], decay[moving:])
+        P[:moving, :moving] = moved @ Phi.T
+        P[:moving, moving:] = moved[:, moving:] * decay[moving:]
+        P[moving:, :moving] = P[:moving, moving:].T
+        P[np.diag_indices_from(P)] += 0.5 * variance
+        seen = H.any(axis=1)
+        if seen.any():
+            HP = H[seen] @ P if not seen.all() else H @ P
+            S = HP @ H[seen].T
+            S[np.diag_indices_from(S)] += 1.0
+            whitened = solve_triangular(cholesky(S, lower=True), HP, lower=True)
+            P -= whitened.T @ whitened
+        yield P
+
+
+def marks(bound: Bound, windows: Iterable[Window], seconds: Iterable[int]) -> dict[str, float]:
+    """The bound so many ``seconds`` into an outage, the largest of all that last so long, as metrics."""
+    result: dict[str, float] = {}
+    for mark in seconds:
+        found = [bound.horizontal_at(start + mark) for start, end in windows if start + mark < min(end, bound.t[-1])]
+        if found:
+            result[f"outage_bound_at_{mark}s_m"] = max(found)
+    return result
