@@ -1,4 +1,4 @@
-"""The report of a run: its figures as PNG, and one HTML page that needs nothing else."""
+"""The report of a run: its figures as PNG, and one HTML page to look around in that needs nothing else."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
+from markupsafe import Markup
 
-from testbed.report import tables
+from testbed.report import interactive, tables
 from testbed.report.figures import CHAPTERS
+from testbed.report.interactive.contents import events
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
-from testbed.score.accuracy import column
 from testbed.score.remarks import remarks
 
 if TYPE_CHECKING:
@@ -64,11 +64,12 @@ def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder:
     with held(folder):
         shown = []
         for chapter in CHAPTERS:
-            for title, name, caption, figure in chapter.drawn(run):
+            for plot, title, name, caption, figure in chapter.drawn(run):
                 picture = png(figure)
                 write_result(folder / f"{name}.png", picture, force)
-                shown.append(Shown(title, caption, picture))
-        write_result(page, render("run.html", figures=shown, **_told(run, metrics)).encode(), force)
+                if plot.pictured:
+                    shown.append(Shown(title, caption, picture))
+        write_result(page, render("run.html", figures=shown, **told(run, metrics)).encode(), force)
     return page
 
 
@@ -84,10 +85,13 @@ def files(subjects: Iterable[str]) -> list[str]:
     return [REPORT, *(f"{name}.png" for name in names)]
 
 
-def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
+def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
     """What the page says beside its figures."""
     attributes = run.dataset.attrs
+    contents = interactive.contents([interactive.Shown("", run)])
     return {
+        "contents": contents,
+        "script": Markup(interactive.script(contents)),
         "title": str(attributes.get("title", "Run")),
         "duration_s": float(run.t[-1]),
         "seed": attributes.get("seed", ""),
@@ -96,19 +100,9 @@ def _told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "summary": tables.summary(metrics),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),
-        "events": _events(run),
+        "events": [(t, f"{t:.1f} s", how, what) for t, how, what in events(run)],
         "kept": [(name, str(attributes[key])) for key, name in KEPT if attributes.get(key)],
     }
-
-
-def _events(run: Run) -> list[tuple[str, str, str]]:
-    """When, how grave and what, of everything that was told during the run."""
-    if not run.has("events"):
-        return []
-    when, severity, text = (
-        np.atleast_1d(column(run.dataset, f"events/{name}")) for name in ("time", "severity", "text")
-    )
-    return [(f"{t:.1f} s", str(how), str(what)) for t, how, what in zip(when, severity, text, strict=True)]
 
 
 def png(figure: Figure) -> bytes:
@@ -124,7 +118,7 @@ def png(figure: Figure) -> bytes:
 
 def render(template: str, **values: Any) -> str:
     """One of the pages in `templates`; whatever text is put into it is escaped."""
-    return _pages().get_template(template).render(**values)
+    return _pages().get_template(template).render(styles=Markup(interactive.styles()), **values)
 
 
 @functools.cache

@@ -26,6 +26,11 @@ COLOURS = (
     "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00",
     "#882255", "#999933", "#332288", "#44AA99", "#AA4499", "#BBBBBB",
 )  # fmt: skip
+# The same hues for a dark ground, in the same order.
+ON_DARK = (
+    "#4BA3E3", "#F0803C", "#2FC79A", "#E6A3C8", "#A5DBFF", "#F5BE41",
+    "#E0609A", "#CFCF5A", "#9F8CF0", "#70D6C6", "#D486D4", "#DDDDDD",
+)  # fmt: skip
 DASHES = ("-", "--", ":", "-.")  # a colour that comes again is dashed
 TRUTH = "#000000"
 BOUND: dict[str, Any] = {"color": "#000000", "lw": 1.1, "ls": (0, (4, 1.5)), "zorder": 4}  # what nobody can be below
@@ -40,6 +45,14 @@ NOT_USED = {
     Outcome.WEAKENED: "#8C5A2B",
     Outcome.OUT_OF_RANGE: "#00838F",
     Outcome.UNSOUND: "#000000",
+}
+NOT_USED_ON_DARK = {
+    Outcome.OUTSIDE_GATE: "#FF6B6B",
+    Outcome.ISOLATED: "#C58AF0",
+    Outcome.WITHHELD: "#A9B3BD",
+    Outcome.WEAKENED: "#D0A070",
+    Outcome.OUT_OF_RANGE: "#4DD0E1",
+    Outcome.UNSOUND: "#FFFFFF",
 }
 SHADE = "#DDDDDD"
 FAULT = "#FBE9A8"
@@ -75,15 +88,15 @@ def tints(colour: str) -> list[str]:
     return [to_hex((dark[0], dark[1], dark[2])), colour, to_hex((light[0], light[1], light[2]))]
 
 
-def thin(t: Array, y: Array) -> tuple[Array, Array]:
+def thin(t: Array, y: Array, bins: int = BINS) -> tuple[Array, Array]:
     """A line with at most two points per bin, its lowest and its highest: no peak is lost. NaN stay gaps."""
-    size = len(t) // BINS
+    size = len(t) // bins
     if size < 3:
         return t, y
     count = len(t) // size
-    bins = y[: count * size].reshape(count, size)
-    low = np.where(np.isnan(bins), np.inf, bins).argmin(axis=1)
-    high = np.where(np.isnan(bins), -np.inf, bins).argmax(axis=1)
+    values = y[: count * size].reshape(count, size)
+    low = np.where(np.isnan(values), np.inf, values).argmin(axis=1)
+    high = np.where(np.isnan(values), -np.inf, values).argmax(axis=1)
     first, second = np.minimum(low, high), np.maximum(low, high)
     kept = (np.arange(count)[:, None] * size + np.column_stack([first, second])).ravel()
     kept = np.append(kept, np.arange(count * size, len(t)))

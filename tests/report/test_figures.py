@@ -49,7 +49,7 @@ def run() -> Run:
 def drawn(run: Run) -> dict[str, Figure]:
     """All figures of the run by file name, drawn once so that everything has its place."""
     chapters = [replace(c, subjects=lambda _: ["dead_reckoning"]) if c.title == "{}" else c for c in CHAPTERS]
-    made = {name: figure for chapter in chapters for _, name, _, figure in chapter.drawn(run)}
+    made = {name: figure for chapter in chapters for _, _, name, _, figure in chapter.drawn(run)}
     for figure in made.values():
         figure.canvas.draw()
     return made
@@ -198,6 +198,6 @@ def test_a_logarithmic_axis_has_numbers(low: float, high: float) -> None:
 
 def test_a_run_without_estimators_shows_its_flight() -> None:
     run = Run(synthetic_run.dataset(20.0, {}))
-    names = [name for chapter in CHAPTERS for _, name, _, _ in chapter.drawn(run)]
+    names = [name for chapter in CHAPTERS for _, _, name, _, _ in chapter.drawn(run)]
     assert names[:2] == ["ground_track", "flight"]
     assert flight.wind(run) is None

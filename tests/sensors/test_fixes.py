@@ -374,5 +374,5 @@ def test_the_report_compares_biases_with_the_estimators_own_imu(twins):
     from testbed.report.figures import imu
     from testbed.report.run import Run
 
-    seen = {name: imu._imu_error(Run(twins.dataset), name) for name in ("first", "second")}
+    seen = {name: imu.imu_error(Run(twins.dataset), name) for name in ("first", "second")}
     assert np.abs(seen["second"]["gyro"]).max() > 5 * np.abs(seen["first"]["gyro"]).max()

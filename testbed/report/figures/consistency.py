@@ -191,14 +191,14 @@ def innovations(run: Run, name: str) -> Figure | None:
     gates = [run.estimate(name, f"innovations/{aid}/threshold") for aid in aids]
     if any(np.isfinite(gate).any() for gate in gates):
         first.plot([], [], color=GUIDE, lw=0.8, ls="--", label="gate")
-    seen = np.unique(np.concatenate([_refused_as(run, name, aid) for aid in aids]))
+    seen = np.unique(np.concatenate([refused_as(run, name, aid) for aid in aids]))
     for outcome in (one for one in NOT_USED if one in seen):
         first.add_line(Line2D([], [], color=NOT_USED[outcome], marker="x", ls="", ms=5, label=OUTCOMES[outcome]))
     run.against_time(drawn, 0.28, sensors)
     return drawn.figure
 
 
-def _refused_as(run: Run, name: str, aid: str) -> Array:
+def refused_as(run: Run, name: str, aid: str) -> Array:
     """What became of each sample (N,) that was not used, or not with every axis; NaN for the others."""
     own = f"innovations/{aid}"
     outcome = run.estimate(name, f"{own}/outcome")
@@ -210,7 +210,7 @@ def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:
     """Draw those of one aid, and say whose they are."""
     own = f"innovations/{aid}"
     t, z = run.estimate(name, f"{own}/sample_time"), run.estimate(name, f"{own}/innovation")
-    became = _refused_as(run, name, aid)
+    became = refused_as(run, name, aid)
     refused = np.isfinite(became)
     gate = np.sqrt(run.estimate(name, f"{own}/threshold"))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -220,7 +220,7 @@ def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:
     shown[refused] = np.nan_to_num(shown[refused], nan=-0.97 * limit)
     some = slice(None, None, max(1, len(t) // MOST_DOTS))
     fused = ~refused[some]
-    axes, colours = _axes_of(run, f"estimators/{name}/{own}/innovation"), tints(run.colours[name])
+    axes, colours = axes_of(run, f"estimators/{name}/{own}/innovation"), tints(run.colours[name])
     for k in range(z.shape[1]):
         colour = colours[k % 3] if axes else run.colours[name]
         ax.plot(t[some][fused], shown[some, k][fused], ".", ms=1.6, color=colour)
@@ -239,7 +239,7 @@ def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:
     return set(run.estimate(name, f"{own}/sensor").astype(str).tolist())
 
 
-def _axes_of(run: Run, path: str) -> list[str]:
+def axes_of(run: Run, path: str) -> list[str]:
     """What the record calls the components of a vector; none where it has one, or no names for them."""
     variable: Any = run.dataset[path]
     along = variable.dims[1]

@@ -69,11 +69,11 @@ def attitude(run: Run) -> Figure | None:
         return None
     drawn = sheet(3)
     curves: list[tuple[str, Array, Array, dict[str, Any]]] = [
-        (name, run.estimate(name, "time"), _euler_deg(run.estimate(name, "q_nb")),
+        (name, run.estimate(name, "time"), euler_deg(run.estimate(name, "q_nb")),
          run.lines[name] | layer(rank, len(run.aligned)))
         for rank, name in enumerate(run.aligned)
     ]  # fmt: skip
-    curves.insert(0, (run.reference, run.t, _euler_deg(run.truth("q_nb")), {"color": TRUTH, "lw": 1.0, "zorder": 4}))
+    curves.insert(0, (run.reference, run.t, euler_deg(run.truth("q_nb")), {"color": TRUTH, "lw": 1.0, "zorder": 4}))
     for k, (ax, label) in enumerate(zip(drawn.axes[:, 0], ("roll [deg]", "pitch [deg]", "heading [deg]"), strict=True)):
         for name, t, euler, line in curves:
             some = stride(len(t))
@@ -87,7 +87,7 @@ def attitude(run: Run) -> Figure | None:
     return drawn.figure
 
 
-def _euler_deg(q: Array) -> Array:
+def euler_deg(q: Array) -> Array:
     """Roll, pitch, heading (N, 3) of q_nb (N, 4); heading in [0, 360)."""
     angles = np.rad2deg(accuracy.euler(q))
     angles[:, 2] %= 360.0

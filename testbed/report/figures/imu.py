@@ -42,7 +42,7 @@ def biases(run: Run, name: str) -> Figure | None:
     if not own:
         return None
     drawn = sheet(3, len(own))
-    real = _imu_error(run, name)
+    real = imu_error(run, name)
     t = run.estimate(name, "time")
     some = stride(len(t))
     for axes, (what, sigmas) in zip(drawn.axes.T, own.items(), strict=True):
@@ -71,7 +71,7 @@ def _focus_bias(ax: Axes, value: Array, real: Array) -> None:
         ax.set_ylim(low - margin, high + margin)
 
 
-def _imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
+def imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
     """Times ``t`` (N,) and mean error ``gyro`` (N, 3) [rad/s], ``accel`` (N, 3) [m/s^2] of an estimator's IMU."""
     imu = run.imu_of(estimator)
     if imu is None or len(run.t) < 3:
@@ -252,6 +252,7 @@ OF_UNIT = (
         " data sheet promises, each kind of noise alone; full line: all of them.",
         allan,
         timed=False,
+        pictured=True,
     ),
     Plot(
         "{}_spectra",
@@ -259,5 +260,6 @@ OF_UNIT = (
         " rate shows it; dashed: white noise of the data sheet.",
         spectra,
         timed=False,
+        pictured=True,
     ),
 )

@@ -66,5 +66,6 @@ PLOTS = (
         " what was measured before; blank: not at all, or not apart from others. A grey line: the estimator has no such"
         " state.",
         visibility,
+        pictured=True,
     ),
 )

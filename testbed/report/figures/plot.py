@@ -19,12 +19,14 @@ class Plot:
     """One figure. ``draw(run)``, or ``draw(run, subject)`` in a chapter of subjects, is None where it would be empty.
 
     ``name`` is that of the file, with {} for the subject. ``timed`` ones have shades, which their caption explains.
+    ``pictured`` ones stand in the page too, which has nothing like them to look around in.
     """
 
     name: str
     caption: str
     draw: Callable[..., Figure | None]
     timed: bool = True
+    pictured: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +37,11 @@ class Chapter:
     plots: tuple[Plot, ...]
     subjects: Callable[[Run], Iterable[str]] | None = None
 
-    def drawn(self, run: Run) -> Iterator[tuple[str, str, str, Figure]]:
-        """Title of the chapter, file name, caption and figure, of all that has something to show."""
+    def drawn(self, run: Run) -> Iterator[tuple[Plot, str, str, str, Figure]]:
+        """Plot, title of the chapter, file name, caption and figure, of all that has something to show."""
         for subject in [()] if self.subjects is None else [(name,) for name in self.subjects(run)]:
             for plot in self.plots:
                 figure = plot.draw(run, *subject)
                 if figure is not None:
                     shades = f" {SHADES}" if plot.timed and (run.windows or run.faults) else ""
-                    yield self.title.format(*subject), plot.name.format(*subject), plot.caption + shades, figure
+                    yield plot, self.title.format(*subject), plot.name.format(*subject), plot.caption + shades, figure

@@ -1,0 +1,293 @@
+// The map, and beside it the errors at the cursor with the ellipses that are claimed of them.
+
+const CORNERS = 72;
+const markersAt = (source, points) =>
+  (source.data = { x: points.map((p) => p.x), y: points.map((p) => p.y), colour: points.map((p) => p.colour) });
+
+/** Corners of the ellipse of a covariance about a point; x is east, y is north. */
+function ellipse([nn, ne, ee], x, y, sigmas) {
+  const mean = (nn + ee) / 2;
+  const apart = Math.hypot((nn - ee) / 2, ne);
+  const [long, short] = [Math.sqrt(Math.max(mean + apart, 0)), Math.sqrt(Math.max(mean - apart, 0))];
+  const angle = Math.atan2(2 * ne, nn - ee) / 2; // of the long axis, from north to east
+  const corners = { x: [], y: [], long: sigmas * long, short: sigmas * short };
+  for (let k = 0; k <= CORNERS; k++) {
+    const turn = (2 * Math.PI * k) / CORNERS;
+    const [along, across] = [corners.long * Math.cos(turn), corners.short * Math.sin(turn)];
+    corners.y.push(y + along * Math.cos(angle) - across * Math.sin(angle));
+    corners.x.push(x + along * Math.sin(angle) + across * Math.cos(angle));
+  }
+  return corners;
+}
+
+/** A square view of places; ranges are set so that a metre is as long in both directions. */
+class Plane {
+  constructor(place, name, x_axis_label, y_axis_label) {
+    this.element = make("figure", "plane");
+    this.caption = make("figcaption");
+    this.caption.append(make("b", "", name));
+    this.told = make("span", "told");
+    this.caption.append(this.told);
+    this.plot = make("div", "plot");
+    this.plot.setAttribute("role", "img");
+    this.plot.setAttribute("aria-label", name);
+    this.element.append(this.caption, this.plot);
+    place.append(this.element);
+    this.figure = new Bokeh.Plotting.figure({
+      height: 420, sizing_mode: "stretch_width", toolbar_location: null, tools: [], x_axis_label, y_axis_label,
+      x_range: new Bokeh.Range1d({ start: -1, end: 1 }), y_range: new Bokeh.Range1d({ start: -1, end: 1 }),
+      min_border_right: 10, min_border_top: 4, lod_threshold: null,
+    });
+    this.figure.xaxis.formatter = TICKS();
+    this.figure.yaxis.formatter = TICKS();
+    this.parts = []; // [subject, renderer]
+    this.themed = [];
+  }
+
+  source(data = { x: [], y: [], colour: [] }) {
+    return new Bokeh.ColumnDataSource({ data });
+  }
+
+  line(of, x, y, style = {}) {
+    const renderer = this.figure.line({ field: "x" }, { field: "y" }, { source: this.source({ x, y }), ...style });
+    if (!style.line_color) this.themed.push(() => renderer.glyph.setv({ line_color: colourOf(of) }));
+    this.parts.push([of, renderer]);
+    return renderer;
+  }
+
+  guides() {
+    for (const dimension of ["width", "height"]) {
+      const span = new Bokeh.Span({ location: 0, dimension, line_width: 1, level: "underlay" });
+      this.figure.add_layout(span);
+      this.themed.push(() => span.setv({ line_color: colours().guide }));
+    }
+  }
+
+  theme() {
+    dress(this.figure);
+    for (const paint of this.themed) paint();
+  }
+
+  shown() {
+    for (const [of, renderer] of this.parts) renderer.visible = !seen.hidden.has(of);
+  }
+
+  async show() {
+    this.theme();
+    this.shown();
+    this.view = await Bokeh.Plotting.show(this.figure, this.plot);
+  }
+
+  /** Show a box around a point, at least so far in both directions. */
+  fit(x, y, half_x, half_y = half_x) {
+    const { width, height } = this.view ? this.view.frame.bbox : { width: 400, height: 400 };
+    const metres = Math.max(half_x / Math.max(width, 1), half_y / Math.max(height, 1), 1e-9);
+    this.figure.x_range.setv({ start: x - metres * width, end: x + metres * width });
+    this.figure.y_range.setv({ start: y - metres * height, end: y + metres * height });
+  }
+}
+
+class Chart extends Plane {
+  constructor(place, spec) {
+    super(place, "Map", "east of the start [m]", "north of the start [m]");
+    this.truths = spec.truths.map((one) => ({ ...one, t: numbers(one.t), n: numbers(one.n), e: numbers(one.e) }));
+    this.tracks = spec.tracks.map((one) => ({
+      ...one, t: numbers(one.t), n: numbers(one.n), e: numbers(one.e),
+      error: one.error.map(numbers), covariance: one.covariance.map(numbers),
+    }));
+    this.sigmas = spec.sigmas;
+    this.follows = false;
+    this._denied();
+    for (const fixes of spec.fixes) this._fixes(fixes);
+    for (const { of, n, e } of this.tracks) this.line(of, e, n, stroke(of));
+    for (const { n, e } of this.truths) this.line(-1, e, n, stroke(-1));
+    this._ends();
+    this.around = this.source({ x: [], y: [], colour: [] });
+    const outlines = { source: this.around, line_color: { field: "colour" }, fill_color: { field: "colour" } };
+    this.figure.patches({ field: "x" }, { field: "y" }, { ...outlines, fill_alpha: 0.12, line_width: 1.5 });
+    this.here = this.source();
+    const style = { source: this.here, size: 11, fill_color: { field: "colour" }, line_color: "#FFFFFF", line_width: 1.5 };
+    this.figure.scatter({ field: "x" }, { field: "y" }, style);
+    if (!touches) gestures(this.figure, "both");
+    this._buttons();
+    this.plot.addEventListener("pointermove", (event) => event.pointerType == "mouse" && this._point(event));
+    this.plot.addEventListener("click", (event) => this._point(event));
+    this.plot.addEventListener("pointerleave", () => hideTip());
+    this.plot.addEventListener("dblclick", () => this.whole());
+  }
+
+  _denied() {
+    const { t, n, e } = this.truths[0];
+    const inside = (at) => PAGE.windows.some(([start, end]) => at >= start && at < end);
+    const cut = (values) => values.map((value, k) => (inside(t[k]) ? value : NaN));
+    const renderer = this.line(-2, cut(e), cut(n), { line_width: 11, line_cap: "round", line_color: "#DDDDDD" });
+    this.themed.push(() => renderer.glyph.setv({ line_color: colours().denied }));
+  }
+
+  _fixes({ n, e }) {
+    const source = this.source({ x: numbers(e), y: numbers(n) });
+    const style = { source, size: 3, line_color: null };
+    const renderer = this.figure.scatter({ field: "x" }, { field: "y" }, style);
+    this.themed.push(() => renderer.glyph.setv({ fill_color: colours().fix }));
+  }
+
+  _ends() {
+    for (const { n, e } of this.truths) {
+      const known = [...n.keys()].filter((k) => Number.isFinite(n[k]) && Number.isFinite(e[k]));
+      [[known[0], "circle"], [known[known.length - 1], "square"]].forEach(([k, marker]) => {
+        if (k === undefined) return;
+        const style = { source: this.source({ x: [e[k]], y: [n[k]] }), size: 9, marker, line_color: null };
+        const renderer = this.figure.scatter({ field: "x" }, { field: "y" }, style);
+        this.themed.push(() => renderer.glyph.setv({ fill_color: colourOf(-1) }));
+      });
+    }
+  }
+
+  _buttons() {
+    const row = make("span", "buttons");
+    const add = (sign, said, does) => {
+      const button = make("button", "", sign);
+      button.type = "button";
+      button.title = said;
+      button.setAttribute("aria-label", said);
+      button.addEventListener("click", () => does(button));
+      row.append(button);
+    };
+    add("−", "map: zoom out", () => this.scale(1.6));
+    add("+", "map: zoom in", () => this.scale(1 / 1.6));
+    add("whole", "map: the whole flight", () => this.whole());
+    add("follow", "map: stay at the cursor", (button) => {
+      this.follows = !this.follows;
+      button.setAttribute("aria-pressed", this.follows);
+      if (this.follows) this.near();
+    });
+    this.caption.append(row);
+  }
+
+  scale(factor) {
+    const { x_range: x, y_range: y } = this.figure;
+    const at = this.follows && this.centre ? this.centre : { x: (x.start + x.end) / 2, y: (y.start + y.end) / 2 };
+    this.fit(at.x, at.y, (factor * (x.end - x.start)) / 2, (factor * (y.end - y.start)) / 2);
+  }
+
+  /** All of truth, or of the estimates where there is none. */
+  whole() {
+    let [west, east, south, north] = [Infinity, -Infinity, Infinity, -Infinity];
+    const reach = ({ n, e }) => {
+      for (let k = 0; k < n.length; k++) {
+        if (!(Number.isFinite(n[k]) && Number.isFinite(e[k]))) continue;
+        [west, east] = [Math.min(west, e[k]), Math.max(east, e[k])];
+        [south, north] = [Math.min(south, n[k]), Math.max(north, n[k])];
+      }
+    };
+    this.truths.forEach(reach);
+    if (west > east) this.tracks.forEach(reach);
+    if (west > east) return;
+    const half = Math.max((east - west) / 2, (north - south) / 2, 5);
+    const narrow = (width) => Math.max(0.55 * width, 0.1 * half, 5);
+    this.fit((west + east) / 2, (south + north) / 2, narrow(east - west), narrow(north - south));
+  }
+
+  /** The cursor, with room for errors and ellipses. */
+  near() {
+    if (!this.centre) return;
+    const { x_range: x } = this.figure;
+    const half = Math.min((x.end - x.start) / 2, Math.max(3 * this.reach, 20));
+    this.fit(this.centre.x, this.centre.y, half);
+  }
+
+  follow() {
+    const points = [];
+    for (const { t, n, e } of this.truths) {
+      const k = nearest(t, seen.cursor);
+      if (k >= 0 && Number.isFinite(n[k])) points.push({ x: e[k], y: n[k], colour: colourOf(-1) });
+    }
+    this.centre = points[0];
+    this.reach = 0;
+    const around = { x: [], y: [], colour: [] };
+    for (const { of, t, n, e, error, covariance } of this.tracks) {
+      const k = nearest(t, seen.cursor);
+      if (seen.hidden.has(of) || k < 0 || !Number.isFinite(n[k])) continue;
+      points.push({ x: e[k], y: n[k], colour: colourOf(of) });
+      this.centre ??= points[0];
+      const claimed = ellipse(covariance.map((own) => own[k]), e[k], n[k], this.sigmas);
+      if (!Number.isFinite(claimed.long)) continue;
+      this.reach = Math.max(this.reach, claimed.long, Math.hypot(error[0][k], error[1][k]) || 0);
+      around.x.push(claimed.x);
+      around.y.push(claimed.y);
+      around.colour.push(colourOf(of));
+    }
+    this.around.data = around;
+    markersAt(this.here, points);
+    if (this.follows) this.near();
+  }
+
+  _point(event) {
+    const { left, top, width, height } = this.view.frame.bbox;
+    const box = this.plot.getBoundingClientRect();
+    const [px, py] = [event.clientX - box.left - left, event.clientY - box.top - top];
+    if (px < 0 || py < 0 || px > width || py > height) return hideTip();
+    const { x_range: x, y_range: y } = this.figure;
+    const metres = (x.end - x.start) / width;
+    const [east, north] = [x.start + px * metres, y.end - (py / height) * (y.end - y.start)];
+    let [best, when] = [NEAREST * metres, null];
+    for (const { t, n, e } of this.truths.length ? this.truths : this.tracks)
+      for (let k = 0; k < t.length; k++) {
+        const away = Math.hypot(e[k] - east, n[k] - north);
+        // Where a track is met more than once, the time nearest to the cursor.
+        const later = when !== null && Math.abs(t[k] - seen.cursor) >= Math.abs(when - seen.cursor);
+        if (away < best - 2 * metres || (away < best + 2 * metres && !later)) [best, when] = [Math.min(away, best), t[k]];
+      }
+    if (when === null) return hideTip();
+    setCursor(when);
+    showTip(event, [
+      [null, timeText(when), ""],
+      [null, "east", `${text(east)} m`],
+      [null, "north", `${text(north)} m`],
+    ]);
+  }
+}
+
+class Errors extends Plane {
+  constructor(place, chart) {
+    super(place, "Horizontal errors at the cursor, 95 % ellipses", "east [m]", "north [m]");
+    this.chart = chart;
+    this.guides();
+    this.around = this.source({ x: [], y: [], colour: [] });
+    const outlines = { source: this.around, line_color: { field: "colour" }, fill_color: { field: "colour" } };
+    this.figure.patches({ field: "x" }, { field: "y" }, { ...outlines, fill_alpha: 0.1, line_width: 1.8 });
+    this.here = this.source();
+    const style = { source: this.here, size: 10, marker: "x", line_color: { field: "colour" }, line_width: 2.5 };
+    this.figure.scatter({ field: "x" }, { field: "y" }, style);
+  }
+
+  follow() {
+    const [points, sizes] = [[], []];
+    const around = { x: [], y: [], colour: [] };
+    this.told.replaceChildren();
+    for (const { of, t, error, covariance } of this.chart.tracks) {
+      if (seen.hidden.has(of)) continue;
+      const k = nearest(t, seen.cursor);
+      const [n, e] = k < 0 ? [NaN, NaN] : [error[0][k], error[1][k]];
+      const claimed = ellipse(covariance.map((own) => own[Math.max(k, 0)]), 0, 0, this.chart.sigmas);
+      const known = k >= 0 && Number.isFinite(claimed.long);
+      if (known) {
+        around.x.push(claimed.x);
+        around.y.push(claimed.y);
+        around.colour.push(colourOf(of));
+      }
+      if (Number.isFinite(n)) points.push({ x: e, y: n, colour: colourOf(of) });
+      sizes.push(Math.max(known ? claimed.long : 0, Math.hypot(n, e) || 0));
+      const size = known ? `; ${text(claimed.long)} × ${text(claimed.short)} m` : "";
+      const one = make("span", "", `${text(Math.hypot(n, e))} m${size}`);
+      one.title = PAGE.subjects[of].name;
+      one.style.setProperty("--own", colourOf(of));
+      this.told.append(one);
+    }
+    this.around.data = around;
+    markersAt(this.here, points);
+    const sound = sizes.filter((size) => size > 0);
+    const least = Math.min(...sound);
+    this.fit(0, 0, 1.15 * Math.max(...sound.filter((size) => size <= FAR * least), 0.1));
+  }
+}
