@@ -6,6 +6,7 @@ Nothing heavy is imported before a command needs it, so that help and completion
 from __future__ import annotations
 
 import math
+import re
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -40,6 +41,13 @@ from testbed.data import data_dir
 from testbed.errors import UserError, printable
 from testbed.results import METRICS, held, require_own
 
+# Options that may stand alone: what their values look like, and which is meant without one.
+ALONE = {
+    "--realtime": (r"[-+]?(\d*\.?\d*(e[-+]?\d+)?|nan|inf)", "1"),
+    "--px4": (r"\w+:.*", "tcpin:127.0.0.1:4560"),
+    "--ardupilot": (r"\w+:.*", "udpin:127.0.0.1:9002"),
+}
+
 app = typer.Typer(
     help="Fly, sense, navigate: a navigation testbed coupled to a flight simulation.",
     no_args_is_help=True,
@@ -54,7 +62,7 @@ def main() -> None:
     """Entry point: a user's mistake ends with its message and exit code 2, never with a traceback."""
     try:
         with interrupts.heeded():
-            app(_explicit_realtime(sys.argv[1:]))
+            app(_explicit(sys.argv[1:]))
     except UserError as error:
         for line in str(error).splitlines():
             remark(line)
@@ -323,16 +331,13 @@ def _split(text: str) -> list[str]:
     return parts
 
 
-def _explicit_realtime(arguments: Sequence[str]) -> list[str]:
-    """Give a bare ``--realtime`` its factor 1: the option parser knows no optional values."""
+def _explicit(arguments: Sequence[str]) -> list[str]:
+    """Give an option that stands alone what it means: the option parser knows no optional values."""
     explicit = []
     for argument, following in pairwise([*arguments, ""]):
         explicit.append(argument)
-        if argument == "--realtime":
-            try:
-                float(following)
-            except ValueError:
-                explicit.append("1")
+        if argument in ALONE and not (following and re.fullmatch(ALONE[argument][0], following)):
+            explicit.append(ALONE[argument][1])
     return explicit
 
 

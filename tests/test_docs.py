@@ -38,6 +38,8 @@ NOT_RUN = {
     "mavproxy.py": "a ground station, in an environment of its own: tests/clients",
     "testbed campaign": "each starts processes for seconds: tests/many/test_campaign.py",
     "testbed check": "flies in processes, for minutes without names: tests/many, tests/test_shipped.py",
+    "testbed run loiter_gnss_outage --px4": "waits for PX4: tests/bridges/test_px4.py",
+    "testbed run loiter_gnss_outage --ardupilot": "waits for ArduPilot: tests/bridges/test_ardupilot.py",
     "testbed papers": "takes minutes: tests/papers",
     "python scenarios/sweep_outage.py": "flies half an hour",
 }
@@ -94,7 +96,7 @@ def not_run(line: Sequence[str]) -> bool:
 def parsed(command: Sequence[str]) -> dict[str, Any]:
     """What the command line makes of a command."""
     group: Any = typer.main.get_command(cli.app)
-    name, *arguments = cli._explicit_realtime(command)
+    name, *arguments = cli._explicit(command)
     context = group.get_command(group.make_context("testbed", [name]), name).make_context(name, arguments)
     return dict(context.params)
 

@@ -28,6 +28,7 @@ from testbed.errors import UserError
 from testbed.results import METRICS, RECORD, REPORT, require_own
 
 if TYPE_CHECKING:
+    from testbed.feeds.bridged import FarEnd
     from testbed.loop.links import Publisher
     from testbed.loop.loop import RunResult
     from testbed.loop.requests import Recorded
@@ -56,6 +57,12 @@ MavlinkKey = Annotated[
     str | None,
     typer.Option(metavar="KEY", help="Hear only what is signed with this passphrase or 64 hexadecimal digits."),
 ]
+Px4Address = Annotated[
+    str | None, typer.Option("--px4", metavar="[URL]", help="Let PX4 follow the run; it connects to tcpin:HOST:PORT.")
+]
+ArduPilotAddress = Annotated[
+    str | None, typer.Option("--ardupilot", metavar="[URL]", help="Let ArduPilot follow it; it calls udpin:HOST:PORT.")
+]
 Shown = Annotated[str | None, typer.Option(metavar="NAME", help="Which estimator to stream; the scenario's first.")]
 Realtime = Annotated[
     float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
@@ -74,6 +81,8 @@ def run(
     mavlink_readonly: MavlinkReadonly = False,
     mavlink_key: MavlinkKey = None,
     estimator: Shown = None,
+    px4: Px4Address = None,
+    ardupilot: ArduPilotAddress = None,
     realtime: Realtime = None,
     report: Report = True,
     force: Force = False,
@@ -110,7 +119,8 @@ def run(
             readonly=mavlink_readonly,
             key=mavlink_key,
         )
-        result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay)
+        far_end = _far_end(loaded, px4, ardupilot)
+        result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
         conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
@@ -178,6 +188,26 @@ def _connect(
         if path is not None and path.resolve().parent == folder.resolve() and path.name in (RECORD, METRICS, REPORT):
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
+
+
+def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None) -> FarEnd | None:
+    """The autopilot that is to follow the run, once it is there; None when there is to be none."""
+    if px4 is None and ardupilot is None:
+        return None
+    from testbed.bridges.ardupilot import ArduPilot
+    from testbed.bridges.px4 import Px4
+    from testbed.sensors.imu import ImuConfig
+
+    if px4 is not None and ardupilot is not None:
+        raise UserError("--px4, --ardupilot: one autopilot follows a run: leave one of them out")
+    if not any(isinstance(section, ImuConfig) for section in scenario.sensors.values()):
+        raise UserError("--px4, --ardupilot: an autopilot lives on inertial samples: add [sensors.imu]")
+    if px4 is not None:
+        remark(f"waiting for PX4 on {px4}")
+        return Px4(px4)
+    assert ardupilot is not None
+    remark(f"waiting for ArduPilot on {ardupilot}")
+    return ArduPilot(ardupilot)
 
 
 def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: Any) -> RunResult:

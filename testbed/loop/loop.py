@@ -19,6 +19,7 @@ from nav.samples import Estimate, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
+from testbed.feeds.bridged import Bridged, FarEnd
 from testbed.feeds.build import located, open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     import xarray
 
 BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
-PACED_S = 0.1  # and when it keeps to the clock
+PACED_S = 0.1  # and when it keeps to the clock, or a far end follows
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REHEARSAL_S = 5.0  # that an estimator aligns in
 COLLECT_AFTER = 200_000  # objects kept
@@ -73,6 +74,7 @@ def run(
     controls: Sequence[Callable[[], Sequence[Request]]] = (),
     replay: Sequence[tuple[float, Recorded]] = (),
     build: registry.Build = registry.build,
+    far_end: FarEnd | None = None,
 ) -> RunResult:
     """Fly, sense, estimate and record one scenario.
 
@@ -81,24 +83,27 @@ def run(
     unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
     ``source`` replaces the motion, to share one flown truth between runs. Links and ``controls`` may make requests
     (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. ``build`` makes the estimators
-    of their sections, in place of `registry.build`. Same scenario, seed and requests, same bits. Raises UserError when
+    of their sections, in place of `registry.build`. A ``far_end`` is told of every turn, and closed at the end; when it
+    fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when
     the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
     with ExitStack() as ending:
         for link in links:
             ending.callback(link.close)
+        if far_end is not None:
+            ending.callback(far_end.close)
         scenario = located(scenario)
         seed = scenario.seed if seed is None else seed
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(scenario, shown) if links or shown is not None else None
-        setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build)
+        setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
             require_own(setup.out, [RECORD, METRICS])
         rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
         asking = (*(link.requests for link in links if link.asks), *controls)
-        director = Director(asking, replay, realtime, rate_hz, source is None)
+        director = Director(asking, replay, realtime, rate_hz, source is None and far_end is None)
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
             rehearsal = scenario.model_copy(update={"duration_s": min(REHEARSAL_S, scenario.duration_s)})
@@ -125,6 +130,7 @@ class Setup:
     progress: Callable[[Progress], None] | None = None
     source: MotionSource | None = None
     build: registry.Build = registry.build
+    far_end: FarEnd | None = None
 
 
 class _Flown(NamedTuple):
@@ -180,11 +186,13 @@ class _Passage:
         self.tick, self.ticks = 0, round(scenario.duration_s * rate_hz) + 1
         publish = max(1, round(min(link.period_s for link in setup.links) * rate_hz)) if setup.links else 0
         self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), max(1, round(EVENTS_S * rate_hz)), publish)
-        self.batch = round(BATCH_S * rate_hz)
+        self.batch = round((BATCH_S if setup.far_end is None else PACED_S) * rate_hz)
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
         self.lanes = setup.build(scenario.estimator, scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
         self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead)
+        if setup.far_end is not None:
+            self.feed = Bridged(self.feed, setup.far_end)
         ending.callback(self.feed.close)
         self.recorder = Recorder(setup.out / RECORD if setup.out else None, scenario, setup.seed)
         ending.callback(self.recorder.close)

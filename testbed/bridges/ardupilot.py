@@ -1,0 +1,146 @@
+"""ArduPilot's JSON physics backend: we are the physics. ArduPilot listens to the motion of the run.
+
+ArduPilot sends a packet of servo outputs per frame over UDP and waits for one line of JSON; a line goes out for each
+sample of the first IMU, when the packet of the next frame has come, and until then the run waits. What is ours in it:
+``imu`` (gyro and accel_body, with all errors of the scenario), and ``airspeed`` where there is a sensor. ``position``
+(from the first place, NED), ``velocity`` and ``attitude`` are truth: of these ArduPilot makes GNSS, magnetometer and
+barometer of its own. What the servos say moves nothing here.
+
+A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
+earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
+more than `MOST_PACKETS` without the next frame ends it, and the run, with the reason.
+
+Source: SIM_JSON.cpp and .h of ArduPilot 4.6, and libraries/SITL/examples/JSON/readme.md there: magic 18458 with 16
+channels or 29569 with 32, rate, count, microseconds of each, little-endian; no space may stand before a list.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import time
+
+import numpy as np
+
+from nav.earth import position_difference_n
+from nav.rotation import euler_from_quat
+from nav.samples import AirspeedSample
+from testbed.bridges.address import address, bound
+from testbed.bridges.steps import Step, Stepper
+from testbed.errors import UserError
+from testbed.feeds.feed import Turn
+
+DEFAULT = "udpin:127.0.0.1:9002"
+CONNECT_S, ANSWER_S = 120.0, 10.0  # of wall time
+MOST_PACKETS = 1000  # heard within one step
+_HEAD = struct.Struct("<HHI")  # magic, frame rate, frame count
+CHANNELS = {18458: 16, 29569: 32}  # by magic
+DIGITS = 9
+
+
+class ArduPilot:
+    """One ArduPilot that follows a run (`testbed.feeds.bridged.FarEnd`); ``answered`` counts steps."""
+
+    def __init__(self, url: str = DEFAULT, *, connect_s: float = CONNECT_S, answer_s: float = ANSWER_S) -> None:
+        """Wait for ArduPilot's first packet. Raises UserError when the address is none, is taken, or nobody comes."""
+        self.failure, self.answered = "", 0
+        self._answer_s = answer_s
+        self._stepper = Stepper()
+        self._line = b""  # the last answer
+        self._frame: int | None = None  # that was answered last
+        self._peer: tuple[str, int] | None = None
+        self._home: tuple[float, float, float] | None = None
+        self._airspeed: float | None = None
+        self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
+        self._next = self._heard(time.monotonic() + connect_s)
+        if self._next is None:
+            self._socket.close()
+            raise UserError(f"{url}: no ArduPilot has called within {connect_s:g} s: start it with --model JSON")
+
+    def follow(self, turn: Turn) -> None:
+        """Answer the frames that the steps of a turn belong to."""
+        for step in self._stepper.steps(turn):
+            if not self.failure:
+                self._answer(step)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._socket.close()
+
+    def _answer(self, step: Step) -> None:
+        frame, self._next = self._next, None
+        if frame is None:
+            frame = self._heard(time.monotonic() + self._answer_s)
+        if frame is None:
+            self.failure = self.failure or f"ArduPilot has sent no frame for {self._answer_s:g} s at {step.t:.3f} s"
+            return
+        self._frame, self._line = frame, self.line(step)
+        self._reply()
+        self.answered += 1
+
+    def _reply(self) -> None:
+        if self._peer is not None:
+            try:
+                self._socket.sendto(self._line, self._peer)
+            except OSError as error:
+                self.failure = f"the answer to ArduPilot can't be sent: {error.strerror}"
+
+    def _heard(self, until: float) -> int | None:
+        """The count of the next frame, None when none comes."""
+        for _ in range(MOST_PACKETS):
+            left = until - time.monotonic()
+            if left <= 0:
+                return None
+            self._socket.settimeout(left)
+            try:
+                data, peer = self._socket.recvfrom(2048)
+            except TimeoutError:
+                return None
+            except OSError:  # the peer's port was closed when an answer came; it may open again
+                continue
+            frame = _frame_of(data)
+            if frame is None or (self._peer is not None and peer != self._peer):
+                continue
+            self._peer = peer
+            if self._frame is None or frame > self._frame:
+                return frame
+            if frame == self._frame:
+                self._reply()
+            elif frame == 0:
+                self.failure = f"ArduPilot has begun anew: frame 0 after frame {self._frame}"
+                return None
+        self.failure = f"ArduPilot has sent {MOST_PACKETS} packets, but no next frame"
+        return None
+
+    def line(self, step: Step) -> bytes:
+        """What ArduPilot is told of a step."""
+        row = step.truth
+        place = float(row.lat[0]), float(row.lon[0]), float(row.h[0])
+        self._home = self._home or place
+        if (speed := step.first(AirspeedSample)) is not None:
+            self._airspeed = speed.eas
+        said = {
+            "timestamp": round(step.t, DIGITS),
+            "imu": {"gyro": _list(step.gyro), "accel_body": _list(step.accel)},
+            "position": _list(position_difference_n(*place, *self._home)),
+            "attitude": _list(np.array(euler_from_quat(row.q_nb[0]))),
+            "velocity": _list(row.v_n[0]),
+        }
+        if self._airspeed is not None:
+            said["airspeed"] = round(self._airspeed, DIGITS)
+        return b"\n" + json.dumps(said, separators=(",", ":")).encode() + b"\n"
+
+
+def _list(values: np.ndarray) -> list[float]:
+    return [round(float(value), DIGITS) for value in values]
+
+
+def _frame_of(data: bytes) -> int | None:
+    """The frame's count in a packet of servo outputs, None when it is none."""
+    if len(data) < _HEAD.size:
+        return None
+    magic, _, count = _HEAD.unpack_from(data)
+    if magic not in CHANNELS or len(data) != _HEAD.size + 2 * CHANNELS[magic]:
+        return None
+    return int(count)

@@ -1,0 +1,71 @@
+"""A feed with somebody listening: each turn goes to a far end, such as an autopilot, before it goes on as it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+from testbed.feeds.feed import Feed, Turn
+
+
+class FarEnd(Protocol):
+    """A program outside that is told what the sensors say, step by step, and answers each step.
+
+    ``failure`` is why it no longer does, empty as long as it does.
+    """
+
+    failure: str
+
+    def follow(self, turn: Turn) -> None:
+        """Tell it of a turn, and hear its answers; waits for them. Sets ``failure`` in place of raising anything."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the connection."""
+        ...
+
+
+class Bridged:
+    """A feed that a far end follows (`testbed.feeds.feed.Feed`); it ends when that no longer answers."""
+
+    def __init__(self, feed: Feed, far_end: FarEnd) -> None:
+        self.rate_hz, self.source, self.origin = feed.rate_hz, feed.source, feed.origin
+        self.faults, self.receptions = feed.faults, feed.receptions
+        self._feed, self._far_end = feed, far_end
+        self._last: Turn | None = None
+
+    @property
+    def motion_s(self) -> float:
+        """Wall time that the motion took so far."""
+        return self._feed.motion_s
+
+    @property
+    def failure(self) -> str:
+        """Why the motion ended early, or the far end; empty when neither did."""
+        return self._feed.failure or self._far_end.failure
+
+    def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
+        """The next rows, once the far end has followed them; none after it has failed."""
+        if self._last is not None and self._far_end.failure:
+            return Turn(self._last.reference.rows(0, 0), {}, {})
+        self._last = turn = self._feed.advance(ticks, wanted)
+        if len(turn.reference):
+            self._far_end.follow(turn)
+        return turn
+
+    def activity(self) -> str:
+        """What the motion is doing."""
+        return self._feed.activity()
+
+    def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
+        """Those of the feed."""
+        return self._feed.take_events(until)
+
+    def remark(self) -> str:
+        """That of the feed."""
+        return self._feed.remark()
+
+    def close(self) -> None:
+        """Let go of what the feed holds; whoever made the far end closes it."""
+        self._feed.close()
