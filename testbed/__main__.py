@@ -1,4 +1,4 @@
-"""Commands: ``testbed scenarios | aircraft | run | log | check | report | export | campaign | papers | watch | init``.
+"""Commands: ``testbed scenarios | aircraft | run | log | compare | view | check | report | export | campaign | …``.
 
 Nothing heavy is imported before a command needs it, so that help and completion answer at once.
 """
@@ -21,6 +21,7 @@ if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is th
 
 import typer
 
+from testbed.commands.compare import compare, view
 from testbed.commands.export import export
 from testbed.commands.log import log
 from testbed.commands.run import run
@@ -111,6 +112,8 @@ def aircraft(
 
 app.command()(run)
 app.command()(log)
+app.command()(compare)
+app.command()(view)
 
 
 @app.command()

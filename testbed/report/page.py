@@ -91,7 +91,7 @@ def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
     contents = interactive.contents([interactive.Shown("", run)])
     return {
         "contents": contents,
-        "script": Markup(interactive.script(contents)),
+        "script": script_of(contents),
         "title": str(attributes.get("title", "Run")),
         "duration_s": float(run.t[-1]),
         "seed": attributes.get("seed", ""),
@@ -114,6 +114,11 @@ def png(figure: Figure) -> bytes:
         pil_kwargs={"compress_level": 2},  # as small as 6, in half the time
     )
     return picture.getvalue()
+
+
+def script_of(contents: Mapping[str, Any]) -> Markup:
+    """What draws these contents, to be put into a page as it is."""
+    return Markup(interactive.script(contents))
 
 
 def render(template: str, **values: Any) -> str:

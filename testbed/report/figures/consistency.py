@@ -94,7 +94,7 @@ def ellipses(run: Run) -> Figure | None:
     claimed = {name: (run.estimate(name, "time"), run.estimate(name, "covariance")) for name in run.positioned}
     for ax, (t, title) in zip(drawn.axes.flat, moments, strict=False):
         _ellipses_at(run, ax, t, claimed)
-        ax.set_title(title, fontsize=9, loc="left")
+        ax.set_title(title, y=1.0, fontsize=9, loc="left")
         ax.set_xlabel("east [m]", fontsize=9)
     for ax in drawn.axes[:, 0]:
         ax.set_ylabel("north [m]")
@@ -229,7 +229,7 @@ def _innovations_of(run: Run, ax: Axes, name: str, aid: str) -> set[str]:
     for sign in (-1, 1):
         ax.plot(t, sign * gate, color=GUIDE, lw=0.8, ls="--")
     ax.set_ylim(-limit, limit)
-    ax.set_title(f"{aid}: {np.mean(refused):.2%} refused", fontsize=10, loc="left")
+    ax.set_title(f"{aid}: {np.mean(refused):.2%} refused", y=1.0, fontsize=10, loc="left")
     if axes:
         keys = [patch(colours[k % 3]) for k in range(len(axes))]
         ax.legend(

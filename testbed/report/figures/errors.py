@@ -47,7 +47,6 @@ def comparison(run: Run) -> Figure | None:
         ("roll and\npitch [deg]", lambda e: np.rad2deg(e.tilt)),
         ("heading [deg]", lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
-    bounds = {id(bound): bound for bound in run.bounds.values()}.values()  # of estimators with the same sensors, once
     panels = [(run.positioned, *panel) for panel in of_position if run.positioned]
     panels += [(run.aligned, *panel) for panel in of_attitude]
     drawn = sheet(len(panels), height=1.9)
@@ -55,7 +54,7 @@ def comparison(run: Run) -> Figure | None:
         for rank, (name, e) in enumerate(shown.items()):
             line = thin(e.t, np.maximum(moving_rms(e.t, size(e), SMOOTH_S), 1e-6))
             ax.plot(*line, **run.lines[name], **layer(rank, len(shown), LOG_LINE), label=name)
-        for bound in bounds:
+        for bound in run.bound_once:
             ax.plot(*thin(bound.t, size(bound)), **BOUND, label="bound")
         ax.set_ylabel(label)
         focus_log(ax, [size(e)[e.valid] for e in shown.values()])
@@ -153,8 +152,8 @@ def position_errors(run: Run, name: str) -> Figure | None:
         _error_panels(run, drawn.axes[:, k], name, scale * e.position, sigmas, labels)
         _reach(drawn.axes[:, k], [scale * limit for limit in limits])
     if any(closer):
-        drawn.axes[0, 0].set_title("whole run", fontsize=10, loc="left")
-        drawn.axes[closer.index(True), 1].set_title("the same, closer", fontsize=10, loc="left")
+        drawn.axes[0, 0].set_title("whole run", y=1.0, fontsize=10, loc="left")
+        drawn.axes[closer.index(True), 1].set_title("the same, closer", y=1.0, fontsize=10, loc="left")
     run.against_time(drawn, 0.25 if any(closer) else 0.0)
     for row, differs in zip(drawn.axes, closer, strict=True):
         row[-1].set_visible(differs or row[-1] is row[0])  # no panel twice
@@ -179,7 +178,7 @@ def motion_errors(run: Run, name: str) -> Figure:
     for k, (title, error, both, names) in enumerate(columns):
         _error_panels(run, drawn.axes[:, k], name, error, both, names)
         _reach(drawn.axes[:, k], _limits(error, both.claimed, _shown_rows(e)))
-        drawn.axes[0, k].set_title(title, fontsize=10, loc="left")
+        drawn.axes[0, k].set_title(title, y=1.0, fontsize=10, loc="left")
     run.against_time(drawn, 0.25)
     return drawn.figure
 

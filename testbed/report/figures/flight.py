@@ -52,8 +52,8 @@ def ground_track(run: Run) -> Figure | None:
         centre, half = (low + high) / 2, 0.62 * extent
         first.set_xlim(centre[1] - half, centre[1] + half)
         first.set_ylim(centre[0] - half, centre[0] + half)
-        first.set_title("around the true track", fontsize=10)
-        drawn.axes[0, 1].set_title("as far as the estimates go", fontsize=10)
+        first.set_title("around the true track", y=1.0, fontsize=10)
+        drawn.axes[0, 1].set_title("as far as the estimates go", y=1.0, fontsize=10)
         drawn.axes[0, 1].set_aspect("equal", adjustable="datalim")
     keys = keys_of(drawn.axes.flat)
     if run.windows:

@@ -57,7 +57,7 @@ def biases(run: Run, name: str) -> Figure | None:
             ax.plot(t[some], value[some, k], color=run.colours[name], lw=1.3, label="estimate")
             ax.set_ylabel(f"{AXES[k]} [{unit}]")
             _focus_bias(ax, value[:, k], true)
-        axes[0].set_title(title, fontsize=10, loc="left")
+        axes[0].set_title(title, y=1.0, fontsize=10, loc="left")
     run.against_time(drawn, 0.25)
     return drawn.figure
 
@@ -224,7 +224,7 @@ def spectra(run: Run, imu: str) -> Figure | None:
             logarithmic(ax, along="x")
             logarithmic(ax)
             ax.set_ylabel(f"{AXES[k]}\n[{unit}]")
-        axes[0].set_title("rate" if what == "gyro" else "specific force", fontsize=10, loc="left")
+        axes[0].set_title("rate" if what == "gyro" else "specific force", y=1.0, fontsize=10, loc="left")
         axes[-1].set_xlabel("frequency [Hz]")
     drawn.legend(keys_of(drawn.axes.flat), 0.25)
     return drawn.figure

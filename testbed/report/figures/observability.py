@@ -47,7 +47,7 @@ def visibility(run: Run) -> Figure | None:
         missing = sorted(set(range(len(states))) - set(rows))
         ax.hlines(missing, run.t[0], run.t[-1], color="#BBBBBB", lw=0.6)
         ax.set_yticks(range(len(states)), states if ax in drawn.axes[:, 0] else [], fontsize=7)
-        ax.set_title(name, fontsize=10, loc="left")
+        ax.set_title(name, y=1.0, fontsize=10, loc="left")
     run.against_time(drawn, 0.25)
     for ax in drawn.axes.flat:
         ax.grid(axis="y", visible=False)

@@ -18,6 +18,7 @@ from testbed.report.interactive.arrays import Arrays
 from testbed.report.run import Run
 from testbed.report.style import NOT_USED
 from testbed.score import accuracy
+from testbed.score.bound import Bound
 
 TRUTH = -1  # in place of a subject
 DOTS = 1.5  # of an aid, for each bin of a line
@@ -57,7 +58,8 @@ def chapters(subjects: Sequence[Subject], truths: Truths, arrays: Arrays) -> lis
     found: list[tuple[str, str, Iterator[Panel]]] = [
         (
             "Size of the errors",
-            "Root mean square over the last 2 s, on a logarithmic axis.",
+            "Root mean square over the last 2 s, on a logarithmic axis. Dashed black, in runs with an outage: the"
+            " bound, a root mean square over draws that no estimator of these sensors can be below; one run may be.",
             _sizes(subjects, positioned, arrays),
         ),
         (
@@ -92,20 +94,26 @@ def _panel(title: str, unit: str, lines: Sequence[dict[str, Any]], **more: Any) 
 
 
 def _sizes(subjects: Sequence[Subject], positioned: Sequence[Subject], arrays: Arrays) -> Iterator[Panel]:
-    quantities: tuple[tuple[str, str, Sequence[Subject], Callable[[accuracy.Errors], Array]], ...] = (
+    quantities: tuple[tuple[str, str, Sequence[Subject], Callable[[accuracy.Errors | Bound], Array]], ...] = (
         ("horizontal position error", "m", positioned, lambda e: e.horizontal),
         ("height error", "m", positioned, lambda e: np.abs(e.position[:, 2])),
         ("velocity error", "m/s", positioned, lambda e: np.asarray(np.linalg.norm(e.velocity, axis=1))),
         ("roll and pitch error", "deg", subjects, lambda e: np.rad2deg(e.tilt)),
         ("heading error", "deg", subjects, lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
+    known = {one.name.removesuffix(one.estimator): one.run for one in subjects}
+    bounds = [(f"{name}bound", bound) for name, run in known.items() for bound in run.bound_once]
     for title, unit, shown, size in quantities:
-        lines = []
+        lines: list[dict[str, Any]] = []
         for one in shown:
             e = one.errors
             y = np.maximum(moving_rms(e.t, size(e), SMOOTH_S), 1e-6)
             lines.append({"of": one.index, "since": _since(e), **arrays.line(e.t, y)})
         if lines:
+            lines += [
+                {"of": TRUTH, "name": name, "dashed": True, **arrays.line(bound.t, size(bound))}
+                for name, bound in bounds
+            ]
             yield _panel(title, unit, lines, log=True)
 
 

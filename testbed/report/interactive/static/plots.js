@@ -1,7 +1,9 @@
 // Panels over time. Each is made when it comes into sight, or when there is nothing else to do.
 
 const TICKS = () => new Bokeh.BasicTickFormatter({ use_scientific: false });
-const POWERS = () => new Bokeh.CustomJSTickFormatter({ code: "return tick >= 1e4 ? tick / 1000 + 'k' : String(tick)" });
+const POWERS = () => new Bokeh.CustomJSTickFormatter({
+  code: "const round = Number(tick.toPrecision(6)); return round >= 1e4 ? round / 1000 + 'k' : String(round)",
+});
 const touches = matchMedia("(pointer: coarse)").matches;
 
 class Panel {
@@ -102,7 +104,7 @@ class Panel {
 
   _line(line) {
     const source = new Bokeh.ColumnDataSource({ data: { t: line.t, y: this.spec.wraps ? this._broken(line) : line.y } });
-    this._add(line.of, this.figure.line({ field: "t" }, { field: "y" }, { source, ...stroke(line.of) }), ["line_color"]);
+    this._add(line.of, this.figure.line({ field: "t" }, { field: "y" }, { source, ...stroke(line.of, line.dashed) }), ["line_color"]);
   }
 
   /** A turn through north is no line across the axes. */
@@ -200,9 +202,9 @@ class Panel {
   }
 
   _logarithmic(own) {
-    const low = Math.min(...own.map((one) => one.median)) / 20;
+    const low = Math.min(...own.map((one) => Math.max(one.low / 1.3, one.median / 20)));
     const high = 2 * Math.max(...own.map((one) => one.high));
-    const [least, most] = this.spec.bounds ? [0.05, 10] : [Infinity, 0];
+    const [least, most] = this.spec.bounds ? [0.05, 10] : [high / 20, 0];
     return [Math.max(Math.min(low, least), 1e-6), Math.max(high, most, 1e-5)];
   }
 
@@ -284,8 +286,8 @@ class Panel {
 }
 
 /** Of lines that lie on each other each shows beside those above it: the first is the widest, truth the thinnest. */
-function stroke(of) {
-  if (of < 0) return { line_width: 1.1 };
+function stroke(of, dashed = false) {
+  if (of < 0) return { line_width: 1.1, line_dash: dashed ? [6, 4] : "solid" };
   const below = PAGE.subjects.length - 1 - of;
   return { line_width: 1.4 + Math.min(1.2, 4 / PAGE.subjects.length) * below, line_dash: DASHES[PAGE.subjects[of].dash] };
 }
