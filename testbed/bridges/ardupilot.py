@@ -4,7 +4,8 @@ ArduPilot sends a packet of servo outputs per frame over UDP and waits for one l
 sample of the first IMU, when the packet of the next frame has come, and until then the run waits. What is ours in it:
 ``imu`` (gyro and accel_body, with all errors of the scenario), and ``airspeed`` where there is a sensor. ``position``
 (from the first place, NED), ``velocity`` and ``attitude`` are truth: of these ArduPilot makes GNSS, magnetometer and
-barometer of its own. What the servos say moves nothing here.
+barometer of its own. What the servos say moves nothing here, unless ArduPilot is to fly: then from its first throttle
+above `STARTED_US` on channels 1 to 4 are aileron, elevator, throttle and rudder, a packet old when they move.
 
 A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
 earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
@@ -27,8 +28,9 @@ from nav.earth import position_difference_n
 from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample
 from testbed.bridges.address import address, bound
-from testbed.bridges.steps import Step, Stepper
+from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
+from testbed.feeds.bridged import Surfaces
 from testbed.feeds.feed import Turn
 
 DEFAULT = "udpin:127.0.0.1:9002"
@@ -37,19 +39,28 @@ MOST_PACKETS = 1000  # heard within one step
 _HEAD = struct.Struct("<HHI")  # magic, frame rate, frame count
 CHANNELS = {18458: 16, 29569: 32}  # by magic
 DIGITS = 9
+MIDDLE_US, TRAVEL_US, STARTED_US = 1500, 500, 1050  # of a channel
 
 
 class ArduPilot:
     """One ArduPilot that follows a run (`testbed.feeds.bridged.FarEnd`); ``answered`` counts steps."""
 
-    def __init__(self, url: str = DEFAULT, *, connect_s: float = CONNECT_S, answer_s: float = ANSWER_S) -> None:
+    name = "ArduPilot"
+
+    def __init__(
+        self, url: str = DEFAULT, *, flies: bool = False, connect_s: float = CONNECT_S, answer_s: float = ANSWER_S
+    ) -> None:
         """Wait for ArduPilot's first packet. Raises UserError when the address is none, is taken, or nobody comes."""
         self.failure, self.answered = "", 0
+        self.flies = flies
+        self.surfaces: Surfaces | None = None
+        self._started = False
         self._answer_s = answer_s
         self._stepper = Stepper()
         self._line = b""  # the last answer
         self._frame: int | None = None  # that was answered last
         self._peer: tuple[str, int] | None = None
+        self._servos: tuple[int, ...] = (MIDDLE_US, MIDDLE_US, 0, MIDDLE_US)
         self._home: tuple[float, float, float] | None = None
         self._airspeed: float | None = None
         self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
@@ -75,9 +86,18 @@ class ArduPilot:
         if frame is None:
             self.failure = self.failure or f"ArduPilot has sent no frame for {self._answer_s:g} s at {step.t:.3f} s"
             return
+        self._take(self._servos)
         self._frame, self._line = frame, self.line(step)
         self._reply()
         self.answered += 1
+
+    def _take(self, servos: tuple[int, ...]) -> None:
+        """The first four channels [us], once the throttle is up."""
+        roll, pitch, throttle, yaw = servos
+        self._started |= throttle > STARTED_US
+        if self.flies and self._started:
+            right, up, yawed = ((value - MIDDLE_US) / TRAVEL_US for value in (roll, pitch, yaw))
+            self.surfaces = moved(right, up, yawed, (throttle - MIDDLE_US + TRAVEL_US) / (2 * TRAVEL_US))
 
     def _reply(self) -> None:
         if self._peer is not None:
@@ -104,6 +124,7 @@ class ArduPilot:
                 continue
             self._peer = peer
             if self._frame is None or frame > self._frame:
+                self._servos = struct.unpack_from("<4H", data, _HEAD.size)
                 return frame
             if frame == self._frame:
                 self._reply()

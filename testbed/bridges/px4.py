@@ -4,7 +4,8 @@ PX4 connects over TCP. For each sample of the first IMU it is sent HIL_SENSOR, b
 news, and at `TRUTH_HZ` HIL_STATE_QUATERNION; it answers HIL_SENSOR with HIL_ACTUATOR_CONTROLS of the same
 ``time_usec``, and until it has, the run waits. It does so once it has booted: until then it is sent the first sample
 again and again, in real time, and the run waits at its beginning. So stamps are those of the run and what booting
-took; what else is sent depends on the run alone. What PX4 answers moves nothing here.
+took; what else is sent depends on the run alone. What PX4 answers moves nothing here, unless it is to fly: then from
+when it is armed its outputs 1 to 4 are aileron, elevator, throttle and rudder, positive to the right, up, on, right.
 
 * Samples are those of the scenario with all their errors; of several units of a kind, the first, but all receivers.
 * Answers to earlier steps are passed over; a later one, none within ``answer_s``, more than `MOST_BYTES` without the
@@ -22,14 +23,16 @@ import math
 import socket
 import time
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
 from nav.earth import SEA_LEVEL_DENSITY, isa_temperature, pressure_altitude
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.bridges.address import address, bound
-from testbed.bridges.steps import Step, Stepper
+from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
+from testbed.feeds.bridged import Surfaces
 from testbed.feeds.feed import Turn
 from testbed.mavlink.encode import Encoder, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.receive import Message, Reader
@@ -50,11 +53,21 @@ class Px4:
     it ever was.
     """
 
+    name = "PX4"
+
     def __init__(
-        self, url: str = DEFAULT, *, connect_s: float = CONNECT_S, boot_s: float = BOOT_S, answer_s: float = ANSWER_S
+        self,
+        url: str = DEFAULT,
+        *,
+        flies: bool = False,
+        connect_s: float = CONNECT_S,
+        boot_s: float = BOOT_S,
+        answer_s: float = ANSWER_S,
     ) -> None:
         """Wait for PX4 to connect. Raises UserError when the address is none, is taken, or nobody comes."""
         self.failure, self.answered, self.armed = "", 0, False
+        self.flies = flies
+        self.surfaces: Surfaces | None = None
         self._boot_s, self._answer_s = boot_s, answer_s
         self._stepper, self._encoder, self._reader = Stepper(), Encoder(), Reader()
         self._heard: deque[Message] = deque()
@@ -112,6 +125,8 @@ class Px4:
             if controls["time_usec"] == stamp:
                 self.answered += 1
                 self.armed |= bool(controls["mode"] & ARMED)
+                if self.flies and controls["mode"] & ARMED:
+                    self._take(controls["controls"], t)
                 return
             if controls["time_usec"] > stamp:
                 self.failure = (
@@ -128,6 +143,13 @@ class Px4:
                 if much > MOST_BYTES
                 else f"PX4 has not answered the step of {t:.3f} s for {self._answer_s:g} s"
             )
+
+    def _take(self, controls: Sequence[float], t: float) -> None:
+        """Outputs, as they are from -1 to 1, and the throttle from 0."""
+        roll, pitch, throttle, yaw = controls[:4]
+        self.surfaces = moved(roll, pitch, yaw, throttle)
+        if self.surfaces is None:
+            self.failure = f"PX4 commanded at {t:.3f} s what is no number"
 
     def _controls(self, until: float) -> Message | None:
         """The next HIL_ACTUATOR_CONTROLS, None when there is none by ``until`` or too much else is said."""

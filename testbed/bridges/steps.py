@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from nav.samples import Array, Sample
+from testbed.feeds.bridged import Surfaces
 from testbed.feeds.feed import Turn
 from testbed.motion.table import TruthBlock
 
@@ -34,6 +35,17 @@ class Step:
     def first(self, kind: type[S]) -> S | None:
         """News of the first sensor of a kind, None when it has none."""
         return next((one for one in self.arrived.values() if isinstance(one, kind)), None)
+
+
+def moved(roll: float, pitch: float, yaw: float, throttle: float) -> Surfaces | None:
+    """Surfaces of commands that are positive to the right, up and right, from -1 to 1, and throttle from 0 to 1.
+
+    What is beyond is the limit; None where one is no number.
+    """
+    commands = np.array([roll, -pitch, -yaw, throttle])
+    if not np.isfinite(commands).all():
+        return None
+    return Surfaces(*np.clip(commands, [-1.0, -1.0, -1.0, 0.0], 1.0).tolist())
 
 
 class Stepper:

@@ -63,6 +63,9 @@ Px4Address = Annotated[
 ArduPilotAddress = Annotated[
     str | None, typer.Option("--ardupilot", metavar="[URL]", help="Let ArduPilot follow it; it calls udpin:HOST:PORT.")
 ]
+Pilot = Annotated[
+    bool, typer.Option("--pilot", help="With --px4 or --ardupilot: let it fly, in place of the plan, once it is armed.")
+]
 Shown = Annotated[str | None, typer.Option(metavar="NAME", help="Which estimator to stream; the scenario's first.")]
 Realtime = Annotated[
     float | None, typer.Option(metavar="[FACTOR]", help="Run no faster than real time, or FACTOR times that.")
@@ -83,6 +86,7 @@ def run(
     estimator: Shown = None,
     px4: Px4Address = None,
     ardupilot: ArduPilotAddress = None,
+    pilot: Pilot = False,
     realtime: Realtime = None,
     report: Report = True,
     force: Force = False,
@@ -119,7 +123,7 @@ def run(
             readonly=mavlink_readonly,
             key=mavlink_key,
         )
-        far_end = _far_end(loaded, px4, ardupilot)
+        far_end = _far_end(loaded, px4, ardupilot, pilot)
         result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
         conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
@@ -190,9 +194,11 @@ def _connect(
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
 
-def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None) -> FarEnd | None:
+def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None, flies: bool) -> FarEnd | None:
     """The autopilot that is to follow the run, once it is there; None when there is to be none."""
     if px4 is None and ardupilot is None:
+        if flies:
+            raise UserError("--pilot: there is no autopilot: add --px4 or --ardupilot, or leave it out")
         return None
     from testbed.bridges.ardupilot import ArduPilot
     from testbed.bridges.px4 import Px4
@@ -204,10 +210,10 @@ def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None) -> FarE
         raise UserError("--px4, --ardupilot: an autopilot lives on inertial samples: add [sensors.imu]")
     if px4 is not None:
         remark(f"waiting for PX4 on {px4}")
-        return Px4(px4)
+        return Px4(px4, flies=flies)
     assert ardupilot is not None
     remark(f"waiting for ArduPilot on {ardupilot}")
-    return ArduPilot(ardupilot)
+    return ArduPilot(ardupilot, flies=flies)
 
 
 def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: Any) -> RunResult:

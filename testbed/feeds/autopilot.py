@@ -39,7 +39,7 @@ import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -60,8 +60,8 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
-from testbed.estimators.lane import Lane, Tracked
-from testbed.feeds.feed import Turn
+from testbed.estimators.lane import Lane
+from testbed.feeds.feed import Turn, join
 from testbed.feeds.known import commanded, handed_over
 from testbed.motion.paths import Feedback
 from testbed.motion.table import MotionSource, TruthBlock
@@ -156,7 +156,7 @@ class Autopilot:
             here = [float(block.t[k - done]) for k in wanted[first:last]]
             turns.append(self._turn(block, here))
             done += len(block)
-        return _join(turns) if turns else Turn(TruthBlock.empty(self._tick, 0), {}, {}, {})
+        return join(turns) if turns else Turn(TruthBlock.empty(self._tick, 0), {}, {}, {})
 
     def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
         """Remove and give the events up to a time."""
@@ -402,34 +402,3 @@ def _at_centre(
         estimate.h + down,
         (float(v_n[0]), float(v_n[1]), float(v_n[2])),
     )
-
-
-def _join(turns: Sequence[Turn]) -> Turn:
-    """Consecutive turns as one."""
-    if len(turns) == 1:
-        return turns[0]
-    columns = {
-        field.name: np.concatenate([getattr(turn.reference, field.name) for turn in turns])
-        for field in fields(TruthBlock)
-        if field.name != "tick"
-    }
-    first = turns[0]
-    return Turn(
-        TruthBlock(first.reference.tick, **columns),
-        {name: _join_imu([turn.imu[name] for turn in turns]) for name in first.imu},
-        {name: [sample for turn in turns for sample in turn.samples[name]] for name in first.samples},
-        {
-            name: Tracked(
-                _join_imu([turn.tracked[name].increments for turn in turns]),
-                [report for turn in turns for report in turn.tracked[name].votes],
-                [report for turn in turns for report in turn.tracked[name].reports],
-                [estimate for turn in turns for estimate in turn.tracked[name].estimates],
-            )
-            for name in first.tracked
-        },
-    )
-
-
-def _join_imu(pieces: Sequence[ImuSamples]) -> ImuSamples:
-    columns = ("t", "dt", "dtheta", "dv")
-    return ImuSamples(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in columns))

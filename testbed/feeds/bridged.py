@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from testbed.feeds.feed import Feed, Turn
+
+
+class Surfaces(NamedTuple):
+    """What moves an aircraft: shares of travel (-1 to 1) with the signs of recorded controls, and throttle (0 to 1)."""
+
+    aileron: float
+    elevator: float
+    rudder: float
+    throttle: float
 
 
 class FarEnd(Protocol):
     """A program outside that is told what the sensors say, step by step, and answers each step.
 
-    ``failure`` is why it no longer does, empty as long as it does.
+    ``name`` is what it is called. ``failure`` is why it no longer answers, empty as long as it does. ``flies`` says
+    whether it is to move the aircraft; then ``surfaces`` are what it commands, None as long as it does not.
     """
 
+    name: str
     failure: str
+    flies: bool
+    surfaces: Surfaces | None
 
     def follow(self, turn: Turn) -> None:
         """Tell it of a turn, and hear its answers; waits for them. Sets ``failure`` in place of raising anything."""

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from nav.samples import ImuSamples, Sample
 from testbed.estimators.lane import Tracked
@@ -65,3 +68,34 @@ class Feed(Protocol):
     def close(self) -> None:
         """Let go of what it holds."""
         ...
+
+
+def join(turns: Sequence[Turn]) -> Turn:
+    """Consecutive turns as one."""
+    if len(turns) == 1:
+        return turns[0]
+    columns = {
+        field.name: np.concatenate([getattr(turn.reference, field.name) for turn in turns])
+        for field in fields(TruthBlock)
+        if field.name != "tick"
+    }
+    first = turns[0]
+    return Turn(
+        TruthBlock(first.reference.tick, **columns),
+        {name: _join_imu([turn.imu[name] for turn in turns]) for name in first.imu},
+        {name: [sample for turn in turns for sample in turn.samples[name]] for name in first.samples},
+        {
+            name: Tracked(
+                _join_imu([turn.tracked[name].increments for turn in turns]),
+                [report for turn in turns for report in turn.tracked[name].votes],
+                [report for turn in turns for report in turn.tracked[name].reports],
+                [estimate for turn in turns for estimate in turn.tracked[name].estimates],
+            )
+            for name in first.tracked
+        },
+    )
+
+
+def _join_imu(pieces: Sequence[ImuSamples]) -> ImuSamples:
+    columns = ("t", "dt", "dtheta", "dv")
+    return ImuSamples(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in columns))

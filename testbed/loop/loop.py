@@ -19,7 +19,7 @@ from nav.samples import Estimate, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
-from testbed.feeds.bridged import Bridged, FarEnd
+from testbed.feeds.bridged import FarEnd
 from testbed.feeds.build import located, open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
@@ -83,8 +83,8 @@ def run(
     unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
     ``source`` replaces the motion, to share one flown truth between runs. Links and ``controls`` may make requests
     (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. ``build`` makes the estimators
-    of their sections, in place of `registry.build`. A ``far_end`` is told of every turn, and closed at the end; when it
-    fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when
+    of their sections, in place of `registry.build`. A ``far_end`` is told of every turn, flies if it is to, and is
+    closed at the end; when it fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when
     the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
     with ExitStack() as ending:
@@ -190,9 +190,7 @@ class _Passage:
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
         self.lanes = setup.build(scenario.estimator, scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
-        self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead)
-        if setup.far_end is not None:
-            self.feed = Bridged(self.feed, setup.far_end)
+        self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead, setup.far_end)
         ending.callback(self.feed.close)
         self.recorder = Recorder(setup.out / RECORD if setup.out else None, scenario, setup.seed)
         ending.callback(self.recorder.close)

@@ -124,6 +124,7 @@ class Flight:
         self._row = self._aircraft.read()
         self._last = self._row  # the last row handed out, for its increments
         self._feedback: Feedback | None = None
+        self._moved = False
         alt, speed = truth.start.alt_m, truth.start.airspeed_mps
         envelope, period = self._aircraft.envelope, self._frame / truth.rate_hz
         self._guidance = Guidance(plan, envelope, self.true_feedback(), alt, speed, period)
@@ -157,6 +158,14 @@ class Flight:
         self._feedback = state
         self._aircraft.feed_back(state)
 
+    def move(self, aileron: float, elevator: float, rudder: float, throttle: float) -> None:
+        """Let somebody else fly from now on: shares of the surfaces' travel (-1 to 1), and throttle (0 to 1).
+
+        Signs are those of the recorded controls: aileron rolls right, elevator pitches down, rudder yaws left.
+        """
+        self._moved = True
+        self._aircraft.move(aileron, elevator, rudder, throttle)
+
     def blow(self, from_deg: float, speed_mps: float) -> None:
         """Let the mean wind, where it is one, become this: `Weather.blow`."""
         self._weather.blow(from_deg, speed_mps)
@@ -167,7 +176,7 @@ class Flight:
 
     def activity(self) -> str:
         """The leg being flown, or why the flight ended."""
-        return self.failure or self._guidance.activity()
+        return self.failure or ("flown from outside" if self._moved else self._guidance.activity())
 
     def _guide(self) -> None:
         """One step of guidance, or the end of the flight."""
@@ -176,10 +185,11 @@ class Flight:
         if self.failure:
             self._ended = True
             return
-        command = self._guidance.step(self._feedback or true)
-        self._ended = self._guidance.done
-        self._commands = (command.bank, command.altitude, command.airspeed, float(self._guidance.leg))
-        self._aircraft.command(command.bank, command.altitude, command.climb, command.airspeed)
+        if not self._moved:
+            command = self._guidance.step(self._feedback or true)
+            self._ended = self._guidance.done
+            self._commands = (command.bank, command.altitude, command.airspeed, float(self._guidance.leg))
+            self._aircraft.command(command.bank, command.altitude, command.climb, command.airspeed)
         if self._weather.changes:
             self._aircraft.wind(*self._weather.step(true.lat, true.lon, true.h))
 
@@ -318,6 +328,12 @@ class Aircraft:
             "airspeed-mps": state.airspeed,
         }.items():
             self.fdm[f"feedback/{name}"] = value
+
+    def move(self, aileron: float, elevator: float, rudder: float, throttle: float) -> None:
+        """Leave the inner loops out, and the actuators to these shares of their travel."""
+        self.fdm["ap/engaged"], self.fdm["ap/hold"] = 0.0, -1.0
+        for name, value in zip((*SURFACES, "throttle"), (aileron, elevator, rudder, throttle), strict=True):
+            self.fdm[f"fcs/{name}-cmd-norm"] = value
 
     def wind(self, north: float, east: float, down: float) -> None:
         """Set the wind beside the gusts, the velocity of the air [m/s]."""

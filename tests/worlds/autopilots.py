@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import socket
 import struct
 import threading
@@ -24,16 +25,48 @@ def free_port(kind: socket.SocketKind) -> int:
         return int(probe.getsockname()[1])
 
 
+class Circle:
+    """A minimal autopilot: holds a bank, the height and the airspeed that it finds when it begins. Outputs from -1 to 1
+    are positive to the right, up and right; the throttle from 0 to 1.
+    """
+
+    BANK = math.radians(25.0)
+    AILERON, ELEVATOR = 0.35, 0.52  # travel [rad]
+
+    def __init__(self) -> None:
+        self._begun: tuple[float, float] | None = None
+        self._t = 0.0
+        self._lift, self._nose, self._power = 0.0, 0.0, 0.5  # integrals
+
+    def fly(self, t: float, rates: Sequence[float], angles: Sequence[float], h: float, climb: float, v: float) -> Any:
+        """Roll, pitch, yaw and throttle for time [s], body rates, roll and pitch [rad], height, climb and airspeed."""
+        h0, v0 = self._begun = self._begun or (h, v)
+        dt, self._t = (t - self._t if self._t else 0.0), t
+        (p, q, r), (roll, pitch, *_) = rates, angles
+        climb_error = max(-2.0, min(2.0, 0.3 * (h0 - h))) - climb
+        self._lift += 0.014 * climb_error * dt
+        wanted = max(-0.2, min(0.25, 0.03 * climb_error + self._lift))
+        self._nose += 1.0 * (wanted - pitch) * dt
+        slow = v0 - v
+        self._power += 0.014 * slow * dt
+        turned_q = q * math.cos(roll) - r * math.sin(roll)
+        up = (1.0 * (wanted - pitch) + self._nose - 0.15 * turned_q) / self.ELEVATOR
+        right = (0.45 * (self.BANK - roll) - 0.03 * p) / self.AILERON
+        yaw = 0.16 * right - 0.25 * (r - 9.81 * math.sin(roll) / max(v, 10.0)) / self.AILERON
+        return right, up, yaw, max(0.0, min(1.0, self._power + 0.1 * slow))
+
+
 class Px4(threading.Thread):
     """PX4's side: connects, says hello, and answers each HIL_SENSOR from the ``boot``-th on.
 
     ``behaviour`` from the ``at``-th sensor on: "stall", "close", "late" (answers of the step before), "ahead" (of a
     later time), "talk" (never stops), "deaf" (says much, reads nothing); all the time: "double" (every answer twice),
-    "halves" (a byte at a time, garbage between).
+    "halves" (a byte at a time, garbage between). With a ``pilot`` it is armed from the ``at``-th sensor on.
     """
 
-    def __init__(self, behaviour: str = "", at: int = 0, boot: int = 3) -> None:
+    def __init__(self, behaviour: str = "", at: int = 0, boot: int = 3, pilot: Circle | None = None) -> None:
         super().__init__(daemon=True)
+        self.pilot, self._state = pilot, None
         self.port = free_port(socket.SOCK_STREAM)
         self.behaviour, self.at, self.boot = behaviour, at, boot
         self.heard: list[Any] = []  # messages
@@ -70,17 +103,34 @@ class Px4(threading.Thread):
             self.raw += data
             for message in parser.parse_buffer(data) or []:
                 self.heard.append(message)
+                if message.get_type() == "HIL_STATE_QUATERNION":
+                    self._state = message
                 if message.get_type() != "HIL_SENSOR":
                     continue
+                self._sensor = message
                 sensors += 1
                 if sensors >= self.boot and not self._answer(link, message.time_usec, sensors):
                     return
 
     def _controls(self, stamp: int) -> bytes:
-        return bytes(self._mav.hil_actuator_controls_encode(stamp, [0.0] * 16, 1, 1).pack(self._mav))
+        controls, mode = [0.0] * 16, 1
+        if self.pilot is not None and self._due and self._state is not None:
+            right, up, yaw, throttle = self._flown()
+            controls[:4], mode = [right, up, throttle, yaw], 1 | 128
+        return bytes(self._mav.hil_actuator_controls_encode(stamp, controls, mode, 1).pack(self._mav))
+
+    def _flown(self) -> Any:
+        own, sensor = self._state, self._sensor
+        w, x, y, z = own.attitude_quaternion
+        roll, pitch = math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), math.asin(2 * (w * y - x * z))
+        rates = sensor.xgyro, sensor.ygyro, sensor.zgyro
+        assert self.pilot is not None
+        return self.pilot.fly(
+            sensor.time_usec / 1e6, rates, (roll, pitch), own.alt / 1e3, -own.vz / 100, own.true_airspeed / 100
+        )
 
     def _answer(self, link: socket.socket, stamp: int, count: int) -> bool:
-        due = count >= self.at
+        due = self._due = count >= self.at
         if self.behaviour == "stall" and due:
             self.over.wait()
             return False
@@ -105,13 +155,14 @@ class ArduPilot(threading.Thread):
 
     ``behaviour`` from the ``at``-th frame on: "stall", "restart" (frame 0), "repeat" (the same frame for ever); all the
     time: "double" (every packet twice), "wrong" (packets of a wrong magic and halves of packets before each), "wide"
-    (32 channels).
+    (32 channels). With a ``pilot`` its throttle is up from the ``at``-th frame on.
     """
 
-    def __init__(self, behaviour: str = "", at: int = 0, frames: int = 10**9) -> None:
+    def __init__(self, behaviour: str = "", at: int = 0, pilot: Circle | None = None) -> None:
         super().__init__(daemon=True)
+        self.pilot = pilot
         self.port = free_port(socket.SOCK_DGRAM)
-        self.behaviour, self.at, self.frames = behaviour, at, frames
+        self.behaviour, self.at = behaviour, at
         self.lines: list[bytes] = []
         self.over = threading.Event()
         self.start()
@@ -147,7 +198,16 @@ class ArduPilot(threading.Thread):
     def _send(self, link: socket.socket, count: int, again: int) -> None:
         there = ("127.0.0.1", self.port)
         magic, channels = (29569, 32) if self.behaviour == "wide" else (18458, 16)
-        packet = struct.pack(f"<HHI{channels}H", magic, 400, count, *[1500] * channels)
+        outputs = [1500, 1500, 1000, 1500] + [1500] * (channels - 4)
+        if self.pilot is not None and count >= self.at and self.lines:
+            said = json.loads(self.lines[-1])
+            v = said["velocity"]
+            right, up, yaw, throttle = self.pilot.fly(
+                said["timestamp"], said["imu"]["gyro"], said["attitude"], -said["position"][2], -v[2], said["airspeed"]
+            )
+            pwm = 1500 + 500 * right, 1500 + 500 * up, 1000 + 1000 * throttle, 1500 + 500 * yaw
+            outputs[:4] = [round(max(1000.0, min(2000.0, value))) for value in pwm]
+        packet = struct.pack(f"<HHI{channels}H", magic, 400, count, *outputs)
         if self.behaviour == "wrong":
             link.sendto(struct.pack("<HHI16H", 18459, 400, count + 1, *[1500] * 16), there)
             link.sendto(packet[: len(packet) // 2], there)

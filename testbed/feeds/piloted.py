@@ -1,0 +1,96 @@
+"""A feed that is flown from outside: a far end hears each inertial sample, and what it commands moves the surfaces.
+
+A run begins in the air, so the plan is flown until the far end takes over, which is an event. Then neither plan nor
+inner loops have a say. What it answers to a sample moves the aircraft from that sample's time on.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+from testbed.feeds.bridged import FarEnd
+from testbed.feeds.feed import Turn, join
+from testbed.feeds.simulated import Simulated
+from testbed.motion.table import MotionSource, TruthBlock
+
+NEVER_FLOWN = "the plan was flown to the end: {} never took over"
+
+
+@runtime_checkable
+class Movable(MotionSource, Protocol):
+    """A motion whose surfaces can be moved: `testbed.motion.flight.Flight`."""
+
+    def move(self, aileron: float, elevator: float, rudder: float, throttle: float) -> None:
+        """Let these fly from now on."""
+        ...
+
+    def give_up(self, why: str) -> None:
+        """End the motion here; ``why`` becomes its failure."""
+        ...
+
+
+class Piloted:
+    """A simulated feed that a far end flies (`testbed.feeds.feed.Feed`), one inertial sample after the other."""
+
+    def __init__(self, simulated: Simulated, source: Movable, far_end: FarEnd, imu_hz: float) -> None:
+        self.rate_hz, self.source = simulated.rate_hz, simulated.source
+        self.faults, self.receptions, self.origin = simulated.faults, simulated.receptions, simulated.origin
+        self.motion_s = 0.0
+        self._simulated, self._movable, self._far_end = simulated, source, far_end
+        self._every = max(1, round(self.rate_hz / imu_hz))  # ticks from sample to sample
+        self._tick = 0
+        self._events: list[tuple[float, str, str]] = []
+        self._taken_over = False
+
+    @property
+    def failure(self) -> str:
+        """Why the motion ended early, empty when it did not."""
+        return self._simulated.failure
+
+    def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
+        """The next rows, fewer when the motion or the far end ends; nobody's estimate is needed for them."""
+        turns: list[Turn] = []
+        done = 0
+        while done < ticks:
+            before = time.perf_counter()
+            block = self._movable.advance(min(ticks - done, 1 + -self._tick % self._every))
+            self.motion_s += time.perf_counter() - before
+            if not len(block):
+                break
+            turn = Turn(block, *self._simulated.sense(block))
+            turns.append(turn)
+            done += len(block)
+            self._tick += len(block)
+            self._far_end.follow(turn)
+            self._obey(float(block.t[-1]))
+        return join(turns) if turns else Turn(TruthBlock.empty(self._tick, 0), {}, {})
+
+    def _obey(self, t: float) -> None:
+        if self._far_end.failure:
+            self._movable.give_up(self._far_end.failure)
+        elif self._far_end.surfaces is not None:
+            self._movable.move(*self._far_end.surfaces)
+            if not self._taken_over:
+                self._events.append((t, "info", f"{self._far_end.name} flies from here on"))
+            self._taken_over = True
+
+    def activity(self) -> str:
+        """What the motion is doing."""
+        return self._simulated.activity()
+
+    def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
+        """Remove and give its events up to a time."""
+        taken = [event for event in self._events if event[0] <= until]
+        self._events = self._events[len(taken) :]
+        return taken
+
+    def remark(self) -> str:
+        """That nobody took over, if so."""
+        return "" if self._taken_over else NEVER_FLOWN.format(self._far_end.name)
+
+    def close(self) -> None:
+        """Let go of what the motion holds."""
+        self._simulated.close()
