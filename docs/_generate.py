@@ -458,6 +458,9 @@ length_m = 5000
 [sensors.star_tracker]
 [sensors.position_fix]
 rate_hz = 1.0
+[sensors.rangefinder]
+max_range_m = 1000.0
+[sensors.optical_flow]
 [[fault]]
 sensor = "gnss"
 channel = "north"
@@ -525,7 +528,18 @@ def _grade_part(kind: str) -> Callable[[], str]:
     return lambda: grade_tables()[kind]
 
 
-KINDS = ("imu", "gnss", "magnetometer", "barometer", "airspeed", "body_velocity", "star_tracker", "position_fix")
+KINDS = (
+    "imu",
+    "gnss",
+    "magnetometer",
+    "barometer",
+    "airspeed",
+    "body_velocity",
+    "star_tracker",
+    "position_fix",
+    "rangefinder",
+    "optical_flow",
+)
 PARTS: dict[str, Callable[[], str]] = {
     "scenario_reference": scenario_reference,
     "fault_kinds": fault_kinds,

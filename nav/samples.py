@@ -161,6 +161,33 @@ class PositionSample:
     sensor: str = "position_fix"
 
 
+@dataclass(frozen=True, slots=True)
+class RangeSample:
+    """Range to the ground along body z, down [m]."""
+
+    t: float
+    t_arrival: float
+    range: float
+    sensor: str = "rangefinder"
+
+
+@dataclass(frozen=True, slots=True)
+class OpticalFlowSample:
+    """How the image of a camera that looks along body z, down, moves: means over an interval whose middle is ``t``.
+
+    ``flow_b`` (2,) rates of the line of sight about body x and y, positive as by a rotation of the body about them
+    (MAVLink, OPTICAL_FLOW_RAD), and ``rotation_b`` (2,) that rotation by the sensor's own gyro [rad/s]; ``quality`` of
+    the match from 0 to 1, to whose inverse the variance of its noise is proportional.
+    """
+
+    t: float
+    t_arrival: float
+    flow_b: Array
+    rotation_b: Array
+    quality: float
+    sensor: str = "optical_flow"
+
+
 Sample: TypeAlias = (
     GnssSample
     | BarometerSample
@@ -169,6 +196,8 @@ Sample: TypeAlias = (
     | BodyVelocitySample
     | StarSample
     | PositionSample
+    | RangeSample
+    | OpticalFlowSample
 )
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from nav.aids import airspeed, barometer, body_velocity, gnss, magnetometer, position_fix, star_tracker
+from nav.aids import airspeed, barometer, body_velocity, gnss, magnetometer, position_fix, star_tracker, terrain
 from nav.aids.airspeed import AirspeedAid
 from nav.aids.barometer import BarometerAid
 from nav.aids.base import Aid
@@ -19,13 +19,16 @@ from nav.aids.gnss import Course, GnssAid
 from nav.aids.magnetometer import MagnetometerAid
 from nav.aids.position_fix import PositionFixAid
 from nav.aids.star_tracker import StarAid
+from nav.aids.terrain import OpticalFlowAid, RangefinderAid
 from nav.samples import (
     AirspeedSample,
     BarometerSample,
     BodyVelocitySample,
     GnssSample,
     MagnetometerSample,
+    OpticalFlowSample,
     PositionSample,
+    RangeSample,
     Sample,
     StarSample,
 )
@@ -38,7 +41,9 @@ __all__ = [
     "Course",
     "GnssAid",
     "MagnetometerAid",
+    "OpticalFlowAid",
     "PositionFixAid",
+    "RangefinderAid",
     "StarAid",
     "problem",
 ]
@@ -49,7 +54,9 @@ PROBLEMS: Mapping[type[Sample], Callable[[Any], str]] = {
     BodyVelocitySample: body_velocity.problem,
     GnssSample: gnss.problem,
     MagnetometerSample: magnetometer.problem,
+    OpticalFlowSample: terrain.flow_trouble,
     PositionSample: position_fix.problem,
+    RangeSample: terrain.range_trouble,
     StarSample: star_tracker.problem,
 }
 

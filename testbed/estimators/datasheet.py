@@ -16,22 +16,26 @@ from nav.aids import (
     BodyVelocityAid,
     GnssAid,
     MagnetometerAid,
+    OpticalFlowAid,
     PositionFixAid,
+    RangefinderAid,
     StarAid,
 )
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
-from testbed.estimators.rig import Air
+from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
-from testbed.sensors import SensorConfig, registry
+from testbed.sensors import registry
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocityConfig
 from testbed.sensors.gnss import GnssConfig
 from testbed.sensors.imu import ImuErrors
 from testbed.sensors.magnetometer import MagnetometerConfig
+from testbed.sensors.optical_flow import OpticalFlowConfig
 from testbed.sensors.position_fix import PositionFixConfig
+from testbed.sensors.rangefinder import RangefinderConfig
 from testbed.sensors.star_tracker import StarTrackerConfig
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
@@ -101,16 +105,21 @@ def _drive(sigma: float, tau: float) -> float:
     return sigma * math.sqrt(2 / tau)
 
 
-def aid_of(
-    name: str, section: SensorConfig, imu: ImuErrors, air: Air, usual: Usual, slip_mps: float | None = None
-) -> Aid | None:
-    """A sensor as a filter is told of it, None for one that aids none.
+def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None = None) -> Aid | None:
+    """A sensor of the ``rig`` as a filter is told of it, None for one that aids none.
 
-    ``slip_mps`` is of wheels, None without that constraint. Body velocity and position fixes are of the centre of
-    gravity.
+    ``slip_mps`` is of wheels, None without that constraint. Body velocity, position fixes and what is seen of the
+    ground are of the centre of gravity.
     """
+    section, usual, site = rig.sensors[name], rig.usual, rig.site
     from_imu: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
+        case RangefinderConfig():
+            r = section.errors()
+            return RangefinderAid(name, r.noise, r.scale, site.terrain, site.terrain_sigma)
+        case OpticalFlowConfig():
+            f = section.errors()
+            return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, site.terrain, site.terrain_sigma)
         case GnssConfig():
             e = section.errors()
             return GnssAid(

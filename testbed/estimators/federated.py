@@ -219,7 +219,7 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
     air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid:
-        made = aid_of(name, rig.sensors[name], errors, air, rig.usual, section.nonholonomic_mps)
+        made = aid_of(name, rig, errors, air, section.nonholonomic_mps)
         assert made is not None  # the scenario was checked
         return made
 

@@ -104,7 +104,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
     air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid | None:
-        return aid_of(name, sensors[name], errors, air, rig.usual, section.nonholonomic_mps)
+        return aid_of(name, rig, errors, air, section.nonholonomic_mps)
 
     # One sensor of a kind: an aid, or the first in the file, whose samples then serve the alignment only.
     offered = {sensors[name].kind: name for name in section.aids if sensors[name].kind in ONE_EACH}

@@ -68,6 +68,6 @@ class Rig:
         }
 
     def lag_s(self, names: Iterable[str]) -> float:
-        """The largest latency [s] of the aids of these names."""
+        """The largest age [s] at which samples of the aids of these names arrive."""
         sections = [self.sensors[name] for name in names]
-        return max((section.latency_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)
+        return max((section.age_s for section in sections if not isinstance(section, ImuConfig)), default=0.0)

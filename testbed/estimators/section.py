@@ -15,7 +15,7 @@ Mistake: TypeAlias = tuple[tuple[str | int, ...], str]  # where in the table, an
 
 DEFAULT_ESTIMATOR = "ins"  # the kind of one that does not say it
 # Of these kinds an estimator may have several sensors; of any other kind it takes one.
-SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix"})
+SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix", "rangefinder", "optical_flow"})
 ONE_EACH = frozenset({"gnss", "barometer", "magnetometer", "airspeed"})
 
 Engine: TypeAlias = Annotated[Literal["linear", "unscented"], Field(description="derivatives or sigma points")]

@@ -21,7 +21,9 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    OpticalFlowSample,
     PositionSample,
+    RangeSample,
     Sample,
     StarSample,
 )
@@ -37,6 +39,8 @@ SAMPLES: Mapping[str, type[Sample]] = {
     "body_velocity": BodyVelocitySample,
     "star_tracker": StarSample,
     "position_fix": PositionSample,
+    "rangefinder": RangeSample,
+    "optical_flow": OpticalFlowSample,
 }
 
 Samples: TypeAlias = Sequence[Sample]

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, field_validator, model_validator
 
-from testbed.motion.sections import Altitude, Latitude, Longitude, TickRate
+from testbed.motion.sections import Altitude, Latitude, Longitude, Terrain, TickRate
 from testbed.schema import Section
 
 COMPONENT = re.compile(r"(?P<minus>-?)(?P<axis>[xyz])")
@@ -107,6 +107,7 @@ class LogTruth(Section):
         "or its GNSS where it has none; that GNSS, kept back where it is denied; or nothing",
     )
     start: Place | None = Field(default=None, description="where it begins; none: where the log's GNSS says")
+    terrain: Terrain = Field(default=Terrain(), description="the ground, as filters are told of it")
     columns: dict[str, Stream] = Field(
         default_factory=dict, description="of a table: the columns of each sensor, by name, and of the `reference`"
     )

@@ -138,6 +138,15 @@ class Wind(Section):
         return self.walk_mps_per_sqrt_s > 0 or wanders or self.updrafts is not None
 
 
+class Terrain(Section):
+    """The ground below: level, at a height that maps tell."""
+
+    height_m: float = Field(default=0.0, ge=-500, le=9000, description="of the map above the WGS84 ellipsoid")
+    map_sigma_m: float = Field(
+        default=5.0, ge=0, le=1000, description="1 sigma of how far the ground is from the map; filters are told it"
+    )
+
+
 class FlightTruth(Section):
     """Motion from JSBSim: an aircraft flies the scenario's plan."""
 
@@ -148,6 +157,7 @@ class FlightTruth(Section):
     rate_hz: TickRate = 200.0
     start: Start = Field(description="where the flight begins, trimmed, straight and level")
     wind: Wind = Field(default=Wind(), description="wind and turbulence; none: calm air")
+    terrain: Terrain = Field(default=Terrain(), description="the ground that sensors see; it stops nobody")
 
 
 class KinematicStart(Section):
@@ -176,6 +186,7 @@ class KinematicTruth(Section):
     start: KinematicStart = Field(description="where the body starts and how it lies")
     body: Body = Field(default=Body(), description="how it turns and sways")
     segments: tuple[Segment, ...] = Field(default=(), description="what it does, one after the other; then straight on")
+    terrain: Terrain = Field(default=Terrain(), description="the ground that sensors see")
 
     def track(self) -> Track:
         """The track along the segments. Raises ValueError with the key of the first that can't be."""

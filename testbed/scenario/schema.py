@@ -28,6 +28,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from nav.terrain import Terrain
 from testbed.data import data_dir
 from testbed.errors import UserError, shown
 from testbed.estimators import registry
@@ -267,7 +268,11 @@ class Scenario(Section):
         start = self.truth.start
         if start is None:
             raise UserError("truth.start: is found in the log when it is run; to know it before, give it")
-        return Site(self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m)
+        ground = self.truth.terrain
+        return Site(
+            self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m,
+            Terrain.flat(ground.height_m), ground.map_sigma_m,
+        )  # fmt: skip
 
     def rig(self, seed: int) -> Rig:
         """What builders of estimators may know of a run with this seed."""

@@ -17,7 +17,18 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from nav.ahrs import LEVEL, MAGNETIC_HEADING, STATES, Ahrs, transition
-from nav.aids import Aid, AirspeedAid, BarometerAid, BodyVelocityAid, GnssAid, MagnetometerAid, PositionFixAid, StarAid
+from nav.aids import (
+    Aid,
+    AirspeedAid,
+    BarometerAid,
+    BodyVelocityAid,
+    GnssAid,
+    MagnetometerAid,
+    OpticalFlowAid,
+    PositionFixAid,
+    RangefinderAid,
+    StarAid,
+)
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
 from nav.earth import earth_rate_n, isa_pressure
@@ -36,7 +47,9 @@ from nav.samples import (
     FixType,
     GnssSample,
     MagnetometerSample,
+    OpticalFlowSample,
     PositionSample,
+    RangeSample,
     Sample,
     StarSample,
     Status,
@@ -236,6 +249,10 @@ def _sample(
             return BodyVelocitySample(t, t, np.zeros(3), aid.sensor)
         case StarAid():
             return StarSample(t, t, np.array([1.0, 0.0, 0.0, 0.0]), aid.sensor)
+        case RangefinderAid():
+            return RangeSample(t, t, 1.0, aid.sensor)
+        case OpticalFlowAid():
+            return OpticalFlowSample(t, t, np.zeros(2), np.zeros(2), 1.0, aid.sensor)
         case PositionFixAid():
             return PositionSample(t, t, here.lat, here.lon, here.h, aid.sensor)
     raise TypeError(f"no sample of {aid!r}")

@@ -14,8 +14,11 @@ from testbed.sensors.barometer import Barometer, BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
 from testbed.sensors.gnss import Gnss, GnssConfig
 from testbed.sensors.imu import Imu, ImuConfig
-from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig, Site, geomagnetic_field_n
+from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig, geomagnetic_field_n
+from testbed.sensors.optical_flow import OpticalFlow, OpticalFlowConfig
 from testbed.sensors.position_fix import PositionFix, PositionFixConfig
+from testbed.sensors.rangefinder import Rangefinder, RangefinderConfig
+from testbed.sensors.site import Site
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
 
 __all__ = [
@@ -37,8 +40,12 @@ SensorConfig: TypeAlias = (
     | BodyVelocityConfig
     | StarTrackerConfig
     | PositionFixConfig
+    | RangefinderConfig
+    | OpticalFlowConfig
 )
-AidingSensor: TypeAlias = Gnss | Magnetometer | Barometer | Airspeed | BodyVelocity | StarTracker | PositionFix
+AidingSensor: TypeAlias = (
+    Gnss | Magnetometer | Barometer | Airspeed | BodyVelocity | StarTracker | PositionFix | Rangefinder | OpticalFlow
+)
 Sensor: TypeAlias = Imu | AidingSensor
 
 
@@ -46,5 +53,6 @@ def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site:
     """The sensor for one run. Raises UserError when its samples do not fall on ticks or no field model has the date."""
     made = registry.of(config).sensor
     given = (name, config, tick_rate_hz, seed)
-    sensor: Sensor = made(*given, site) if isinstance(config, MagnetometerConfig) else made(*given)
+    local = isinstance(config, MagnetometerConfig | RangefinderConfig | OpticalFlowConfig)
+    sensor: Sensor = made(*given, site) if local else made(*given)
     return sensor

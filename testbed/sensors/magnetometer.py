@@ -18,6 +18,7 @@ from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
+from testbed.sensors.site import Site
 from testbed.sensors.timing import AidingTiming, Schedule
 from testbed.sensors.units import DEG, MICROTESLA, PERCENT
 
@@ -46,16 +47,6 @@ GRADES: dict[str, dict[str, Any]] = {
         "range_ut": 400.0,
     },
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Site:
-    """Where and when a run starts: date, geodetic ``lat``, ``lon`` [rad], ``h`` [m]."""
-
-    date: datetime.date
-    lat: float
-    lon: float
-    h: float
 
 
 def decimal_year(date: datetime.date) -> float:

@@ -33,7 +33,9 @@ from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
 from testbed.sensors.gnss import Gnss, GnssConfig
 from testbed.sensors.imu import Imu, ImuConfig
 from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig
+from testbed.sensors.optical_flow import OpticalFlow, OpticalFlowConfig
 from testbed.sensors.position_fix import PositionFix, PositionFixConfig
+from testbed.sensors.rangefinder import Rangefinder, RangefinderConfig
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
 from testbed.sensors.timing import AidingTiming
 
@@ -58,6 +60,8 @@ BUILT_IN: dict[str, Kind] = {
     "body_velocity": Kind(BodyVelocityConfig, BodyVelocity),
     "star_tracker": Kind(StarTrackerConfig, StarTracker),
     "position_fix": Kind(PositionFixConfig, PositionFix),
+    "rangefinder": Kind(RangefinderConfig, Rangefinder),
+    "optical_flow": Kind(OpticalFlowConfig, OpticalFlow),
 }
 _BY_SECTION: dict[type[Section], Kind] = {kind.section: kind for kind in BUILT_IN.values()}
 _CUSTOM: dict[tuple[str, Any], Kind] = {}

@@ -65,6 +65,11 @@ class AidingTiming(Section):
         description="an INS takes no more of its samples per second: errors of closer ones are alike; none: all",
     )
 
+    @property
+    def age_s(self) -> float:
+        """The largest age of a sample when it arrives [s]."""
+        return self.latency_s
+
 
 def patience(rate_hz: float) -> float:
     """After how long [s] without a sample a sensor of this rate counts as silent, everywhere in the house."""

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 from worlds.sensor_truth import RATE_HZ, lively, still
 
 from testbed.errors import UserError
-from testbed.sensors.magnetometer import FieldMap, Magnetometer, MagnetometerConfig, Site, geomagnetic_field_n
+from testbed.sensors.magnetometer import FieldMap, Magnetometer, MagnetometerConfig, geomagnetic_field_n
+from testbed.sensors.site import Site
 
 DATE = datetime.date(2026, 6, 1)
 SITE = Site(DATE, 0.6, 1.9, 800.0)

@@ -18,7 +18,9 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     MagnetometerSample,
+    OpticalFlowSample,
     PositionSample,
+    RangeSample,
     StarSample,
 )
 from testbed import sensors
@@ -31,7 +33,9 @@ from testbed.sensors import (
     gnss,
     imu,
     magnetometer,
+    optical_flow,
     position_fix,
+    rangefinder,
     star_tracker,
 )
 
@@ -45,6 +49,8 @@ MODULES = {
     "body_velocity": body_velocity,
     "star_tracker": star_tracker,
     "position_fix": position_fix,
+    "rangefinder": rangefinder,
+    "optical_flow": optical_flow,
 }
 SAMPLES = {
     "imu": ImuSamples,
@@ -55,6 +61,8 @@ SAMPLES = {
     "body_velocity": BodyVelocitySample,
     "star_tracker": StarSample,
     "position_fix": PositionSample,
+    "rangefinder": RangeSample,
+    "optical_flow": OpticalFlowSample,
 }
 # On its way north the body passes a small jammer 44 m from its start.
 JAMMER = {"lat_deg": np.degrees(0.6) + 4e-4, "lon_deg": np.degrees(1.9), "radius_m": 20.0}
@@ -76,6 +84,8 @@ EVERYTHING = {
     "body_velocity": {"rate_hz": 50.0, "offset_s": 0.01, **INTERRUPTED},
     "star_tracker": {"rate_hz": 20.0, "boresight": "right", **INTERRUPTED},
     "position_fix": {"rate_hz": 25.0, "transponder": BEACON, **INTERRUPTED},
+    "rangefinder": {"rate_hz": 25.0, "max_range_m": 1000.0, **INTERRUPTED},
+    "optical_flow": {"rate_hz": 20.0, "offset_s": 0.02, "max_range_m": 2000.0, "outlier_percent": 20.0, **INTERRUPTED},
 }
 TRUTH = lively(400)
 

@@ -238,4 +238,8 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
     "star_tracker": {name: _turn(axis) for axis, name in enumerate(BODY_AXES)},
     "position_fix": _position(lambda c, axis: float(c.errors().position_n[axis])),
     "airspeed": {"speed": _scalar("eas", SPEEDS, lambda c: c.errors().noise)},
+    "rangefinder": {"range": _scalar("range", {"m": 1.0}, lambda c: c.errors().noise)},
+    "optical_flow": {
+        name: _component("flow_b", axis, {"rad/s": 1.0}, lambda c: c.errors().noise) for axis, name in enumerate("xy")
+    },
 }

@@ -1,0 +1,193 @@
+"""What is seen of the ground: its range along the body's down axis, and how its image moves.
+
+Both are predicted from the height over the map, with the error of the map as a state (`TERRAIN`) that they share: a
+rangefinder finds it, and optical flow is a velocity then.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from nav._jit import njit
+from nav.aids.base import Measurement, OperatingPoint, range_problem
+from nav.earth import earth_rate_n
+from nav.error_model import PHI, POS, VEL, Block, markov
+from nav.rotation import cross, dcm_from_quat
+from nav.samples import Array, OpticalFlowSample, RangeSample, Sample
+from nav.terrain import Terrain, slant_range
+
+TERRAIN = "terrain"  # the state: how much higher the ground is than on the map [m]
+RANGE_LIMITS, RATE_LIMIT = (0.0, 20_000.0), 100.0  # what an instrument could possibly report [m], [rad/s]
+LEAST_QUALITY = 0.01
+
+
+@dataclass(frozen=True)
+class RangefinderAid:
+    """Range to the ground along the body's down axis, with white noise and an unknown scale factor.
+
+    ``map_sigma`` [m] is how well the ``terrain`` is known.
+    """
+
+    sensor: str = "rangefinder"
+    sigma: float = 0.5  # [m]
+    scale_sigma: float = 0.0  # [1]
+    terrain: Terrain = field(default_factory=Terrain)
+    map_sigma: float = 5.0
+
+    parts = (("range", 1),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return TERRAIN, f"{self.sensor}_scale"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        return [Block(TERRAIN, 1, self.map_sigma), Block(self.states[1], 1, self.scale_sigma)]
+
+    @cached_property
+    def _R(self) -> Array:
+        return np.array([self.sigma**2])
+
+    def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
+        """See `Aid`."""
+        assert isinstance(sample, RangeSample)
+        state, terrain, (raised, scale) = at.state, self.terrain, at.starts
+        nu, H = range_to_ground(state.q_nb, state.lla, at.x, raised, scale, sample.range, terrain.heights, terrain.grid)
+        return None if math.isnan(nu[0]) else Measurement(nu, H, self._R)
+
+
+@dataclass(frozen=True)
+class OpticalFlowAid:
+    """Rates of the line of sight about body x and y, less the rotation that the sensor's own gyro measures.
+
+    ``sigma`` [rad/s] white at full quality, its variance goes with the inverse of the quality; the optics have a scale
+    error, ``error_sigma`` [rad/s] is of a slow error (Markov), such as the bias of its gyro.
+    """
+
+    sensor: str = "optical_flow"
+    sigma: float = 0.002
+    scale_sigma: float = 0.0
+    error_sigma: float = 0.0
+    error_correlation_s: float = 300.0
+    terrain: Terrain = field(default_factory=Terrain)
+    map_sigma: float = 5.0
+
+    parts = (("optical_flow", 2),)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """See `Aid`."""
+        return TERRAIN, f"{self.sensor}_scale", f"{self.sensor}_error"
+
+    def blocks(self) -> list[Block]:
+        """See `Aid`."""
+        _, scale, error = self.states
+        return [
+            Block(TERRAIN, 1, self.map_sigma),
+            Block(scale, 1, self.scale_sigma),
+            markov(error, 2, self.error_sigma, self.error_correlation_s),
+        ]
+
+    def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
+        """See `Aid`."""
+        assert isinstance(sample, OpticalFlowSample)
+        state, terrain, (raised, scale, error) = at.state, self.terrain, at.starts
+        nu, H = optical_flow(
+            state.q_nb, state.v_n, state.lla, at.x, raised, scale, error, sample.flow_b, sample.rotation_b,
+            terrain.heights, terrain.grid,
+        )  # fmt: skip
+        R = np.full(2, self.sigma**2 / max(sample.quality, LEAST_QUALITY))
+        return None if math.isnan(nu[0]) else Measurement(nu, H, R)
+
+
+def range_trouble(sample: RangeSample) -> str:
+    """See `nav.aids.problem`."""
+    return range_problem("range", sample.range, RANGE_LIMITS)
+
+
+def flow_trouble(sample: OpticalFlowSample) -> str:
+    """See `nav.aids.problem`."""
+    largest = float(np.abs(np.concatenate([sample.flow_b, sample.rotation_b])).max())
+    return range_problem("rate", largest, (0.0, RATE_LIMIT)) or range_problem("quality", sample.quality, (0.0, 1.0))
+
+
+@njit
+def _sight(q_nb: Array, lla: Array, x: Array, terrain: int, heights: Array, grid: Array) -> tuple[float, Array]:
+    """Range r [m] along the body's down axis u to the ground, and dr / d error state (n,); NaN where there is none.
+
+    p + r u is on the ground of slope g, so with D = u_D + g_N u_N + g_E u_E, phi turning u by u x phi,
+
+        D dr = dh - r (e_D + g_N e_N + g_E e_E) . du - g . dp - d terrain
+    """
+    C_nb = dcm_from_quat(q_nb)
+    u = np.array([C_nb[0, 2], C_nb[1, 2], C_nb[2, 2]])
+    h = np.zeros(len(x))
+    length, slope_n, slope_e = slant_range(lla, u, x[terrain] if terrain >= 0 else 0.0, heights, grid)
+    normal = np.array([slope_n, slope_e, 1.0])
+    closing = u[0] * normal[0] + u[1] * normal[1] + u[2]
+    turned = cross(normal, u)  # normal . (u x phi) = (normal x u) . phi
+    for i in range(3):
+        h[PHI + i] = -length * turned[i] / closing
+        h[POS + i] = -normal[i] / closing
+    if terrain >= 0:
+        h[terrain] = -1.0 / closing
+    return length, h
+
+
+@njit
+def range_to_ground(
+    q_nb: Array, lla: Array, x: Array, terrain: int, scale: int, measured: float, heights: Array, grid: Array
+) -> tuple[Array, Array]:
+    """Range [m]: (1 + scale) r along the body's down axis; see `_sight`."""
+    length, h = _sight(q_nb, lla, x, terrain, heights, grid)
+    gain = 1.0 + x[scale] if scale >= 0 else 1.0
+    H = np.empty((1, len(x)))
+    H[0] = gain * h
+    if scale >= 0:
+        H[0, scale] = length
+    return np.array([measured - gain * length]), H
+
+
+@njit
+def optical_flow(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, terrain: int, scale: int, error: int, flow_b: Array,
+    rotation_b: Array, heights: Array, grid: Array,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Flow less rotation about body x and y [rad/s]: (1 + scale)(w_ge + m) + scale w_rotation + error.
+
+    Of a camera that looks down at the range r the scene turns by w + m, m = (-v_y, v_x) / r in body axes: a rotation
+    about an axis is a positive flow about it (MAVLink, OPTICAL_FLOW_RAD). w is that relative to the ground; the gyro
+    ``rotation_b`` (2,) feels the Earth turn as well, so w_ge = -C_nb' w_ie remains.
+    """
+    C_nb = dcm_from_quat(q_nb)
+    length, h = _sight(q_nb, lla, x, terrain, heights, grid)
+    earth_n = earth_rate_n(lla[0])
+    gain = 1.0 + x[scale] if scale >= 0 else 1.0
+    nu, H = np.empty(2), np.zeros((2, len(x)))
+    for row in range(2):
+        sign, axis = (-1.0, 1) if row == 0 else (1.0, 0)
+        along = np.array([C_nb[0, axis], C_nb[1, axis], C_nb[2, axis]])
+        speed = sign * (along[0] * v_n[0] + along[1] * v_n[1] + along[2] * v_n[2])
+        turned = cross(v_n, along)
+        about = np.array([C_nb[0, row], C_nb[1, row], C_nb[2, row]])
+        behind = -(about[0] * earth_n[0] + about[2] * earth_n[2])
+        carried = cross(earth_n, about)
+        moved = speed / length + behind
+        nu[row] = flow_b[row] - rotation_b[row] - gain * moved
+        for j in range(len(x)):
+            H[row, j] = -gain * speed / (length * length) * h[j]
+        for i in range(3):
+            H[row, PHI + i] += gain * (sign * turned[i] / length - carried[i])
+            H[row, VEL + i] += gain * sign * along[i] / length
+        if scale >= 0:
+            nu[row] -= x[scale] * rotation_b[row]
+            H[row, scale] = moved + rotation_b[row]
+        if error >= 0:
+            nu[row] -= x[error + row]
+            H[row, error + row] = 1.0
+    return nu, H
