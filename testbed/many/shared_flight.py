@@ -36,10 +36,11 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
 
 
 def log_digests(scenarios: Sequence[Scenario]) -> list[str]:
-    """What tells the logs and tables of wind of these scenarios, if any, from others."""
+    """What tells the logs, tables of wind and maps of these scenarios, if any, from others."""
     files = {Path(one.truth.file) for one in scenarios if isinstance(one.truth, LogTruth)}
     winds = [one.truth.wind.file for one in scenarios if isinstance(one.truth, FlightTruth)]
-    files |= {Path(file) for file in winds if file}
+    grounds = [one.truth.terrain.file for one in scenarios]
+    files |= {Path(file) for file in (*winds, *grounds) if file}
     return [hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files) if file.is_file()]
 
 

@@ -139,12 +139,23 @@ class Wind(Section):
 
 
 class Terrain(Section):
-    """The ground below: level, at a height that maps tell."""
+    """The ground below, level or with relief, as maps tell; it is higher or lower than these by one draw a run."""
 
     height_m: float = Field(default=0.0, ge=-500, le=9000, description="of the map above the WGS84 ellipsoid")
     map_sigma_m: float = Field(
         default=5.0, ge=0, le=1000, description="1 sigma of how far the ground is from the map; filters are told it"
     )
+    file: str | None = Field(
+        default=None,
+        description="heights in place of one, seen from this file: an SRTM tile (`.hgt`), or `.npz` with `lat_deg`,"
+        " `lon_deg` and `height_m`",
+    )
+
+    @model_validator(mode="after")
+    def _one_ground(self) -> Self:
+        if self.file and "height_m" in self.model_fields_set:
+            raise ValueError("a file replaces height_m: give one or the other")
+        return self
 
 
 class FlightTruth(Section):

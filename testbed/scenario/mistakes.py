@@ -10,7 +10,7 @@ from testbed import measures
 from testbed.errors import UserError, unknown
 from testbed.estimators.ahrs import AhrsSection
 from testbed.estimators.section import EstimatorSection
-from testbed.motion import aircraft, guidance
+from testbed.motion import aircraft, guidance, terrain
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.motion.weather import strongest
@@ -36,6 +36,10 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         yield from _sensor_mistakes(("sensors", name), config, scenario.duration_s)
         if not isinstance(scenario.truth, LogTruth):  # whose sensors have times of their own
             yield from _tick_mistakes(("sensors", name), config, tick_hz)
+    try:
+        terrain.of(scenario.truth.terrain)
+    except UserError as error:
+        yield ("truth", "terrain", "file"), str(error)
     yield from _plan_mistakes(scenario)
     yield from _fault_mistakes(scenario)
     taken: set[str] = set()

@@ -28,13 +28,12 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from nav.terrain import Terrain
 from testbed.data import data_dir
 from testbed.errors import UserError, shown
 from testbed.estimators import registry
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
-from testbed.motion import aircraft, legs
+from testbed.motion import aircraft, legs, terrain
 from testbed.motion.gusts import expected_gust
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
@@ -271,7 +270,7 @@ class Scenario(Section):
         ground = self.truth.terrain
         return Site(
             self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m,
-            Terrain.flat(ground.height_m), ground.map_sigma_m,
+            terrain.of(ground), ground.map_sigma_m,
         )  # fmt: skip
 
     def rig(self, seed: int) -> Rig:
@@ -357,8 +356,7 @@ def _see_files(truth: dict[str, Any], path: Path | None) -> None:
     folder = path.parent if path else Path()
     if isinstance(named := truth.get("aircraft"), str):
         truth["aircraft"] = _aircraft(named, path)
-    wind = truth.get("wind")
-    for table in (truth if truth.get("source") == "log" else None, wind):
+    for table in (truth if truth.get("source") == "log" else None, truth.get("wind"), truth.get("terrain")):
         if isinstance(table, dict) and isinstance(file := table.get("file"), str):
             table["file"] = str(folder / file)
 

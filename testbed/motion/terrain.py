@@ -1,0 +1,99 @@
+"""The ground from a file: an SRTM tile, or a grid of heights in a NumPy archive."""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from nav.samples import Array
+from nav.terrain import Terrain
+from testbed.errors import UserError
+from testbed.motion.sections import Terrain as Section
+
+TILE = re.compile(r"(?P<ns>[NS])(?P<lat>\d{2})(?P<ew>[EW])(?P<lon>\d{3})", re.IGNORECASE)
+TILE_SIZES = (1201, 3601)  # points a side, 3 and 1 arc-second
+VOID = -32768  # of SRTM, where nothing was measured
+LIMITS = (-500.0, 9000.0)  # [m]
+NEEDED = ("lat_deg", "lon_deg", "height_m")
+EVEN = 1e-6  # of a step
+
+
+def of(section: Section) -> Terrain:
+    """The map of a section. Raises UserError where its file can't be read or makes no sense."""
+    if section.file is None:
+        return Terrain.flat(section.height_m)
+    path = Path(section.file)
+    try:
+        changed = path.stat().st_mtime_ns
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror or error}") from None
+    return _kept(path, changed)
+
+
+@lru_cache(maxsize=2)
+def _kept(path: Path, changed: int) -> Terrain:
+    """`read`, once for every sensor and filter."""
+    return read(path)
+
+
+def read(path: Path) -> Terrain:
+    """The heights [m] above the ellipsoid in a file; what a tile gives above the geoid is taken as that.
+
+    ``.hgt``: a tile of SRTM, whose name tells its south-west corner, such as N36W085.hgt. ``.npz``: ``lat_deg`` and
+    ``lon_deg``, ascending in even steps, and ``height_m`` (latitudes, longitudes). Raises UserError.
+    """
+    try:
+        if path.suffix.lower() == ".hgt":
+            lat, lon, heights = _tile(path)
+        elif path.suffix.lower() == ".npz":
+            lat, lon, heights = _archive(path)
+        else:
+            raise UserError(f"{path}: heights of the ground are read from .hgt (SRTM) and .npz: convert it")
+    except OSError as error:
+        raise UserError(f"{path}: can't be read: {error.strerror or error}") from None
+    if not ((heights >= LIMITS[0]) & (heights <= LIMITS[1])).all():
+        raise UserError(f"{path}: a height is missing, or not from {LIMITS[0]:g} to {LIMITS[1]:g} m: fill it first")
+    grid = np.radians([lat[0], (lat[-1] - lat[0]) / (len(lat) - 1), lon[0], (lon[-1] - lon[0]) / (len(lon) - 1)])
+    return Terrain(np.ascontiguousarray(heights), grid)
+
+
+def _tile(path: Path) -> tuple[Array, Array, Array]:
+    """Latitudes, longitudes [deg], ascending, and heights of a tile: big-endian numbers, northern row first."""
+    name = TILE.fullmatch(path.stem)
+    if name is None:
+        raise UserError(f"{path}: the name of a tile is its south-west corner, such as N36W085.hgt")
+    raw = np.fromfile(path, ">i2")
+    side = math.isqrt(len(raw))
+    if side not in TILE_SIZES or side * side != len(raw):
+        sizes = " or ".join(f"{2 * n * n}" for n in TILE_SIZES)
+        raise UserError(f"{path}: an SRTM tile has {sizes} bytes, this file {2 * len(raw)}")
+    south = int(name["lat"]) * (1 if name["ns"].upper() == "N" else -1)
+    west = int(name["lon"]) * (1 if name["ew"].upper() == "E" else -1)
+    ahead = np.linspace(0.0, 1.0, side)
+    heights = raw.reshape(side, side)[::-1].astype(float)
+    heights[heights == VOID] = math.nan
+    return south + ahead, west + ahead, heights
+
+
+def _archive(path: Path) -> tuple[Array, Array, Array]:
+    """The same of a NumPy archive."""
+    try:
+        with np.load(path) as archive:
+            if missing := [name for name in NEEDED if name not in archive]:
+                raise UserError(f"{path}: has no {' and no '.join(missing)}: it has {', '.join(archive) or 'nothing'}")
+            lat, lon, heights = (np.asarray(archive[name], float) for name in NEEDED)
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: is no archive of numbers: {error}") from None
+    for name, values in (("lat_deg", lat), ("lon_deg", lon)):
+        steps = np.diff(values) if values.ndim == 1 else np.zeros(0)
+        if not (len(steps) and (np.abs(steps - steps.mean()) <= EVEN * steps.mean()).all()):
+            raise UserError(f"{path}: {name} must ascend in even steps, two at least")
+    if heights.shape != (len(lat), len(lon)):
+        shape = " x ".join(map(str, heights.shape))
+        raise UserError(f"{path}: height_m is {shape}, not latitudes x longitudes, {len(lat)} x {len(lon)}")
+    return lat, lon, heights
