@@ -114,7 +114,7 @@ class Alignment:
         sigmas = AidSigmas(
             field=magnetometer.sigma,
             field_bias=magnetometer.bias_sigma,
-            field_bend=math.hypot(magnetometer.anomaly_sigma, magnetometer.error_sigma),
+            field_bend=magnetometer.bend,
             gnss_position=np.array(gnss.position_error_sigma),
             gnss_velocity=np.array(gnss.velocity_error_sigma),
             wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),

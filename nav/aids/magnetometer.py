@@ -14,6 +14,7 @@ from nav.error_model import PHI, Block, markov
 from nav.rotation import dcm_from_quat
 from nav.samples import Array, MagnetometerSample, Sample
 
+FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Earth's is 22 to 67 uT [T]
 
 
@@ -29,8 +30,9 @@ class MagnetometerAid:
     sigma: float = 0.5e-6  # [T]
     bias_sigma: float = 1.0e-6  # hard iron left after calibration [T]
     anomaly_sigma: float = 0.0  # of the reference field, constant in n [T]
-    error_sigma: float = 0.0  # what changes with attitude, soft iron, as a Markov process [T]
+    error_sigma: float = 0.0  # what changes with attitude, as a Markov process [T]
     error_correlation_s: float = 30.0
+    soft_iron_sigma: float = 0.0  # of each element of the matrix that soft iron left after calibration is [1]
     doubt: float = 0.0  # of what the field's length is off by, the share that each axis may be, beside the noise
 
     parts = (("magnetometer", 3),)
@@ -38,16 +40,22 @@ class MagnetometerAid:
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        return f"{self.sensor}_bias", f"{self.sensor}_anomaly", f"{self.sensor}_error"
+        return tuple(f"{self.sensor}_{name}" for name in ("bias", "anomaly", "error", "soft_iron"))
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        bias, anomaly, error = self.states
+        bias, anomaly, error, soft_iron = self.states
         return [
             Block(bias, 3, self.bias_sigma),
             Block(anomaly, 3, self.anomaly_sigma),
             markov(error, 3, self.error_sigma, self.error_correlation_s),
+            Block(soft_iron, 9, self.soft_iron_sigma),
         ]
+
+    @property
+    def bend(self) -> float:
+        """By what the field is bent per axis beside the bias, 1 sigma [T]."""
+        return math.hypot(self.anomaly_sigma, self.error_sigma, self.soft_iron_sigma * FIELD_SIZE)
 
     @cached_property
     def _R(self) -> Array:
@@ -56,11 +64,11 @@ class MagnetometerAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, MagnetometerSample)
-        state, (bias, anomaly, error) = at.state, at.starts
+        state, (bias, anomaly, error, soft_iron) = at.state, at.starts
         if not at.reference.has_field:
             return None
         field_n = at.reference.field_n(state.lla)
-        nu, H = magnetometer(state.q_nb, at.x, bias, error, anomaly, field_n, sample.field_b)
+        nu, H = magnetometer(state.q_nb, at.x, bias, error, anomaly, soft_iron, field_n, sample.field_b)
         if not self.doubt:
             return Measurement(nu, H, self._R)
         rest = sample.field_b - (at.x[bias : bias + 3] if bias >= 0 else 0.0)
@@ -75,11 +83,13 @@ def problem(sample: MagnetometerSample) -> str:
 
 @njit
 def magnetometer(
-    q_nb: Array, x: Array, bias: int, error: int, anomaly: int, field_n: Array, field_b: Array
+    q_nb: Array, x: Array, bias: int, error: int, anomaly: int, soft_iron: int, field_n: Array, field_b: Array
 ) -> tuple[Array, Array]:
-    """Magnetic field [T] in body axes: C_nb' (field_n + anomaly) + bias + error, ``field_n`` the reference field there.
+    """Magnetic field [T] in body axes: (I + A) C_nb' (field_n + anomaly) + bias + error, ``field_n`` the reference
+    field there.
 
-    ``bias`` and ``error`` are fixed to the body, ``anomaly`` to n; each is where its states begin, -1 for none.
+    ``bias``, ``error`` and the matrix A of soft iron, row by row, are fixed to the body, ``anomaly`` to n; each is
+    where its states begin, -1 for none.
     """
     C_nb = dcm_from_quat(q_nb)
     H = np.zeros((3, len(x)))
@@ -100,4 +110,23 @@ def magnetometer(
             if start >= 0:
                 H[i, start + i] = 1.0
                 nu[i] -= x[start + i]
+    if soft_iron >= 0:
+        _soften(nu, H, C_nb, x, anomaly, soft_iron, m0, m1, m2)
     return nu, H
+
+
+@njit
+def _soften(
+    nu: Array, H: Array, C_nb: Array, x: Array, anomaly: int, soft_iron: int, m0: float, m1: float, m2: float
+) -> None:
+    """Add soft iron to the innovation (3,) and the Jacobian (3, n) of a magnetometer in the field m (3,) of n."""
+    turned = H[:, PHI : PHI + 3].copy()
+    for i in range(3):
+        for j in range(3):
+            a, m_b = x[soft_iron + 3 * i + j], C_nb[0, j] * m0 + C_nb[1, j] * m1 + C_nb[2, j] * m2
+            H[i, soft_iron + 3 * i + j] = m_b
+            nu[i] -= a * m_b
+            for k in range(3):
+                H[i, PHI + k] += a * turned[j, k]
+                if anomaly >= 0:
+                    H[i, anomaly + k] += a * C_nb[k, j]

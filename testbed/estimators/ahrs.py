@@ -11,11 +11,12 @@ import numpy as np
 from pydantic import Field
 
 from nav.ahrs import Ahrs, AhrsConfig
+from nav.aids.magnetometer import FIELD_SIZE
 from nav.earth import STANDARD_GRAVITY
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
 from nav.samples import Array
-from testbed.estimators.datasheet import FIELD_SIZE, SOFT_IRON_SHARE, imu_model
+from testbed.estimators.datasheet import SOFT_IRON_SHARE, imu_model
 from testbed.estimators.lane import Commanded, Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import (

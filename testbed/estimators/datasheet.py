@@ -21,6 +21,7 @@ from nav.aids import (
     RangefinderAid,
     StarAid,
 )
+from nav.aids.magnetometer import FIELD_SIZE
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from testbed.estimators.rig import Air, Rig
@@ -41,8 +42,7 @@ from testbed.sensors.star_tracker import StarTrackerConfig
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 MANOEUVRE_S = 120.0  # between changes of turn and load
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
-FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
-SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither
+SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither, where it is not a state
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
@@ -138,8 +138,10 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             return BarometerAid(name, sigma=b.noise * METRES_PER_PASCAL, bias_walk=walk)
         case MagnetometerConfig():
             m = section.errors()
-            iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
             bias = math.hypot(m.hard_iron, m.current * usual.current_a)
+            if not m.doubt:
+                return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
+            iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
             return MagnetometerAid(
                 name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt
             )

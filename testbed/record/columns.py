@@ -24,6 +24,7 @@ AXES: dict[str, tuple[str, ...]] = {
         f"{what}_{axis}" for what in ("position", "velocity", "attitude") for axis in ("north", "east", "down")
     ),
 }
+AXES["element"] = tuple(row + column for row in "xyz" for column in "xyz")
 AXES["error_column"] = AXES["error"]
 _FRAME = {
     "ned": "n: local north-east-down",
@@ -150,6 +151,7 @@ EXTRA = {
     "barometer_bias": Variable("m", "estimated bias of pressure altitude"),
     "magnetometer_bias": Variable("T", "estimated magnetometer bias", ("body",)),
     "magnetometer_anomaly": Variable("T", "estimated error of the reference field, constant over ground", ("ned",)),
+    "magnetometer_soft_iron": Variable("1", "estimated soft iron matrix less the unit matrix", ("element",)),
     "magnetometer_error": Variable("T", "estimated correlated error of the magnetometer", ("body",)),
     "wind": Variable("m/s", "estimated velocity of the air over ground, without gusts", ("north_east",)),
     "gust": Variable("m/s", "estimated gust beside the steady wind", ("north_east",)),

@@ -32,12 +32,13 @@ AIDS = (
     aids.AirspeedAid(gust_sigma=1.0, scale_sigma=0.02),
 )
 BODY_VELOCITY = [Block("body_velocity_scale", 2, 0.01), markov("body_velocity_error", 2, 0.1, 300.0)]
-MODEL = ErrorModel(IMU, [*aid_blocks(AIDS), *BODY_VELOCITY])
+SOFT_IRON = Block("magnetometer_soft_iron", 9, 0.02)
+MODEL = ErrorModel(IMU, [*aid_blocks(AIDS), *BODY_VELOCITY, SOFT_IRON])
 ARM = np.array([0.7, -0.3, -1.2])
 FIELD_N = np.array([28e-6, -2e-6, 40e-6])
 STEPS = {"phi": 1e-5, "dv": 1e-2, "dp": 1.0, "gyro_bias": 1e-3, "gyro_drift": 1e-3, "gyro_scale": 1e-3,
          "accel_bias": 1e-2, "accel_drift": 1e-2, "accel_scale": 1e-2, "magnetometer_bias": 1e-7,
-         "magnetometer_anomaly": 1e-7, "magnetometer_error": 1e-7,
+         "magnetometer_anomaly": 1e-7, "magnetometer_error": 1e-7, "magnetometer_soft_iron": 1e-3,
          "airspeed_scale": 1e-3, "wind": 1e-2, "gust": 1e-2}  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def barometer(at):
 
 
 def magnetometer(at):
-    states = [MODEL.start(f"magnetometer_{name}") for name in ("bias", "error", "anomaly")]
+    states = [MODEL.start(f"magnetometer_{name}") for name in ("bias", "error", "anomaly", "soft_iron")]
     return aids.magnetometer.magnetometer(at[0], at[3], *states, FIELD_N, np.array([1e-5, 2e-5, 3e-5]))
 
 
