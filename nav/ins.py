@@ -9,7 +9,7 @@ covariance is kept as integrals until the period is full or a measurement comes.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +51,7 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
+from nav.smoother import Smoother
 from nav.state import State
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
@@ -77,6 +78,7 @@ class InsConfig:
     mounting_sigma: float = 0.0  # between the axes of the IMU, whose attitude is found, and of the body, reported [rad]
     covariance_period: int = 10  # IMU samples per covariance step; 50 ms and less lose nothing on an aircraft
     scaling: Scaling | None = None  # of sigma points instead of derivatives
+    smooth: bool = False  # keeps what it does, to look back in the end (`Ins.smoothed`); not with sigma points
 
     # Belief
     false_rejection: float = 1e-3  # probability that the gate turns a sound measurement away; 0: there is no gate
@@ -92,6 +94,8 @@ class InsConfig:
             raise ValueError("one GNSS receiver can be aided by: several make a federation")
         if self.covariance_period < 1:
             raise ValueError("covariance_period is a number of samples, at least 1")
+        if self.smooth and self.scaling is not None:
+            raise ValueError("what sigma points did can't be smoothed")
 
 
 class Ins:
@@ -116,6 +120,7 @@ class Ins:
         self._filter.weigh_by(policies or {})
         self._filter.fadings = fadings or {}
         self.model = self._filter.model
+        self._smoother = self._filter.smoother = Smoother(self.model) if config.smooth else None
         self._reference = Reference([self.model], [1.0], config.covariance_period, field_n, config.scaling)
         self._gnss = next((aid for aid in config.aids if isinstance(aid, GnssAid)), None)
         course = self._gnss.course if self._gnss is not None else None
@@ -151,6 +156,8 @@ class Ins:
         self._draft = self._state.copy()
         self.t = initial.t
         self._monitor.last_fused = initial.t
+        if self._smoother is not None:
+            self._smoother.pause(self.t, self._state)
 
     def set_gate(self, false_rejection: float) -> None:
         """From now on, turn sound measurements away with this probability (`InsConfig.false_rejection`)."""
@@ -166,6 +173,8 @@ class Ins:
         if self._state is None:
             self._alignment.propagate(imu)
         else:
+            if self._smoother is not None:
+                self._smoother.carry(self._state, imu)
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
         self.t = float(imu.t[-1])
 
@@ -201,13 +210,30 @@ class Ins:
             return []
         self._reference.settle(state)
         if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
-            return self._update_gnss(state, sample, aid)
+            reports = self._update_gnss(state, sample, aid)
+        else:
+            reports = self._update_part_by_part(state, sample, aid)
+        if self._smoother is not None:
+            self._smoother.pause(self.t, state)
+        return reports
+
+    def _update_part_by_part(self, state: State, sample: Sample, aid: Aid) -> list[UpdateReport]:
         reports = []
         for part, _ in aid.parts:
             measurement = self._filter.measure(self._reference, state, aid, part, sample)
             if measurement is not None:
                 reports.append(self._filter.fuse(self._reference, state, sample, part, measurement))
         return reports
+
+    def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
+        """The estimates at ``times`` [s], ascending, by all samples used so far; of those since the alignment.
+
+        Raises ValueError where the filter was not told to keep what they need (`InsConfig.smooth`).
+        """
+        if self._smoother is None:
+            raise ValueError("this filter was not told to keep what smoothing needs: see InsConfig.smooth")
+        for t, state in self._smoother.states(times):
+            yield self._described(state, t, Status.ALIGNED, np.zeros(MOTION))
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
@@ -301,8 +327,12 @@ class Ins:
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
+        return self._described(state, t, status, self._doubt)
+
+    def _described(self, state: State, t: float, status: Status, doubt: Array) -> Estimate:
+        """The estimate of a settled state, with a ``doubt`` (9,) of its motion."""
         P, x = state.P[0], state.x[0].copy()
         x[: len(state.imu)] = state.imu
-        covariance, sigma = spread(doubted(P, self._doubt), self.config.mounting_sigma**2)
+        covariance, sigma = spread(doubted(P, doubt), self.config.mounting_sigma**2)
         extra = {name: (x[where], sigma[where]) for name, where in self._extra}
         return describe(state, x, P, self.model, t, status, covariance, sigma, extra)

@@ -22,6 +22,7 @@ from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
 from nav.samples import Array, Outcome, Sample, UpdateReport
+from nav.smoother import Smoother
 from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
 from nav.weighting import Fading, Policy, SageHusa, split
@@ -55,6 +56,7 @@ class LocalFilter:
         self.noises: dict[str, SageHusa] = {}  # of parts without a monitor, as the two below
         self.policies: dict[str, Policy] = {}
         self.fadings: Mapping[str, Fading] = {}
+        self.smoother: Smoother | None = None  # told of each update of a closed filter, if there is one
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
@@ -183,9 +185,13 @@ class LocalFilter:
         if self.scaling is not None:
             assert at_points is not None
             return self._absorb_points(reference, s, at_points, H, R, threshold)
-        return absorb(
+        before = s.P[self.row].copy() if self.smoother is not None else None
+        S, nis = absorb(
             s.whole, *s.shape, self.row, reference.driven, nu, H, R, threshold, self.closed
         )  # fmt: skip
+        if self.smoother is not None and before is not None and nis <= threshold:
+            self.smoother.updated(before, H, nu, S)
+        return S, nis
 
     def _innovate_points(self, P: Array, at_points: Array, H: Array, R: Array) -> tuple[Array, Array, Array, float]:
         """`unscented.innovate`: minus ``at_points`` is prediction - measurement, so that zero is measured."""

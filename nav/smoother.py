@@ -1,0 +1,192 @@
+"""Looking back: what a filter would have estimated had it known the whole run.
+
+Fixed-interval smoothing in the form of Bryson and Frazier (Bierman, Fixed interval smoothing with discrete
+measurements, International Journal of Control 18 (1), 1973), which equals that of Rauch, Tung and Striebel and inverts
+no covariance. From the last measurement back, with T of each step of time and the gain K of each update,
+
+    lambda <- T' lambda                                 Lambda <- T' Lambda T
+    lambda <- (I - K H)' lambda - H' S^-1 nu            Lambda <- (I - K H)' Lambda (I - K H) + H' S^-1 H
+
+and at any time x_smoothed = x - P lambda, P_smoothed = P - P Lambda P, of estimate and covariance as they were then.
+All that happens between two nodes is one such map, lambda <- M lambda + m and Lambda <- M Lambda M' + N, and is
+multiplied up as it happens. So only nodes are kept; between them the smoothed state is carried by the strapdown.
+
+Where a filter gives up what it knew (`nav.reference.forget`), the past is smoothed as if it had been unsure by then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from nav._jit import njit
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT
+from nav.error_model import MOTION, ErrorModel, Indices, sensor_errors, transition
+from nav.samples import Array, ImuSamples
+from nav.state import State, inject, integrate
+from nav.strapdown import step
+
+NOTHING = 1e-6  # two times this close are the same [s]
+NODE_S = 1.0  # between nodes; within it the noise of any IMU moves the state by far less than its smoothed sigma
+
+
+class Smoothed(NamedTuple):
+    """A smoothed state at ``t`` [s]: a `State` of one filter, whose P is that of the node before it."""
+
+    t: float
+    state: State
+
+
+class _Node(NamedTuple):
+    """The filter at ``t``, and the map (M, m, N) from the next node back to here, filled as it goes on."""
+
+    t: float
+    state: State
+    M: Array
+    m: Array
+    N: Array
+
+
+class Smoother:
+    """Keeps what one closed filter of a ``model`` does, and looks back in the end (`states`).
+
+    The filter tells it of each block of increments before it takes it (`carry`), of each update that it makes
+    (`updated`), and of each time at which it has used its samples (`pause`), the first being its start.
+    """
+
+    def __init__(self, model: ErrorModel) -> None:
+        self._model = model
+        self._nodes: list[_Node] = []
+        self._blocks: list[ImuSamples] = []
+
+    def carry(self, state: State, imu: ImuSamples) -> None:
+        """The filter is about to go on from ``state`` by a block of increments."""
+        if not self._nodes:
+            return
+        sound = _sound(imu, state.rates)
+        self._blocks.append(sound)
+        model, common = self._model, len(state.imu)
+        Phi = np.zeros((MOTION, common))
+        T = _transition(
+            Phi, state.q_nb.copy(), state.v_n.copy(), state.lla.copy(), state.errors, model.driven,
+            sound.dtheta, sound.dv, sound.dt,
+        )  # fmt: skip
+        M = self._nodes[-1].M
+        moved = M[:, :common] @ Phi.T
+        M *= np.exp(-T * model.decay_rate)
+        M[:, :MOTION] = moved
+
+    def updated(self, P: Array, H: Array, nu: Array, S: Array) -> None:
+        """The filter has used an innovation ``nu`` (m,) of covariance ``S``, its own having been ``P`` (n, n)."""
+        if not self._nodes:
+            return
+        _, _, M, m, N = self._nodes[-1]
+        MH = M @ H.T
+        weighed = np.linalg.solve(S, MH.T).T  # M H' S^-1
+        m -= weighed @ nu
+        N += weighed @ MH.T
+        M -= MH @ np.linalg.solve(S, H @ P)
+
+    def pause(self, t: float, state: State) -> None:
+        """The filter is at ``t`` [s] and settled: a node, if the last one is `NODE_S` ago."""
+        if not self._nodes or t - self._nodes[-1].t >= NODE_S:
+            n = self._model.size
+            self._nodes.append(_Node(t, state.copy(), np.eye(n), np.zeros(n), np.zeros((n, n))))
+
+    def states(self, times: Sequence[float]) -> Iterator[Smoothed]:
+        """The smoothed states at ``times`` [s], ascending; none of those before the filter's start."""
+        nodes = self._look_back()
+        if not nodes:
+            return
+        imu = ImuSamples(
+            *(np.concatenate([getattr(b, name) for b in self._blocks]) for name in ("t", "dt", "dtheta", "dv"))
+        )
+        starts = np.array([t for t, _ in nodes])
+        own, at = -1, nodes[0]
+        for t in times:
+            node = int(np.searchsorted(starts, t + NOTHING)) - 1
+            if node < 0:
+                continue
+            if node != own:
+                own, at = node, nodes[node]
+                now = Smoothed(at.t, at.state.copy())
+            now = self._carried(now, t, imu)
+            yield Smoothed(t, now.state)
+
+    def _carried(self, now: Smoothed, t: float, imu: ImuSamples) -> Smoothed:
+        """A smoothed state taken on by the increments up to ``t``, the part of the last one that is needed."""
+        state = now.state.copy()
+        first = int(np.searchsorted(imu.t, now.t + NOTHING))
+        last = min(int(np.searchsorted(imu.t, t - NOTHING)) + 1, len(imu))
+        begun = now.t
+        for k in range(first, last):
+            until = min(float(imu.t[k]), t)
+            share = (until - begun) / imu.dt[k]
+            _advance(
+                state.q_nb, state.v_n, state.lla, state.errors, share * imu.dtheta[k], share * imu.dv[k], until - begun
+            )
+            begun = until
+        return Smoothed(t, state)
+
+    def _look_back(self) -> list[Smoothed]:
+        """The smoothed nodes, in their order."""
+        n = self._model.size
+        back, information = np.zeros(n), np.zeros((n, n))
+        found = []
+        for t, state, M, m, N in reversed(self._nodes):
+            back = M @ back + m
+            information = M @ information @ M.T + N
+            P = state.P[0]
+            correction = -P @ back
+            smoothed = state.copy()
+            inject(smoothed.q_nb, smoothed.v_n, smoothed.lla, smoothed.imu, correction)
+            common = len(state.imu)
+            smoothed.x[0, common:] += correction[common:]
+            sensor_errors(smoothed.errors, smoothed.imu, self._model.driven)
+            spread = P - P @ information @ P
+            smoothed.P[0] = 0.5 * (spread + spread.T)
+            found.append(Smoothed(t, smoothed))
+        return found[::-1]
+
+
+def _sound(imu: ImuSamples, rates: Array) -> ImuSamples:
+    """The same increments, those that are no numbers or impossible replaced by the last sound ``rates`` (2, 3)."""
+    dtheta, dv = imu.dtheta.copy(), imu.dv.copy()
+    with np.errstate(invalid="ignore"):
+        limits = imu.dt[:, None]
+        good = (np.abs(dtheta) <= RATE_LIMIT * limits).all(axis=1) & (np.abs(dv) <= FORCE_LIMIT * limits).all(axis=1)
+    for k in np.flatnonzero(~good):
+        before = (dtheta[k - 1] / imu.dt[k - 1], dv[k - 1] / imu.dt[k - 1]) if k else rates
+        dtheta[k], dv[k] = before[0] * imu.dt[k], before[1] * imu.dt[k]
+    return ImuSamples(imu.t.copy(), imu.dt.copy(), dtheta, dv)
+
+
+@njit
+def _transition(
+    Phi: Array, q_nb: Array, v_n: Array, lla: Array, errors: Array, driven: Indices, dtheta: Array, dv: Array, dt: Array
+) -> float:
+    """Fill ``Phi`` (9, common) as `error_model.transition` does, over N increments from a nominal state; their time."""
+    sums, FT, T = np.zeros((3, 3, 3)), np.zeros_like(Phi), 0.0
+    angle, push = np.empty(3), np.empty(3)
+    for k in range(len(dt)):
+        before = q_nb.copy()
+        for i in range(3):
+            angle[i] = (dtheta[k, i] - errors[0, i] * dt[k]) / (1.0 + errors[2, i])
+            push[i] = (dv[k, i] - errors[1, i] * dt[k]) / (1.0 + errors[3, i])
+        step(q_nb, v_n, lla, angle, push, dt[k])
+        integrate(sums, before, q_nb, angle, push, dt[k])
+        T += dt[k]
+    transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
+    return T
+
+
+@njit
+def _advance(q_nb: Array, v_n: Array, lla: Array, errors: Array, dtheta: Array, dv: Array, dt: float) -> None:
+    """One increment of the strapdown with known sensor errors, in place."""
+    angle, push = np.empty(3), np.empty(3)
+    for i in range(3):
+        angle[i] = (dtheta[i] - errors[0, i] * dt) / (1.0 + errors[2, i])
+        push[i] = (dv[i] - errors[1, i] * dt) / (1.0 + errors[3, i])
+    step(q_nb, v_n, lla, angle, push, dt)
