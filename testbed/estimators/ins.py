@@ -85,12 +85,18 @@ class InsSection(EstimatorSection):
     fading: FadingSection | None = Field(
         default=None, description="covariance that follows diverging innovations; none: it does not"
     )
+    smooth: bool = Field(
+        default=False,
+        description="look back in the end: `<name>_smoothed` is what it would say, knowing the whole run",
+    )
     false_rejection: float = Field(default=1e-3, ge=0, lt=0.5, description="of sound samples by the gate; 0: no gate")
 
     def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
         """What is wrong with it among these sensors."""
         yield from super().mistakes(sensors)
         yield from aid_mistakes("ins", self.aids, sensors, ONE_EACH | SEVERAL)
+        if self.smooth and self.engine != "linear":
+            yield ("smooth",), f"needs engine 'linear', not {self.engine!r}: leave one of the two out"
         receivers = [aid for aid in self.aids if aid in sensors and sensors[aid].kind == "gnss"]
         for key in ("course", "sage_husa", "fading"):
             if getattr(self, key) is not None and not receivers:
@@ -126,6 +132,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
             tuple(idle),
             mounting_sigma=errors.accel_misalignment,
             scaling=scaling(section.engine),
+            smooth=section.smooth,
             false_rejection=section.false_rejection,
         ),
         partial(geomagnetic_field_n, date=rig.site.date),

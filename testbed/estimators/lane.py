@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, cast
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from nav.alignment import InitialState
 from nav.horizon import FusionHorizon
+from nav.ins import Ins
 from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
@@ -91,6 +92,11 @@ class Lane:
         handed = [sample for aid in self.sensors for sample in samples[aid] if self._spaced(aid, sample)]
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
+
+    def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
+        """The estimates at ``times`` [s] by all that it was ever handed, of one that keeps what that takes."""
+        estimator = self.horizon.estimator
+        return estimator.smoothed(times) if isinstance(estimator, Ins) and estimator.config.smooth else iter(())
 
     def _spaced(self, sensor: str, sample: Sample) -> bool:
         """Whether a sample is far enough from the last one that was handed over of its sensor."""

@@ -74,6 +74,11 @@ class EstimatorSection(Section):
         """Whether it estimates no position and no velocity."""
         return False
 
+    @property
+    def recorded(self) -> tuple[str, ...]:
+        """What records and metrics call its estimates: by its name, and those of one that looks back in the end."""
+        return (self.name, f"{self.name}_smoothed") if getattr(self, "smooth", False) else (self.name,)
+
     def aiding(self, sensors: Mapping[str, SensorConfig]) -> tuple[str, ...]:
         """The names of those sensors whose samples it is handed once aligned."""
         aids: tuple[str, ...] | None = getattr(self, "aids", None)

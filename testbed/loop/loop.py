@@ -157,6 +157,7 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
         while passage.tick < passage.ticks and director.ready(passage.tick) and passage.advance():
             pass
         remarks = passage.conclude()
+        passage.look_back()
     dataset = passage.recorder.dataset()
     return _Flown(dataset, passage.feed.failure, remarks, passage.seconds())
 
@@ -319,6 +320,15 @@ class _Passage:
         if self.director.pacer is not None and self.director.pacer.missed:
             remarks.append(str(self.director.pacer))
         return remarks
+
+    def look_back(self) -> None:
+        """Record what estimators say of the whole run when they look back."""
+        times = [tick / self.rate_hz for tick in range(0, self.tick, self.cadence.record)]
+        for section in self.scenario.estimator:
+            _, *smoothed = section.recorded
+            for name in smoothed:
+                for estimate in self.lanes[section.name].smoothed(times):
+                    self.recorder.estimate(name, estimate)
 
     @property
     def _end(self) -> float:

@@ -72,9 +72,13 @@ class Recorder:
             "record_rate_hz": float(scenario.record.rate_hz),
             "versions": json.dumps(versions()),
             "estimated_point_b_m": json.dumps(
-                {own.name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m for own in scenario.estimator}
+                {
+                    name: cast("ImuConfig", scenario.sensors[own.imu]).lever_arm_m
+                    for own in scenario.estimator
+                    for name in own.recorded
+                }
             ),
-            "estimator_imus": json.dumps({own.name: own.imu for own in scenario.estimator}),
+            "estimator_imus": json.dumps({name: own.imu for own in scenario.estimator for name in own.recorded}),
             "error_convention": "error = estimate - truth; C_nb_hat = (I - [phi x]) C_nb; position error in metres NED",
             "complete": 0,
         }

@@ -45,7 +45,7 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     taken: set[str] = set()
     for index, estimator in enumerate(scenario.estimator):
         yield from _estimator_mistakes(("estimator", index), estimator, scenario.sensors, taken)
-        taken.add(estimator.name)
+        taken |= set(estimator.recorded)
     yield from _autopilot_mistakes(scenario)
     for key in scenario.expect:
         yield from _expect_mistakes(key, taken)
@@ -155,8 +155,8 @@ def _estimator_mistakes(
 ) -> Iterator[tuple[KeyPath, str]]:
     if not IDENTIFIER.fullmatch(section.name):
         yield (*path, "name"), "is made of letters, digits and _, and does not begin with a digit"
-    elif section.name in taken:
-        yield (*path, "name"), f"{section.name!r} is taken by an estimator above: give each its own name"
+    elif same := [name for name in section.recorded if name in taken]:
+        yield (*path, "name"), f"{same[0]!r} is taken by an estimator above: give each its own name"
     elif section.name in RESERVED:
         yield (*path, "name"), f"{section.name!r} is reserved: choose another name"
     for where, text in section.mistakes(sensors):

@@ -33,7 +33,7 @@ TIMED = {
 @pytest.fixture(scope="module")
 def run() -> Run:
     made = scenario(150.0)
-    made.estimator = [SimpleNamespace(name=name, imu="imu") for name in NAMES]
+    made.estimator = [SimpleNamespace(name=name, imu="imu", recorded=(name,)) for name in NAMES]
     recorder = Recorder(None, made, 1)
     recorder.faults([FaultTruth("jump", "barometer", "height", "step", 80.0, 90.0, 3.0, "m")])
     own = {name: Errors(sigma_position=1.0 + k) for k, name in enumerate(NAMES)}

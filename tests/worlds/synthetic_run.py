@@ -37,7 +37,10 @@ def scenario(duration_s: float = 60.0, rate_hz: float = 10.0, imu: bool = True) 
         duration_s=duration_s,
         truth=SimpleNamespace(rate_hz=float(TICK_HZ)),
         sensors={"imu": SimpleNamespace(lever_arm_m=(0.0, 0.0, 0.0))},
-        estimator=[SimpleNamespace(name=name, imu="imu") for name in ("ins", "dead_reckoning", "late", "other")],
+        estimator=[
+            SimpleNamespace(name=name, imu="imu", recorded=(name,))
+            for name in ("ins", "dead_reckoning", "late", "other")
+        ],
         record=SimpleNamespace(rate_hz=rate_hz, imu=imu),
     )
 
