@@ -72,7 +72,7 @@ def test_what_udp_may_do_is_no_misbehaviour(behaviour: str) -> None:
 @pytest.mark.parametrize(
     ("behaviour", "says"),
     [
-        ("stall", r"ArduPilot has sent no frame for 1 s at \d\.\d+ s"),
+        ("stall", r"ArduPilot has sent no frame for 3 s at \d\.\d+ s"),
         ("restart", r"ArduPilot has begun anew: frame 0 after frame \d+"),
     ],
 )
@@ -81,7 +81,7 @@ def test_an_ardupilot_that_misbehaves_ends_the_run_and_leaves_the_record(
 ) -> None:
     peer = autopilots.ArduPilot(behaviour, at=500)
     try:
-        result = run(scenario(6.0), out=tmp_path, far_end=ArduPilot(peer.url, answer_s=1.0))
+        result = run(scenario(6.0), out=tmp_path, far_end=ArduPilot(peer.url, answer_s=3.0))
     finally:
         peer.over.set()
     assert re.search(says, result.failure)

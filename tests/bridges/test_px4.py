@@ -113,9 +113,9 @@ def test_receivers_say_what_they_said_in_the_run(alone: RunResult, followed: Fol
 @pytest.mark.parametrize(
     ("behaviour", "says"),
     [
-        ("stall", r"PX4 has not answered the step of \d\.\d+ s for 1 s"),
+        ("stall", r"PX4 has not answered the step of \d\.\d+ s for 3 s"),
         ("close", "PX4 has closed the connection|connection to PX4 broke"),
-        ("late", r"PX4 has not answered the step of \d\.\d+ s for 1 s"),
+        ("late", r"PX4 has not answered the step of \d\.\d+ s for 3 s"),
         ("ahead", r"for 0\.005 s later: its clock is not ours"),
         ("talk", r"PX4 said \d+ bytes at \d\.\d+ s, but not the controls of that step"),
     ],
@@ -123,7 +123,8 @@ def test_receivers_say_what_they_said_in_the_run(alone: RunResult, followed: Fol
 def test_a_px4_that_misbehaves_ends_the_run_and_leaves_the_record(behaviour: str, says: str, tmp_path: Path) -> None:
     peer = autopilots.Px4(behaviour, at=500)
     try:
-        result = run(scenario(6.0), out=tmp_path, far_end=Px4(peer.url, answer_s=1.0))
+        patience = {"answer_s": 3.0} if behaviour in ("stall", "late") else {}
+        result = run(scenario(6.0), out=tmp_path, far_end=Px4(peer.url, **patience))
     finally:
         peer.over.set()
     assert re.search(says, result.failure)
