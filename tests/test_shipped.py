@@ -21,6 +21,7 @@ def test_the_promised_scenarios_are_shipped() -> None:
     promised = {
         "loiter_gnss_outage",
         "denied_walking_wind",
+        "denied_optical_flow",
         "u_turn",
         "survey_racetrack_wind",
         "jammer_zone",
