@@ -50,11 +50,6 @@ class Run:
         """What no estimator can be better than, by the name of each that has a bound; only of a run with an outage."""
         return bound.of_run(self.dataset) if self.windows else {}
 
-    @property
-    def bound_once(self) -> list[Bound]:
-        """The bounds, those of estimators with the same sensors once."""
-        return list({id(bound): bound for bound in self.bounds.values()}.values())
-
     def truth(self, name: str) -> Array:
         """One column of truth."""
         return column(self.dataset, f"truth/{name}")

@@ -7,6 +7,7 @@ import json
 import re
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -164,6 +165,19 @@ def test_a_line_keeps_its_peaks_and_there_are_fewer_points_for_more_estimators()
         kept[count] = len(thinned)
     assert kept[8] < kept[1] <= 2.1 * arrays.MOST
     assert arrays.Arrays(100).bins == arrays.FEWEST
+
+
+@pytest.mark.slow
+def test_a_page_stays_below_eight_megabytes_however_many_estimators() -> None:
+    names = [f"ins_{k}" for k in range(8)]
+    made = scenario(1200.0)  # longer ones have as many points
+    made.estimator = [SimpleNamespace(name=name, imu="imu") for name in names]
+    recorder = Recorder(None, made, 1)
+    synthetic_run.record(recorder, circle(1200.0), {name: Errors() for name in names}, DENIED)
+    page = contents([Shown("", Run(recorder.dataset()))])
+    [line] = panels(page)["true airspeed"]["lines"]
+    assert line["t"][1] < 0.5 * 12_000
+    assert len(interactive.script(page)) < 8e6
 
 
 def test_what_32_bits_cannot_hold_is_a_gap_and_the_same_is_kept_once() -> None:

@@ -47,6 +47,7 @@ def comparison(run: Run) -> Figure | None:
         ("roll and\npitch [deg]", lambda e: np.rad2deg(e.tilt)),
         ("heading [deg]", lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
+    bounds = {id(bound): bound for bound in run.bounds.values()}.values()  # of estimators with the same sensors, once
     panels = [(run.positioned, *panel) for panel in of_position if run.positioned]
     panels += [(run.aligned, *panel) for panel in of_attitude]
     drawn = sheet(len(panels), height=1.9)
@@ -54,7 +55,7 @@ def comparison(run: Run) -> Figure | None:
         for rank, (name, e) in enumerate(shown.items()):
             line = thin(e.t, np.maximum(moving_rms(e.t, size(e), SMOOTH_S), 1e-6))
             ax.plot(*line, **run.lines[name], **layer(rank, len(shown), LOG_LINE), label=name)
-        for bound in run.bound_once:
+        for bound in bounds:
             ax.plot(*thin(bound.t, size(bound)), **BOUND, label="bound")
         ax.set_ylabel(label)
         focus_log(ax, [size(e)[e.valid] for e in shown.values()])

@@ -10,7 +10,7 @@ import numpy as np
 from nav.samples import Array
 from testbed.report import style
 
-FLOATS = 900_000  # that a page may hold: 5 MB of it
+FLOATS = 750_000  # that a page may hold: 4 MB of it
 PER_BIN = 170  # floats that an estimator has for each bin of a line
 FEWEST, MOST = 300, 2000  # bins
 

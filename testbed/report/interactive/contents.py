@@ -43,6 +43,7 @@ def contents(runs: Sequence[Shown]) -> dict[str, Any]:
         "start": start,
         "end": max(end, start + 1e-3),
         "subjects": [_subject(subject) for subject in subjects],
+        "reference": runs[0].run.reference,
         "windows": _windows(runs, end),
         "faults": _faults(runs, end),
         "events": _events(runs[0].run),

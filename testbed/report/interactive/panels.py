@@ -101,8 +101,12 @@ def _sizes(subjects: Sequence[Subject], positioned: Sequence[Subject], arrays: A
         ("roll and pitch error", "deg", subjects, lambda e: np.rad2deg(e.tilt)),
         ("heading error", "deg", subjects, lambda e: np.rad2deg(np.abs(e.attitude[:, 2]))),
     )
-    known = {one.name.removesuffix(one.estimator): one.run for one in subjects}
-    bounds = [(f"{name}bound", bound) for name, run in known.items() for bound in run.bound_once]
+    bounded: dict[int, tuple[Bound, list[str]]] = {}
+    for one in subjects:
+        if one.estimator in one.run.bounds:
+            bound = one.run.bounds[one.estimator]
+            bounded.setdefault(id(bound), (bound, []))[1].append(one.name)
+    bounds = [(f"bound of {', '.join(names)}", bound) for bound, names in bounded.values()]
     for title, unit, shown, size in quantities:
         lines: list[dict[str, Any]] = []
         for one in shown:

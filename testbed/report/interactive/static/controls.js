@@ -1,5 +1,6 @@
 // The bar that stays in sight: who is shown, where the cursor is, what happened; keys; paper; and the start of it all.
 
+const REST_MS = 300; // between panels that nobody waits for
 const bar = document.getElementById("bar");
 const panels = [];
 const planes = [];
@@ -44,7 +45,7 @@ function legend() {
     tell("shown");
   }, true);
   listen("shown", () => bands.setAttribute("aria-pressed", seen.bands));
-  row.append(bands);
+  row.append(bands, key("truth", PAGE.reference));
   if (PAGE.windows.length) row.append(key("denied", "no GNSS fix"));
   if (PAGE.faults.length) row.append(key("fault", "fault of a sensor"));
   return row;
@@ -204,8 +205,8 @@ function sight() {
 /** Make the panels that nobody has seen yet, one at a time: paper shows them all. */
 function idle() {
   const next = panels.find(({ made }) => !made);
-  const wait = window.requestIdleCallback ?? ((does) => setTimeout(does, 50));
-  if (next) wait(() => next.build().then(idle), { timeout: 2000 });
+  const wait = window.requestIdleCallback ?? setTimeout;
+  if (next) wait(() => next.build().then(() => setTimeout(idle, REST_MS)), { timeout: 2000 });
   else document.documentElement.dataset.state = "whole";
 }
 
@@ -233,7 +234,10 @@ function crosses(own) {
 
 async function start() {
   bar.append(legend(), timeline(), buttons());
-  for (const row of document.querySelectorAll("[data-t]")) row.addEventListener("click", () => jump(Number(row.dataset.t)));
+  for (const row of document.querySelectorAll("[data-t]")) row.addEventListener("click", () => {
+    jump(Number(row.dataset.t));
+    bar.nextElementSibling.scrollIntoView();
+  });
   PAGE.chapters.forEach((chapter, k) => {
     const place = document.getElementById(`chapter-${k}`);
     const own = chapter.panels.map((spec, at) => new Panel({ ...spec, last: at == chapter.panels.length - 1 }, place));
