@@ -41,6 +41,7 @@ from testbed.score.bound_model import (
     add_sensor,
     way,
 )
+from testbed.score.bound_sight import add_sight
 from testbed.sensors.gnss import GnssConfig
 
 if TYPE_CHECKING:
@@ -115,7 +116,9 @@ def _bound(dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSecti
     if isinstance(scenario.truth, FlightTruth):
         add_air(model, scenario.truth)
     for name in section.aiding(scenario.sensors):
-        if not add_sensor(model, dataset, name, scenario.sensors[name], scenario.date):
+        config = scenario.sensors[name]
+        known = add_sensor(model, dataset, name, config, scenario.date)
+        if not known and not add_sight(model, dataset, name, config, scenario.truth.terrain):
             return None
     start = model.prior
     start[range(MOTION), range(MOTION)] = _start(getattr(section, "handover", None)) ** 2

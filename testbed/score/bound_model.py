@@ -178,6 +178,7 @@ class Model:
     drives: list[tuple[slice, slice, Array]] = field(default_factory=list)  # rows, columns, F T (K, 3, n)
     measurements: list[tuple[Array, Measured]] = field(default_factory=list)  # samples per step (K,), and rows
     air: tuple[slice, slice | None, Gusts | None] | None = None  # mean wind, what wanders about it, gusts
+    ground: slice | None = None  # its height over the map
 
     def add(self, block: Block) -> slice:
         """Lay a block out behind the others."""
