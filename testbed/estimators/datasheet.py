@@ -27,7 +27,7 @@ from nav.error_model import ImuModel
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
-from testbed.sensors import registry
+from testbed.sensors import Site, registry
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocityConfig
@@ -111,15 +111,11 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
     ``slip_mps`` is of wheels, None without that constraint. Body velocity, position fixes and what is seen of the
     ground are of the centre of gravity.
     """
-    section, usual, site = rig.sensors[name], rig.usual, rig.site
+    section, usual = rig.sensors[name], rig.usual
     from_imu: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
-        case RangefinderConfig():
-            r = section.errors()
-            return RangefinderAid(name, r.noise, r.scale, site.terrain, site.terrain_sigma)
-        case OpticalFlowConfig():
-            f = section.errors()
-            return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, site.terrain, site.terrain_sigma)
+        case RangefinderConfig() | OpticalFlowConfig():
+            return _eye(name, section, rig.site)
         case GnssConfig():
             e = section.errors()
             return GnssAid(
@@ -167,3 +163,12 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             return PositionFixAid(name, tuple(p.position_n), p.height, from_imu)
     maker = registry.of(section).aid  # of a sensor of the user's
     return None if maker is None else maker(name, section, imu)
+
+
+def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site) -> Aid:
+    """A sensor that looks at the ground, with the map."""
+    if isinstance(section, RangefinderConfig):
+        r = section.errors()
+        return RangefinderAid(name, r.noise, r.scale, site.terrain, site.terrain_sigma)
+    f = section.errors()
+    return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, site.terrain, site.terrain_sigma)
