@@ -55,8 +55,12 @@ def _with(parent: ElementTree.Element, tag: str, **texts: str) -> ElementTree.El
     return made
 
 
-def _placemark(folder: ElementTree.Element, name: str, colour: str, width: str = "2") -> ElementTree.Element:
+def _placemark(
+    folder: ElementTree.Element, name: str, colour: str, width: str = "2", when: str = ""
+) -> ElementTree.Element:
     mark = _with(folder, "Placemark", name=name)
+    if when:
+        _with(mark, "TimeStamp", when=when)
     style = _with(mark, "Style")
     _with(style, "LineStyle", color=colour, width=width)
     _with(style, "PolyStyle", color="40" + colour[2:])
@@ -81,8 +85,7 @@ def _denied(folder: ElementTree.Element, track: Track, start: float, end: float)
 
 def _ellipse(view: View, folder: ElementTree.Element, t: float, corners: Array, colour: str) -> None:
     lat, lon, h = corners.T
-    mark = _placemark(folder, f"95 % at {t:g} s", colour, "1")
-    _with(mark, "TimeStamp", when=utc(view, t))
+    mark = _placemark(folder, f"95 % at {t:g} s", colour, "1", utc(view, t))
     ring = _with(_with(_with(mark, "Polygon", altitudeMode="absolute"), "outerBoundaryIs"), "LinearRing")
     ElementTree.SubElement(ring, _name("coordinates")).text = " ".join(_places(lat, lon, h, ","))
 

@@ -19,6 +19,7 @@ MEASURES = {
         runs.cpu_two_estimators,
         runs.cpu_main_scenario,
         runs.federation,
+        runs.exports,
         peers.strapdown_alone,
         peers.ins_at_every_sample,
         peers.accuracy,

@@ -8,15 +8,18 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from statistics import median
 
 from bench.measure import MAIN, TWO_ESTIMATORS, Effort, Row, alternate, cpu_seconds, ratios, wall_seconds
 from bench.shares import shares
 
+from testbed.exports import FORMATS, export
 from testbed.loop import loop
 from testbed.motion.flight import Aircraft
 from testbed.motion.sections import FlightTruth
+from testbed.results import RECORD
 from testbed.scenario import Scenario
 
 CAMPAIGN_RUNS = 20
@@ -58,6 +61,21 @@ def _cpu(what: str, scenario: Scenario, at_most: float, effort: Effort) -> Row:
         spent = shares(fly)
     parts = ", ".join(f"{room} {100 * seconds / sum(spent.values()):.0f} %" for room, seconds in spent.items())
     return Row(what, ratios(whole, bare), at_most=at_most, detail=f"{_over(whole, bare)}: {parts}")
+
+
+def exports(effort: Effort) -> Iterator[Row]:
+    """Processor time of turning the record of the main scenario into each format; mcap where its extra is installed."""
+    with tempfile.TemporaryDirectory() as folder:
+        loop.run(_main_scenario(effort), out=Path(folder))
+        for name, one in FORMATS.items():
+            if one.extra and find_spec(one.extra) is None:
+                continue
+            target = Path(folder) / "out" / name
+            seconds = [
+                cpu_seconds(lambda form=name, to=target: export(Path(folder) / RECORD, form, to, force=True))
+                for _ in range(min(2, effort.rounds))
+            ]
+            yield Row(f"export to {name}, CPU", tuple(seconds), "s")
 
 
 def federation(effort: Effort) -> Iterator[Row]:

@@ -20,7 +20,8 @@ RATE_HZ = 100.0
 
 def scenario(duration_s: float) -> Scenario:
     changes = {"duration_s": duration_s, "truth.rate_hz": RATE_HZ, "sensors.imu.rate_hz": RATE_HZ}
-    return Scenario.load("loiter_gnss_outage", {**changes, "sensors.gnss.denied": []})
+    one = {"name": "ins", "aids": ["gnss", "barometer", "magnetometer", "airspeed"]}
+    return Scenario.load("loiter_gnss_outage", {**changes, "sensors.gnss.denied": [], "estimator": [one], "expect": {}})
 
 
 def flown(protocol: str, duration_s: float, out: Path | None = None) -> RunResult:
@@ -37,7 +38,7 @@ def circles(result: RunResult) -> tuple[float, float, float]:
     """How often it went round, and by how much height and airspeed differ from those at the start, settled."""
     truth = result.dataset["truth"]
     course = np.unwrap(np.arctan2(truth["v_n"].values[:, 1], truth["v_n"].values[:, 0]))
-    settled = truth["time"].values > 20.0
+    settled = truth["time"].values > 15.0
     height = np.abs(truth["h"].values - truth["h"].values[0])[settled].max(initial=0.0)
     speed = np.abs(truth["airspeed"].values - truth["airspeed"].values[0])[settled].max(initial=0.0)
     return float(course[-1] - course[0]) / (2 * np.pi), float(height), float(speed)
@@ -46,10 +47,10 @@ def circles(result: RunResult) -> tuple[float, float, float]:
 @pytest.mark.ci
 @pytest.mark.parametrize("protocol", ["px4", "ardupilot"])
 def test_a_minimal_autopilot_flies_circles(protocol: str) -> None:
-    result = flown(protocol, 40.0)
+    result = flown(protocol, 25.0)
     assert result.failure == ""
     turns, height, speed = circles(result)
-    assert turns == pytest.approx(1.0, abs=0.4)  # a bank of 25 deg at 25 m/s is 0.18 rad/s
+    assert turns == pytest.approx(0.6, abs=0.3)  # a bank of 25 deg at 25 m/s is 0.18 rad/s
     assert height < 20
     assert speed < 4
     events = list(result.dataset["events/text"].values)
@@ -69,7 +70,7 @@ def test_it_does_so_for_ten_minutes(protocol: str) -> None:
 
 
 def test_the_same_commands_give_the_same_bits() -> None:
-    first, second = (flown("px4", 6.0).dataset for _ in range(2))
+    first, second = (flown("px4", 4.0).dataset for _ in range(2))
     assert same(first, second)
 
 
