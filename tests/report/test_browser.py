@@ -235,8 +235,21 @@ def test_paper_shows_every_plot_in_light_colours(opened: Page) -> None:
     opened.dark(True)
     opened.until(WHOLE)
     opened.run("dispatchEvent(new Event('beforeprint'))")
+    opened.until("document.querySelector('img.paper')")
     assert opened.run("document.querySelectorAll('img.paper').length == page.panels.length + page.planes.length")
     assert opened.run(f"{PANEL}.figure.background_fill_color") == "#FFFFFF"
+    # The line of truth is black on white there, though it is white on black on the screen.
+    airspeed = "page.panels.find(({spec}) => spec.title == 'true airspeed')"
+    shades = opened.run(
+        f"(async () => {{ const image = {airspeed}.element.querySelector('img.paper'); await image.decode();"
+        " const canvas = new OffscreenCanvas(image.naturalWidth, image.naturalHeight), own = canvas.getContext('2d');"
+        " own.drawImage(image, 0, 0); const {left, top, width, height} = " + airspeed + ".view.frame.bbox;"
+        " const ratio = image.naturalWidth / " + airspeed + ".view.bbox.width;"
+        " const {data} = own.getImageData(ratio * left + 4, ratio * top + 4, ratio * width - 8, ratio * height - 8);"
+        " let dark = 0; for (let k = 0; k < data.length; k += 4) dark += data[k] + data[k + 1] + data[k + 2] < 150;"
+        " return dark / (data.length / 4) })()"
+    )
+    assert 0.001 < shades < 0.2
     opened.run("dispatchEvent(new Event('afterprint'))")
     opened.until(f"{PANEL}.figure.background_fill_color == '#16191D'")
     assert opened.run("document.querySelectorAll('img.paper').length") == 0

@@ -171,7 +171,7 @@ def test_a_line_keeps_its_peaks_and_there_are_fewer_points_for_more_estimators()
 def test_a_page_stays_below_eight_megabytes_however_many_estimators() -> None:
     names = [f"ins_{k}" for k in range(8)]
     made = scenario(1200.0)  # longer ones have as many points
-    made.estimator = [SimpleNamespace(name=name, imu="imu") for name in names]
+    made.estimator = [SimpleNamespace(name=name, imu="imu", recorded=(name,)) for name in names]
     recorder = Recorder(None, made, 1)
     synthetic_run.record(recorder, circle(1200.0), {name: Errors() for name in names}, DENIED)
     page = contents([Shown("", Run(recorder.dataset()))])

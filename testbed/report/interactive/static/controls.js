@@ -164,13 +164,18 @@ addEventListener("keydown", (event) => {
 
 // --- paper: pictures of the plots as they are, in light colours
 
-function toPaper() {
+const TURNS = 20; // of the queue of promises, after which Bokeh has heeded a change; paper waits for those
+async function toPaper() {
   onPaper = true;
-  for (const one of [...panels, ...planes]) {
-    if (!one.view) continue;
+  const drawn = [...panels, ...planes].filter(({ view }) => view);
+  for (const one of drawn) {
     one.inSight = true;
     if (one.update) one.update();
     one.theme();
+    one.follow();
+  }
+  for (let turn = 0; turn < TURNS; turn++) await null;
+  for (const one of drawn) {
     const picture = make("img", "paper");
     picture.src = one.view.export("png").canvas.toDataURL();
     picture.alt = one.plot.getAttribute("aria-label");
