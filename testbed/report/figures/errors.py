@@ -189,7 +189,7 @@ OF_ALL = (
         "comparison",
         "Size of the errors, logarithmic: root mean square over the last 2 s. Each line is an estimator, wider below"
         " narrower. Dashed black: the bound, a root mean square over draws that no estimator of these sensors can be"
-        " below; one run may be.",
+        " below; one run may be, and what looks back.",
         comparison,
     ),
     Plot(
