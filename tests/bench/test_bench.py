@@ -94,7 +94,7 @@ def test_each_figure_is_printed_as_it_is_measured(capsys: pytest.CaptureFixture[
 def test_quick_is_a_tenth_of_the_work_without_verdicts(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(STUBS, ["--quick", "--only", "two_rows", "over"]) == 0
     out = capsys.readouterr().out
-    assert "25 steps" in out
+    assert "10 steps" in out
     assert not any(word in out for word in ("kept", "missed", "MISSED", "at most"))
     work = [effort.share * (1 + effort.rounds) for effort in (QUICK, FULL)]  # and the warm-up
     assert work[0] <= 0.1 * work[1]

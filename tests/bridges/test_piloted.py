@@ -45,7 +45,7 @@ def circles(result: RunResult) -> tuple[float, float, float]:
 
 
 @pytest.mark.ci
-@pytest.mark.parametrize("protocol", ["px4", "ardupilot"])
+@pytest.mark.parametrize("protocol", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
 def test_a_minimal_autopilot_flies_circles(protocol: str) -> None:
     result = flown(protocol, 25.0)
     assert result.failure == ""

@@ -42,7 +42,9 @@ AHRS = '{name="ahrs", kind="ahrs", aids=["airspeed", "magnetometer", "barometer"
 BLIND = '{name="blind", kind="ahrs", aids=[], heading_deg=90}'
 GYROS = '{name="gyros", kind="ahrs", aids=[], heading_deg=90, levelling=false}'
 OF_ATTITUDE = {
-    f"{quantity}_{statistic}_deg" for quantity in ("roll", "pitch", "heading") for statistic in ("rms", "max", "std")
+    f"{quantity}_{statistic}_deg"
+    for quantity in ("roll", "pitch", "heading")
+    for statistic in ("rms", "max", "mean", "std")
 } | {"roll_pitch_rms_deg", "roll_pitch_max_deg", "attitude_nees_mean"}
 
 
@@ -246,8 +248,8 @@ def lines(axes: Any) -> set[str]:
 def test_figures_compare_what_there_is(flown: Any) -> None:
     every = Run(flown[0].dataset)
     position, height, tilt, heading = errors_figures.comparison(every).axes
-    assert lines(position) == lines(height) == {"ins"}
-    assert lines(tilt) == lines(heading) == {"ahrs", "ins", "blind", "gyros"}
+    assert lines(position) == lines(height) == {"ins", "bound"}
+    assert lines(tilt) == lines(heading) == {"ahrs", "ins", "blind", "gyros", "bound"}
     assert "ahrs" not in lines(flight.ground_track(every).axes[0]) | lines(flight.flight(every).axes[0])
     alone = Run(flown[0].dataset)
     del alone.errors["ins"]

@@ -271,7 +271,7 @@ def test_check_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     ]
     assert re.search(r"heading_max_deg .* -50\.\d % ", both.out)
     assert re.search(
-        r"^good: passed in \d+ s: of \[expect\] 4 kept; of golden metrics 1 better, 48 same$", both.out, re.M
+        r"^good: passed in \d+ s: of \[expect\] 4 kept; of golden metrics 1 better, 57 same$", both.out, re.M
     )
     assert re.search(r"^bad: FAILED in .* 1 worse; kept in runs/check/bad$", both.out, re.M)
     assert [path.name for path in (tmp_path / "runs/check").iterdir()] == ["bad"]

@@ -18,12 +18,13 @@ from worlds.sensor_truth import RATE_HZ, cut, lively, still
 
 from nav.earth import isa_pressure
 from nav.samples import FixType, ImuSamples
+from nav.terrain import Terrain
 from testbed import sensors
 from testbed.sensors import faults
 from testbed.sensors.faults import CHANNELS, Faults
 
 DURATION_S = 30.0
-SITE = sensors.Site(dt.date(2026, 6, 1), 0.0, 0.0, 0.0)
+SITE = sensors.Site(dt.date(2026, 6, 1), 0.0, 0.0, 0.0, Terrain.flat(500.0))  # in sight from 800 m
 KINDS = tuple(SECTIONS)
 FAULT: TypeAdapter[Any] = TypeAdapter(faults.Fault)
 G_TO_SI = 9.80665
