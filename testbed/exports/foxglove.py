@@ -118,7 +118,7 @@ def _poses(view: View, own: Columns) -> Iterator[tuple[float, dict[str, Any]]]:
     """Attitudes where a place is known; of one that knows none, at the origin."""
     lat0, lon0, h0 = (np.array(x) for x in view.origin())
     place = position_difference_n(own["lat"], own["lon"], own["h"], lat0, lon0, h0) @ ENU_NED.T
-    attitude = Rotation.from_quat(own["q_nb"], scalar_first=True)
+    attitude = Rotation.from_quat(np.roll(own["q_nb"], -1, axis=-1))  # the scalar last
     turned = (Rotation.from_matrix(ENU_NED) * attitude * Rotation.from_matrix(FLU_FRD)).as_quat()
     for t, p, q in zip(own["time"], np.nan_to_num(place), turned, strict=True):
         orientation = dict(zip("xyzw", map(float, q), strict=True))

@@ -140,7 +140,7 @@ def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
     steps = (len(t) - 1) // every
     ends = every * np.arange(1, steps + 1)
     rows = slice(1, every * steps + 1)
-    C_nb = Rotation.from_quat(true("q_nb"), scalar_first=True).as_matrix()
+    C_nb = Rotation.from_quat(np.roll(true("q_nb"), -1, axis=-1)).as_matrix()  # the scalar last
     C_ns = (0.5 * (C_nb[1:] + C_nb[:-1]) @ C_sb.T)[: rows.stop - 1]
     dt, dtheta_s, dv_s = np.diff(t)[: rows.stop - 1], true("dtheta")[rows] @ C_sb.T, true("dv")[rows] @ C_sb.T
     starts = every * np.arange(steps)
