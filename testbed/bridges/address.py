@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 
 from testbed.errors import UserError
+from testbed.mavlink.link import in_use
 
 
 def address(url: str, kind: str, default: str) -> tuple[str, int]:
@@ -29,7 +30,5 @@ def bound(url: str, where: tuple[str, int], kind: socket.SocketKind) -> socket.s
         made.bind(where)
     except OSError as error:
         made.close()
-        raise UserError(
-            f"{url}: can't listen there ({error.strerror}): end what uses the port or choose another"
-        ) from None
+        raise UserError(in_use(url, error)) from None
     return made

@@ -215,7 +215,7 @@ class UdpIn:
             self._socket.bind(address)
         except OSError as error:
             self._socket.close()
-            raise UserError(_in_use(url, error)) from None
+            raise UserError(in_use(url, error)) from None
         self._by_address: dict[tuple[str, int], _Udp] = {}
 
     @property
@@ -347,7 +347,7 @@ class TcpServer:
         try:
             self._listener = socket.create_server(address)
         except OSError as error:
-            raise UserError(_in_use(url, error)) from None
+            raise UserError(in_use(url, error)) from None
         self._listener.setblocking(False)
         self.stations: list[_Peer] = []
 
@@ -427,7 +427,8 @@ class Serial:
         self.stations.clear()
 
 
-def _in_use(url: str, error: OSError) -> str:
+def in_use(url: str, error: OSError) -> str:
+    """What is said when nobody can listen at ``url``."""
     return f"{url}: can't listen there ({error.strerror}); end what uses the port or choose another"
 
 

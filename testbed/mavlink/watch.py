@@ -27,7 +27,7 @@ from rich.text import Text
 
 from testbed.errors import UserError
 from testbed.interrupts import Interrupted
-from testbed.mavlink.link import CONNECT_TIMEOUT_S, log_path, resolve
+from testbed.mavlink.link import CONNECT_TIMEOUT_S, in_use, log_path, resolve
 
 Turn: TypeAlias = tuple[float, list[Any]]  # a clock [s] and the messages that have come up to then
 Turns: TypeAlias = Generator[Turn, None, None]
@@ -288,9 +288,7 @@ def _live(url: str) -> Turns:
             connection.bind(address)
         except OSError as error:
             connection.close()
-            raise UserError(
-                f"{url}: can't listen there ({error.strerror}); end what uses the port or choose another"
-            ) from None
+            raise UserError(in_use(url, error)) from None
     else:
         try:
             connection = socket.create_connection(address, timeout=CONNECT_TIMEOUT_S)
