@@ -461,6 +461,8 @@ rate_hz = 1.0
 [sensors.rangefinder]
 max_range_m = 1000.0
 [sensors.optical_flow]
+[sensors.wind_report]
+rate_hz = 1.0
 [[fault]]
 sensor = "gnss"
 channel = "north"
@@ -539,6 +541,7 @@ KINDS = (
     "position_fix",
     "rangefinder",
     "optical_flow",
+    "wind_report",
 )
 PARTS: dict[str, Callable[[], str]] = {
     "scenario_reference": scenario_reference,

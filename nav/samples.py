@@ -188,6 +188,21 @@ class OpticalFlowSample:
     sensor: str = "optical_flow"
 
 
+@dataclass(frozen=True, slots=True)
+class WindSample:
+    """The wind by radio: velocity of the air over ground north and east ``wind_n`` (2,), a mean without gusts [m/s].
+
+    It is of ``age`` [s] before ``t``, when it was reported; ``sigma`` is the 1-sigma per axis that is told with it.
+    """
+
+    t: float
+    t_arrival: float
+    wind_n: Array
+    age: float
+    sigma: float
+    sensor: str = "wind_report"
+
+
 Sample: TypeAlias = (
     GnssSample
     | BarometerSample
@@ -198,6 +213,7 @@ Sample: TypeAlias = (
     | PositionSample
     | RangeSample
     | OpticalFlowSample
+    | WindSample
 )
 
 

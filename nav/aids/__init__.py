@@ -10,7 +10,17 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from nav.aids import airspeed, barometer, body_velocity, gnss, magnetometer, position_fix, star_tracker, terrain
+from nav.aids import (
+    airspeed,
+    barometer,
+    body_velocity,
+    gnss,
+    magnetometer,
+    position_fix,
+    star_tracker,
+    terrain,
+    wind_report,
+)
 from nav.aids.airspeed import AirspeedAid
 from nav.aids.barometer import BarometerAid
 from nav.aids.base import Aid
@@ -20,6 +30,7 @@ from nav.aids.magnetometer import MagnetometerAid
 from nav.aids.position_fix import PositionFixAid
 from nav.aids.star_tracker import StarAid
 from nav.aids.terrain import OpticalFlowAid, RangefinderAid
+from nav.aids.wind_report import WindReportAid
 from nav.samples import (
     AirspeedSample,
     BarometerSample,
@@ -31,6 +42,7 @@ from nav.samples import (
     RangeSample,
     Sample,
     StarSample,
+    WindSample,
 )
 
 __all__ = [
@@ -45,6 +57,7 @@ __all__ = [
     "PositionFixAid",
     "RangefinderAid",
     "StarAid",
+    "WindReportAid",
     "problem",
 ]
 
@@ -58,6 +71,7 @@ PROBLEMS: Mapping[type[Sample], Callable[[Any], str]] = {
     PositionSample: position_fix.problem,
     RangeSample: terrain.range_trouble,
     StarSample: star_tracker.problem,
+    WindSample: wind_report.problem,
 }
 
 

@@ -20,6 +20,7 @@ from nav.aids import (
     PositionFixAid,
     RangefinderAid,
     StarAid,
+    WindReportAid,
 )
 from nav.aids.magnetometer import FIELD_SIZE
 from nav.earth import STANDARD_GRAVITY
@@ -38,6 +39,7 @@ from testbed.sensors.optical_flow import OpticalFlowConfig
 from testbed.sensors.position_fix import PositionFixConfig
 from testbed.sensors.rangefinder import RangefinderConfig
 from testbed.sensors.star_tracker import StarTrackerConfig
+from testbed.sensors.wind_report import WindReportConfig
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 MANOEUVRE_S = 120.0  # between changes of turn and load
@@ -161,6 +163,11 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
         case PositionFixConfig():
             p = section.errors()
             return PositionFixAid(name, tuple(p.position_n), p.height, from_imu)
+        case WindReportConfig():
+            w = section.errors()
+            length = GUST_LENGTH / usual.airspeed_mps
+            left = air.gust * math.sqrt(2 * length / max(section.mean_s, 2 * length))
+            return WindReportAid(name, w.local, w.tau, left, air.wind_walk)
     maker = registry.of(section).aid  # of a sensor of the user's
     return None if maker is None else maker(name, section, imu)
 

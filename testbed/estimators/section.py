@@ -15,7 +15,7 @@ Mistake: TypeAlias = tuple[tuple[str | int, ...], str]  # where in the table, an
 
 DEFAULT_ESTIMATOR = "ins"  # the kind of one that does not say it
 # Of these kinds an estimator may have several sensors; of any other kind it takes one.
-SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix", "rangefinder", "optical_flow"})
+SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix", "rangefinder", "optical_flow", "wind_report"})
 ONE_EACH = frozenset({"gnss", "barometer", "magnetometer", "airspeed"})
 
 Engine: TypeAlias = Annotated[Literal["linear", "unscented"], Field(description="derivatives or sigma points")]
@@ -111,6 +111,11 @@ def aid_mistakes(
             yield ("aids", index), unknown("sensor", aid, names)
         elif aid in aids[:index]:
             yield ("aids", index), f"{aid!r} is listed twice"
+        elif sensors[aid].kind == "wind_report" and not any(
+            sensors[other].kind == "airspeed" for other in aids if other in sensors
+        ):
+            text = "tells of a wind that nothing here meets: add an airspeed sensor to these aids, or leave it out"
+            yield ("aids", index), f"{aid!r} {text}"
 
 
 def second_of_a_kind(kind: str, aids: Sequence[str], sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:

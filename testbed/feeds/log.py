@@ -26,6 +26,7 @@ from nav.samples import (
     RangeSample,
     Sample,
     StarSample,
+    WindSample,
 )
 from testbed.errors import UserError
 from testbed.motion.logged import Place
@@ -41,6 +42,7 @@ SAMPLES: Mapping[str, type[Sample]] = {
     "position_fix": PositionSample,
     "rangefinder": RangeSample,
     "optical_flow": OpticalFlowSample,
+    "wind_report": WindSample,
 }
 
 Samples: TypeAlias = Sequence[Sample]

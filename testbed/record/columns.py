@@ -107,6 +107,9 @@ SAMPLE = {
     "flow_b": Variable("rad/s", "rates of the line of sight about body x and y", ("body_xy",)),
     "rotation_b": Variable("rad/s", "rotation of the body about x and y by the sensor's own gyro", ("body_xy",)),
     "quality": Variable("1", "quality of the match of the images, 0 to 1"),
+    "wind_n": Variable("m/s", "reported velocity of the air over ground, a mean", ("north_east",)),
+    "age": Variable("s", "how long before its time of validity that was"),
+    "sigma": Variable("m/s", "reported 1-sigma per axis"),
     "q_ib": Variable("1", "measured attitude quaternion, scalar first", ("inertial_quaternion",)),
 }
 
@@ -162,6 +165,7 @@ EXTRA = {
     "rangefinder_scale": Variable("1", "estimated scale factor error of the rangefinder"),
     "optical_flow_scale": Variable("1", "estimated scale factor error of the optics"),
     "optical_flow_error": Variable("rad/s", "estimated slow error of optical flow", ("body_xy",)),
+    "wind_report_error": Variable("m/s", "estimated slow error of the wind report", ("north_east",)),
     "mode_counter": Variable("1", "periods of low dynamics"),
     "correction_counter": Variable("1", "corrections of the attitude since the last period that was none"),
     "judged_acceleration": Variable("m/s^2", "acceleration by which low dynamics were judged"),
@@ -192,6 +196,7 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "position_fix": ("m", ("component",)),
     "range": ("m", ("component",)),
     "optical_flow": ("rad/s", ("body_xy",)),
+    "wind_report": ("m/s", ("north_east",)),
     "gnss_course": ("rad", ("component",)),
     "level": ("m/s^2", ("north_east",)),
     "magnetic_heading": ("rad", ("component",)),

@@ -34,6 +34,7 @@ from testbed.sensors.magnetometer import FieldMap, MagnetometerConfig
 from testbed.sensors.position_fix import PositionFixConfig
 from testbed.sensors.star_tracker import StarTrackerConfig
 from testbed.sensors.units import PERCENT
+from testbed.sensors.wind_report import WindReportConfig
 
 if TYPE_CHECKING:
     import datetime
@@ -349,6 +350,9 @@ def add_sensor(model: Model, dataset: xarray.DataTree, name: str, config: Sensor
                 return p.position_n[:axes]
 
             model.observe(times, rows(axes, 1e-3, position))
+        case WindReportConfig():
+            ages = np.asarray(column(dataset, f"sensors/{name}/age"), float) if recorded else np.zeros(0)
+            _add_wind_report(model, times - ages, config)
         case _:
             return False
     return True
@@ -434,6 +438,23 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
         return EXACT_SLIP * sigma
 
     model.observe(way.t[flown], rows(1, 1e-3, slip))
+
+
+def _add_wind_report(model: Model, times: Array, config: WindReportConfig) -> None:
+    """The mean wind at the ``times`` it was measured, known then: nobody knows it sooner, or without the gusts."""
+    e = config.errors()
+    local = model.add(gauss_markov([e.local] * 2, e.tau))
+    if model.air is None:
+        return
+    mean, back, _ = model.air
+
+    def wind(H: Array, part: slice) -> float:
+        H[:, :, mean] = H[:, :, local] = np.eye(2)
+        if back is not None:
+            H[:, :, back] = np.eye(2)
+        return e.noise
+
+    model.observe(times, rows(2, 1e-3, wind))
 
 
 def slip_statistics(way: Way) -> tuple[float, float]:

@@ -28,6 +28,7 @@ from nav.aids import (
     PositionFixAid,
     RangefinderAid,
     StarAid,
+    WindReportAid,
 )
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
@@ -53,6 +54,7 @@ from nav.samples import (
     Sample,
     StarSample,
     Status,
+    WindSample,
 )
 from testbed.errors import UserError
 from testbed.estimators import registry
@@ -255,4 +257,6 @@ def _sample(
             return OpticalFlowSample(t, t, np.zeros(2), np.zeros(2), 1.0, aid.sensor)
         case PositionFixAid():
             return PositionSample(t, t, here.lat, here.lon, here.h, aid.sensor)
+        case WindReportAid():
+            return WindSample(t, t, np.zeros(2), 0.0, aid.error_sigma, aid.sensor)
     raise TypeError(f"no sample of {aid!r}")

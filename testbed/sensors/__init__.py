@@ -20,6 +20,7 @@ from testbed.sensors.position_fix import PositionFix, PositionFixConfig
 from testbed.sensors.rangefinder import Rangefinder, RangefinderConfig
 from testbed.sensors.site import Site
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
+from testbed.sensors.wind_report import WindReport, WindReportConfig
 
 __all__ = [
     "AidingSensor",
@@ -42,9 +43,19 @@ SensorConfig: TypeAlias = (
     | PositionFixConfig
     | RangefinderConfig
     | OpticalFlowConfig
+    | WindReportConfig
 )
 AidingSensor: TypeAlias = (
-    Gnss | Magnetometer | Barometer | Airspeed | BodyVelocity | StarTracker | PositionFix | Rangefinder | OpticalFlow
+    Gnss
+    | Magnetometer
+    | Barometer
+    | Airspeed
+    | BodyVelocity
+    | StarTracker
+    | PositionFix
+    | Rangefinder
+    | OpticalFlow
+    | WindReport
 )
 Sensor: TypeAlias = Imu | AidingSensor
 

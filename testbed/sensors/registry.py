@@ -38,6 +38,7 @@ from testbed.sensors.position_fix import PositionFix, PositionFixConfig
 from testbed.sensors.rangefinder import Rangefinder, RangefinderConfig
 from testbed.sensors.star_tracker import StarTracker, StarTrackerConfig
 from testbed.sensors.timing import AidingTiming
+from testbed.sensors.wind_report import WindReport, WindReportConfig
 
 GROUP = "navigation_testbed.sensors"
 
@@ -62,6 +63,7 @@ BUILT_IN: dict[str, Kind] = {
     "position_fix": Kind(PositionFixConfig, PositionFix),
     "rangefinder": Kind(RangefinderConfig, Rangefinder),
     "optical_flow": Kind(OpticalFlowConfig, OpticalFlow),
+    "wind_report": Kind(WindReportConfig, WindReport),
 }
 _BY_SECTION: dict[type[Section], Kind] = {kind.section: kind for kind in BUILT_IN.values()}
 _CUSTOM: dict[tuple[str, Any], Kind] = {}

@@ -22,6 +22,7 @@ from nav.samples import (
     PositionSample,
     RangeSample,
     StarSample,
+    WindSample,
 )
 from testbed import sensors
 from testbed.errors import UserError
@@ -37,6 +38,7 @@ from testbed.sensors import (
     position_fix,
     rangefinder,
     star_tracker,
+    wind_report,
 )
 
 SITE = sensors.Site(datetime.date(2026, 6, 1), 0.6, 1.9, 800.0)
@@ -51,6 +53,7 @@ MODULES = {
     "position_fix": position_fix,
     "rangefinder": rangefinder,
     "optical_flow": optical_flow,
+    "wind_report": wind_report,
 }
 SAMPLES = {
     "imu": ImuSamples,
@@ -63,6 +66,7 @@ SAMPLES = {
     "position_fix": PositionSample,
     "rangefinder": RangeSample,
     "optical_flow": OpticalFlowSample,
+    "wind_report": WindSample,
 }
 # On its way north the body passes a small jammer 44 m from its start.
 JAMMER = {"lat_deg": np.degrees(0.6) + 4e-4, "lon_deg": np.degrees(1.9), "radius_m": 20.0}
@@ -86,6 +90,7 @@ EVERYTHING = {
     "position_fix": {"rate_hz": 25.0, "transponder": BEACON, **INTERRUPTED},
     "rangefinder": {"rate_hz": 25.0, "max_range_m": 1000.0, **INTERRUPTED},
     "optical_flow": {"rate_hz": 20.0, "offset_s": 0.02, "max_range_m": 2000.0, "outlier_percent": 20.0, **INTERRUPTED},
+    "wind_report": {"rate_hz": 20.0, "mean_s": 0.4, "delay_s": 0.2, **INTERRUPTED},
 }
 TRUTH = lively(400)
 
@@ -265,6 +270,8 @@ def error_keys(kind, grade):
         "satellites",
         "reacquire",
         "rate_hz",
+        "mean_s",
+        "delay",
     )
     numbers = {key: value for key, value in preset.items() if isinstance(value, (int, float))}
     return [key for key, value in numbers.items() if not any(w in key for w in words) and value != 0]

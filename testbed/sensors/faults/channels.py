@@ -242,4 +242,8 @@ CHANNELS: Mapping[str, Mapping[str, Channel]] = {
     "optical_flow": {
         name: _component("flow_b", axis, {"rad/s": 1.0}, lambda c: c.errors().noise) for axis, name in enumerate("xy")
     },
+    "wind_report": {
+        name: _component("wind_n", axis, SPEEDS, lambda c: c.errors().noise)
+        for axis, name in enumerate(("north", "east"))
+    },
 }
