@@ -247,8 +247,8 @@ def papers(
     from testbed import papers as library
     from testbed.many import progress
     from testbed.papers import saved
-    from testbed.papers.claims import Verdict
     from testbed.papers.draws import draws
+    from testbed.score.claims import Verdict
 
     found = library.find(ids or [])
     drawn = draws(library.RECORDED_DRAW if draw is None else draw, runs, quick)

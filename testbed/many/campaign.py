@@ -10,8 +10,6 @@ interrupted carries on with the runs that are missing.
 
 from __future__ import annotations
 
-import functools
-import hashlib
 import io
 import itertools
 import json
@@ -23,19 +21,17 @@ import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import nav
-import testbed
 from nav.samples import Array
-from testbed.data import data_dir, write_file
+from testbed.data import write_file
 from testbed.errors import UserError
 from testbed.many import pool, progress
 from testbed.many.draws import DRAW, require_draw
+from testbed.many.folder import claim, code, require_code, versions
 from testbed.many.shared_flight import log_digests, require_control, share_truth
 from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
@@ -51,8 +47,6 @@ if TYPE_CHECKING:
     from testbed.report.campaign import Statistics
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
-SETUP = "setup.json"
-PRESENTATION = ("report", "mavlink")  # rooms that change no number
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +248,7 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     require_draw(plan.draw, plan.runs if plan.draw else 0)
     total = len(combinations) * plan.runs
     folder = plan.out.absolute()
-    _claim(folder, _setup([one.scenario for one in combinations], plan))
+    claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan))
     stored = _load_all(folder, combinations, plan)
     failures: list[Failure] = []
     if len(stored) < total:
@@ -300,11 +294,11 @@ def _tasks(
     plan: Plan, combinations: Sequence[Combination], truth: Path | None, stored: Set[tuple[int, int]]
 ) -> Iterator[_Task]:
     """The runs that are not there yet. There may be millions: they are made as they are flown."""
-    code = _code()
+    now = code()
     for i, combination in enumerate(combinations):
         for seed in plan.seeds(combination.scenario):
             if (i, seed) not in stored:
-                yield _Task(i, seed, combination.scenario, truth, code)
+                yield _Task(i, seed, combination.scenario, truth, now)
 
 
 # --- the folder
@@ -312,54 +306,16 @@ def _tasks(
 
 def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
-    packages = ("numpy", "scipy", "numba", "jsbsim", "pygeomag")
     flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
         "scenario text": scenarios[0].text,
         "overrides": list(plan.overrides),
         "varied values": {key: list(values) for key, values in plan.vary.items()},
-        "code": _code(),
+        "code": code(),
         "aircraft": [aircraft.digest(name) for name in sorted(flown)],
         "logs": log_digests(scenarios),
-        "versions": {package: version(package) for package in packages},
+        "versions": versions(),
     }
-
-
-@functools.cache
-def _code() -> str:
-    """Digest of the code and the aircraft that decide the numbers of a run in this process."""
-    digest = hashlib.sha256()
-    package = Path(testbed.__file__).parent
-    shown = {file for room in PRESENTATION for file in (package / room).rglob("*.py")}
-    for folder, kinds in (
-        (Path(nav.__file__).parent, (".py",)),
-        (package, (".py",)),
-        (data_dir("aircraft"), (".xml", ".toml")),
-    ):
-        for file in sorted({file for file in folder.rglob("*") if file.suffix in kinds} - shown):
-            digest.update(file.relative_to(folder).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
-
-
-def _claim(folder: Path, setup: Mapping[str, Any]) -> None:
-    """Make the campaign's folder, or make sure that it holds this campaign and no other."""
-    file = folder / SETUP
-    advice = "choose another folder with --out, or delete this one"
-    try:
-        (folder / "runs").mkdir(parents=True, exist_ok=True)
-        if file.exists():
-            before = json.loads(file.read_bytes())
-            differ = [key for key in setup if before.get(key) != setup[key]]
-            if differ:
-                raise UserError(f"{folder}: holds a campaign with different {', '.join(differ)}: {advice}")
-        elif any((folder / "runs").iterdir()):
-            raise UserError(f"{folder}: has runs but no {SETUP} to say of what: {advice}")
-        else:
-            write_file(file, json.dumps(setup, indent=1).encode())
-    except OSError as error:
-        raise UserError(f"{folder}: can't write here ({error.strerror}): choose another folder with --out") from None
-    except (ValueError, AttributeError):
-        raise UserError(f"{file}: is damaged: {advice}") from None
 
 
 def _stem(folder: Path, combination: int, seed: int) -> Path:
@@ -420,10 +376,7 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
     from testbed.loop.loop import run
 
     try:
-        if _code() != task.code:
-            raise UserError(
-                "this worker has other code than the campaign began with: has a file been edited meanwhile?"
-            )
+        require_code(task.code)
         shared = task.truth if task.truth is not None and task.truth.is_dir() else None
         recorded = isinstance(task.scenario.truth, LogTruth)  # is read by the run itself
         source = Replay(shared) if shared else None if recorded else motion(task.scenario, task.seed)

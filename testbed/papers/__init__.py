@@ -1,7 +1,7 @@
 """What five papers claim, and what comes out here: ``testbed papers``. One module for each paper, and `misprints`.
 
 A paper gives jobs, each one run or replay of some `Draws` with its seed, which are worked off in parallel; from their
-results it concludes its claims (`testbed.papers.claims` has how they are judged) and draws its figures. The scenarios
+results it concludes its claims (`testbed.score.claims` has how they are judged) and draws its figures. The scenarios
 lie in ``scenarios/papers``, each with its assumptions; where and how a motion goes is drawn (`testbed.papers.draws`).
 """
 
@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.many import pool
-from testbed.papers.claims import Claim, Verdict
 from testbed.papers.draws import Draws
 from testbed.results import write_result
 from testbed.scenario import Scenario
+from testbed.score.claims import Claim, Verdict
 
 if TYPE_CHECKING:
     from rich.table import Table

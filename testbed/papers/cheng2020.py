@@ -23,13 +23,13 @@ from nav.observability import Segment, analyse, continuous, derivatives, in_unit
 from nav.rotation import quat_from_euler
 from nav.samples import Array
 from testbed.papers import Job, Paper, flights, scenario
-from testbed.papers.claims import EXACT, NEARLY_ALL, RATIO_OF_RMS, RMS, Claim, Floor
 from testbed.papers.draws import world
 from testbed.papers.flights import Sensed, Track
 from testbed.report.style import COLOURS
 from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score import accuracy
+from testbed.score.claims import EXACT, NEARLY_ALL, RATIO_OF_RMS, RMS, Claim, Floor
 
 DURATION_S, STRAIGHT_S, FIRST_TURN_S = 1000, 300, 450
 STRAIGHTS = {2: 112.5, 6: 131.5, 8: 139.0}  # segments [s]

@@ -26,7 +26,6 @@ from testbed.motion.sections import KinematicTruth
 from testbed.motion.segments import Straight, Turn
 from testbed.noise import stream
 from testbed.papers import Job, Paper, levelling, scenario
-from testbed.papers.claims import HARDLY_ANY, MEAN, NEARLY_ALL, SHARE, Claim, bootstrapped, quantile
 from testbed.papers.draws import World, world
 from testbed.papers.flights import Sensed
 from testbed.papers.misprints import correction_eq10
@@ -34,6 +33,7 @@ from testbed.report.style import COLOURS, GUIDE, SHADE
 from testbed.results import write_result
 from testbed.scenario import Scenario
 from testbed.score import accuracy
+from testbed.score.claims import HARDLY_ANY, MEAN, NEARLY_ALL, SHARE, Claim, bootstrapped, quantile
 from testbed.sensors.imu import ImuConfig
 
 if TYPE_CHECKING:

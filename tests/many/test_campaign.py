@@ -31,7 +31,7 @@ from testbed.feeds import simulated
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.many import campaign as campaigns
-from testbed.many import pool, shared_flight
+from testbed.many import folder, pool, shared_flight
 from testbed.many.campaign import Combination, Failure, Outcome, Plan, Progress, campaign
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
@@ -405,14 +405,14 @@ def test_the_code_that_decides_numbers_is_all_of_it_but_presentation(
 ) -> None:
     shutil.copytree(Path(testbed.__file__).parent, tmp_path / "testbed", ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(testbed, "__file__", str(tmp_path / "testbed" / "__init__.py"))
-    before = campaigns._code.__wrapped__()
+    before = folder.code.__wrapped__()
     for path in (tmp_path / "testbed").rglob("*.py"):
         text = path.read_bytes()
         path.write_bytes(text + b"#")
         room = path.relative_to(tmp_path / "testbed").parts[0]
-        assert (campaigns._code.__wrapped__() == before) == (room in ("report", "mavlink")), path
+        assert (folder.code.__wrapped__() == before) == (room in ("report", "mavlink")), path
         path.write_bytes(text)
-    assert campaigns._code.__wrapped__() == before
+    assert folder.code.__wrapped__() == before
 
 
 def test_a_million_runs_are_made_as_they_are_flown(

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from testbed import papers
 from testbed.papers import jiang2021, levelling
-from testbed.papers.claims import Verdict
 from testbed.papers.draws import world
 from testbed.papers.jiang2021 import (
     ACCELERATION,
@@ -33,6 +32,7 @@ from testbed.papers.jiang2021 import (
     Flown,
     Run,
 )
+from testbed.score.claims import Verdict
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.many.check import judge
 from testbed.papers import Job, Paper
-from testbed.papers.claims import EXACT, MEAN, Claim
 from testbed.papers.draws import Draws
+from testbed.score.claims import EXACT, MEAN, Claim
 
 SCENARIOS = sorted(path.stem for path in (data_dir("scenarios") / "papers").glob("*.toml"))
 LONG = {"cheng2020", "zhu2020", "zhu2020_outage"}  # to run: more than 5 s

@@ -12,8 +12,8 @@ from testbed import papers
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.papers import saved
-from testbed.papers.claims import EXACT, MEDIAN, Claim
 from testbed.papers.draws import Draws
+from testbed.score.claims import EXACT, MEDIAN, Claim
 
 ROOT = Path(__file__).parent.parent.parent
 QUOTE = re.compile(r"-?\d[\d.e+-]* \([-\d.e+inf]+ to [-\d.e+inf]+\)")

@@ -14,7 +14,6 @@ from nav.detection import Never
 from testbed.errors import UserError
 from testbed.loop.loop import run
 from testbed.papers import scenario
-from testbed.papers.claims import Verdict
 from testbed.papers.flights import Sensed
 from testbed.papers.misprints import weights_eq13, weights_eq13_in_degrees
 from testbed.papers.zhu2020 import claims, figure, flight
@@ -34,6 +33,7 @@ from testbed.papers.zhu2020.flight import (
     Flown,
 )
 from testbed.scenario import Scenario
+from testbed.score.claims import Verdict
 
 SHORT = ("duration_s=320", "expect={}")
 

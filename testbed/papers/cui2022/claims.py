@@ -11,8 +11,8 @@ from nav.samples import Array
 from testbed.papers import scenario
 from testbed.papers.bounds import TOLD as TOLD_TEST
 from testbed.papers.bounds import told_test
-from testbed.papers.claims import HARDLY_ANY, NEARLY_ALL, SHARE, Claim, Floor
 from testbed.papers.cui2022.flight import FALSE_ALARM, GLR, NAME, QUANTITIES, TOLD, WITH_STAR, WITHOUT_STAR, Draw, Flown
+from testbed.score.claims import HARDLY_ANY, NEARLY_ALL, SHARE, Claim, Floor
 
 AXES = {
     "position": ("north", "east", "down"),

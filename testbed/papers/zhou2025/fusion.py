@@ -19,13 +19,13 @@ from testbed.estimators import federated, registry
 from testbed.estimators.federated import FederatedSection
 from testbed.estimators.lane import Lane
 from testbed.papers import flights, scenario
-from testbed.papers.claims import MEAN, RATIO_OF_RMS, RMS, SHARE, Claim, Floor
 from testbed.papers.draws import world
 from testbed.papers.flights import KnownFaults, Sensed, Track
 from testbed.papers.misprints import weights_by_sum
 from testbed.papers.zhou2025.replays import RAMP, STEP, clairvoyant
 from testbed.scenario import Scenario
 from testbed.score import detection
+from testbed.score.claims import MEAN, RATIO_OF_RMS, RMS, SHARE, Claim, Floor
 from testbed.sensors.faults import FaultTruth
 
 SIDE_M = 230.0

@@ -19,9 +19,9 @@ from nav.detection import ChiSquare, Detector, Glr, Mean, Reset, Sprt, exponenti
 from nav.samples import Array
 from testbed.noise import stream
 from testbed.papers.bounds import TOLD, told_test
-from testbed.papers.claims import MEAN, NEARLY_ALL, RATIO_OF_MEANS, SHARE, Claim, Floor
 from testbed.papers.misprints import CountedEvidence, FadingMean, InclusiveEvidence
 from testbed.score import accuracy, detection
+from testbed.score.claims import MEAN, NEARLY_ALL, RATIO_OF_MEANS, SHARE, Claim, Floor
 
 P = 1e-3  # false alarms and missed ones, per sample
 STEP, GAP, RAMP = (40.0, 60.0), (60.0, 90.0), (90.0, 130.0)

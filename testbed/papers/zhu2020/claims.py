@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from testbed.papers.claims import EXACT, HARDLY_ANY, MEDIAN, NEARLY_ALL, SHARE, Claim
 from testbed.papers.zhu2020.flight import (
     AST,
     CASES,
@@ -25,6 +24,7 @@ from testbed.papers.zhu2020.flight import (
     Draw,
     Flown,
 )
+from testbed.score.claims import EXACT, HARDLY_ANY, MEDIAN, NEARLY_ALL, SHARE, Claim
 
 P_N, P_E, V_N, V_E, ROLL, PITCH, HEADING = 0, 1, 3, 4, 6, 7, 8  # columns of errors
 HORIZONTAL = (P_N, P_E)

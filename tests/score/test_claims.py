@@ -11,7 +11,8 @@ import pytest
 from scipy import stats
 
 from testbed.errors import UserError
-from testbed.papers.claims import (
+from testbed.papers.draws import LATITUDE_DEG, STRETCH, Draws, draws, world
+from testbed.score.claims import (
     EXACT,
     HARDLY_ANY,
     MEAN,
@@ -26,7 +27,6 @@ from testbed.papers.claims import (
     Verdict,
     quantile,
 )
-from testbed.papers.draws import LATITUDE_DEG, STRETCH, Draws, draws, world
 
 HUNDRED = np.random.default_rng(1).permutation(np.arange(1.0, 101.0))
 
