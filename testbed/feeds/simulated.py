@@ -13,8 +13,10 @@ from testbed.motion.ahead import Ahead
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.scenario import Scenario
+from testbed.sensors.delivery import Delivery
 from testbed.sensors.faults import Faults
 from testbed.sensors.gnss import Gnss
+from testbed.sensors.timing import AidingTiming
 
 
 def motion(scenario: Scenario, seed: int) -> MotionSource:
@@ -39,12 +41,15 @@ class Simulated:
         self.motion_s = 0.0
         self.inertial: dict[str, sensors.Imu] = {}
         self.aiding: dict[str, sensors.AidingSensor] = {}
+        self._deliveries: dict[str, Delivery] = {}
         for name, section in scenario.sensors.items():
             sensor = sensors.build(name, section, source.rate_hz, seed, scenario.site())
             if isinstance(sensor, sensors.Imu):
                 self.inertial[name] = sensor
             else:
                 self.aiding[name] = sensor
+                assert isinstance(section, AidingTiming)
+                self._deliveries[name] = Delivery(name, section, seed)
         self.receptions = {name: one.reception for name, one in self.aiding.items() if isinstance(one, Gnss)}
         self.origin: dict[str, str] = {}
         self.faults = Faults(scenario.fault, scenario.sensors, seed)
@@ -65,8 +70,12 @@ class Simulated:
         """What every sensor delivers over these rows: increments by IMU, samples by aiding sensor."""
         return (
             {name: self.faults.apply(name, sensor.sense(block)) for name, sensor in self.inertial.items()},
-            {name: self.faults.apply(name, sensor.sense(block)) for name, sensor in self.aiding.items()},
+            {name: self.faults.apply(name, self._delivered(name, block)) for name in self.aiding},
         )
+
+    def _delivered(self, name: str, block: TruthBlock) -> Sequence[Sample]:
+        """What comes through of one aiding sensor."""
+        return self._deliveries[name].of(self.aiding[name].sense(block))
 
     def activity(self) -> str:
         """What the motion is doing."""

@@ -34,6 +34,7 @@ from testbed.results import METRICS, RECORD, held, require_own, start_anew
 from testbed.scenario import Scenario
 from testbed.score import metrics
 from testbed.score.remarks import remarks
+from testbed.sensors.imu import ImuConfig
 
 if TYPE_CHECKING:
     import xarray
@@ -207,7 +208,9 @@ class _Passage:
 
     def _behind(self, lane: Lane) -> float:
         """Between a tick and what a filter has surely used by then [s]: an increment may not be complete yet."""
-        return lane.horizon.lag_s + 1 / self.scenario.sensors[lane.imu].rate_hz - 1 / self.rate_hz
+        imu = self.scenario.sensors[lane.imu]
+        assert isinstance(imu, ImuConfig)
+        return lane.horizon.lag_s + imu.longest_s - 1 / self.rate_hz
 
     def advance(self) -> bool:
         """One turn: what the feed gives, estimated, recorded and handed out. False when the motion has ended."""

@@ -45,6 +45,8 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     taken: set[str] = set()
     for index, estimator in enumerate(scenario.estimator):
         yield from _estimator_mistakes(("estimator", index), estimator, scenario.sensors, taken)
+        if not isinstance(scenario.truth, LogTruth):  # whose units are brought to common times
+            yield from _stamp_mistakes(("estimator", index, "spare_imus"), estimator, scenario.sensors)
         taken |= set(estimator.recorded)
     yield from _autopilot_mistakes(scenario)
     for key in scenario.expect:
@@ -161,6 +163,16 @@ def _estimator_mistakes(
         yield (*path, "name"), f"{section.name!r} is reserved: choose another name"
     for where, text in section.mistakes(sensors):
         yield (*path, *where), text
+
+
+def _stamp_mistakes(
+    path: KeyPath, section: EstimatorSection, sensors: Mapping[str, SensorConfig]
+) -> Iterator[tuple[KeyPath, str]]:
+    if not section.spare_imus:
+        return
+    for name in (section.imu, *section.spare_imus):
+        if getattr(sensors.get(name), "jitter_s", 0.0):
+            yield path, f"sensors.{name}.jitter_s: units that are voted on must be stamped together: set it to 0"
 
 
 def _autopilot_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:

@@ -19,6 +19,7 @@ from nav.samples import Array, ImuSamples
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.schema import Section
+from testbed.sensors.delivery import InertialDelivery, latest
 from testbed.sensors.grades import with_grade
 from testbed.sensors.imu_grades import GRADES
 from testbed.sensors.increments import accumulate, degrade
@@ -104,6 +105,13 @@ class ImuConfig(Section):
         "drawn", description="drawn from their sigma, or exactly as large as it, with only the signs drawn"
     )
 
+    jitter_s: float = Field(
+        0.0, ge=0, le=1, description="how late increments are stamped: half-normal, by less than a period"
+    )
+    dropout_percent: float = Field(
+        0.0, ge=0, le=50, description="of the increments that are lost: the last rates are read again for them"
+    )
+
     gyro_turn_on_degph: float = Field(0.0, ge=0, le=1e5, description="constant bias of a run")
     gyro_instability_degph: float = Field(
         0.0, ge=0, le=1e4, description="in-run bias instability: the floor of the Allan deviation"
@@ -175,6 +183,11 @@ class ImuConfig(Section):
     def _on_top_of_grade(cls, data: Any) -> Any:
         return with_grade(data, GRADES, "mems-consumer")
 
+    @property
+    def longest_s(self) -> float:
+        """The longest time between two increments [s]."""
+        return 1 / self.rate_hz + latest(self.jitter_s, 1 / self.rate_hz)
+
     def errors(self) -> ImuErrors:
         """The same in SI."""
         roll, pitch, heading = (float(a) * DEG for a in self.mounting_deg)
@@ -222,6 +235,7 @@ class Imu:
         self._every = ticks_per_sample(name, config.rate_hz, tick_rate_hz)
         self._dt = self._every / tick_rate_hz
         self._tick_s = 1 / tick_rate_hz
+        self._delivery = InertialDelivery(name, config.dropout_percent, config.jitter_s, self._dt, seed)
         self._draw_constants(config, seed)
         self._start_processes(seed)
         self._self_heating = (config.self_heating_k, config.self_heating_tau_s)
@@ -335,7 +349,8 @@ class Imu:
         )
         if n:
             self._bias = bias[-1]
-        return ImuSamples(t, np.full(n, self._dt), dtheta, dv)
+        measured = ImuSamples(t, np.full(n, self._dt), dtheta, dv)
+        return self._delivery.of(measured, float(truth.t[-1])) if len(truth) else measured
 
 
 def _axis_errors(scale: Array, misalignment: Array, skewness: Array) -> Array:

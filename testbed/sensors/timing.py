@@ -58,6 +58,10 @@ class AidingTiming(Section):
     rate_hz: float = Field(10.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
     offset_s: float = Field(0.0, ge=0, le=3600, description="time of the first sample, a whole number of ticks")
     latency_s: float = Field(0.0, ge=0, le=10, description="from the time of validity to the time of arrival")
+    jitter_s: float = Field(
+        0.0, ge=0, le=1, description="how late samples are stamped beyond that: half-normal, by less than a period"
+    )
+    dropout_percent: float = Field(0.0, ge=0, lt=100, description="of the samples that are lost, each by itself")
     fused_hz: float | None = Field(
         default=None,
         gt=0,
@@ -106,7 +110,6 @@ class InterruptedTiming(AidingTiming):
     """The timing keys of a sensor that is silent at times: then it delivers nothing."""
 
     denied: Windows = Field((), description="windows of simulated time without samples")
-    dropout_percent: float = Field(0.0, ge=0, lt=100, description="of the samples that are lost, each by itself")
 
 
 class Interruptions:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from worlds.loop import Watcher, same
+from worlds.recordings import log_of
 
 from nav.samples import FixType, GnssSample, Sample
 from testbed import RunResult, Scenario, results, run, sensors
@@ -358,3 +359,24 @@ def test_slow_imu_gives_the_same_bits_live_and_batch(imu_hz: int) -> None:
     scenario = Scenario.load("u_turn", ["duration_s=20", "sensors.gnss.denied=[]", f"sensors.imu.rate_hz={imu_hz}"])
     batch = run(scenario)
     assert same(batch.dataset, run(scenario, links=[Watcher()], realtime=1000.0).dataset)
+
+
+@pytest.mark.ci
+def test_late_stamps_and_losses_give_the_same_bits_live_batch_and_as_a_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rough = {
+        "imu": {"rate_hz": 50, "jitter_s": 0.008, "dropout_percent": 3.0},
+        "gnss": {"denied": [[12, 15]], "jitter_s": 0.02, "dropout_percent": 5.0},
+        **{key: {"jitter_s": 0.01, "dropout_percent": 5.0} for key in ("barometer", "magnetometer", "airspeed")},
+    }
+    changes = {f"sensors.{name}.{key}": value for name, keys in rough.items() for key, value in keys.items()}
+    scenario = Scenario.load("u_turn", {"duration_s": 20, **changes})
+    batch = run(scenario, out=tmp_path)
+    assert same(batch.dataset, run(scenario, links=[Watcher()], realtime=1000.0).dataset)
+    monkeypatch.setattr(loop, "BATCH_S", 0.065)
+    assert same(batch.dataset, run(scenario).dataset)
+    path = tmp_path / "again.toml"
+    path.write_text(log_of(scenario.text, tmp_path / "run.nc", 'aircraft = "loiter"'), "utf-8")
+    again = run(Scenario.load(path, {"duration_s": 20, **changes}))
+    assert same(batch.dataset["estimators"], again.dataset["estimators"])
