@@ -27,6 +27,7 @@ PLACEHOLDER = re.compile(r"^<!-- generated: ([a-z_]+) -->$", re.MULTILINE)
 UNITS = {  # by the end of a key, longer ones first
     "_mps_per_sqrt_s": "m/s/√s",
     "_mps_per_km": "m/s/km",
+    "_degphpg2": "deg/h/g²",
     "_degphprth": "deg/h/√h",
     "_mpsprth": "m/s/√h",
     "_degprth": "deg/√h",
@@ -34,6 +35,7 @@ UNITS = {  # by the end of a key, longer ones first
     "_degphpk": "deg/h/K",
     "_ut_per_a": "µT/A",
     "_mgprth": "mg/√h",
+    "_mgpg2": "mg/g²",
     "_percent": "%",
     "_arcsec": "arcsec",
     "_degps": "deg/s",

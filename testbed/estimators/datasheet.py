@@ -72,8 +72,8 @@ def imu_model(
     turn_rate = usual.turn_rate_radps if turn_rate is None else turn_rate
     load_change = usual.load_change_g * min(1.0, turn_rate / usual.turn_rate_radps) ** 2
     return ImuModel(
-        gyro_noise=beside.gyro_noise,
-        accel_noise=beside.accel_noise,
+        gyro_noise=math.hypot(beside.gyro_noise, beside.gyro_vibration),
+        accel_noise=math.hypot(beside.accel_noise, beside.accel_vibration),
         gyro_bias_sigma=math.hypot(
             beside.gyro_turn_on, beside.gyro_in_run, beside.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
         ),

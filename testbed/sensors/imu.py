@@ -1,7 +1,8 @@
 """Inertial measurement unit: true increments in, increments of a real unit out.
 
 Chain, tick by tick: lever arm -> engine vibration -> bandwidth -> mounting, misalignment, scale factor and its
-asymmetry, g-sensitivity -> summed over the output interval -> biases and noise -> range -> resolution.
+asymmetry, g-sensitivity -> summed over the output interval, or sampled at its end -> biases and noise -> range ->
+resolution -> stamps and losses.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ SECOND_HARMONIC = 0.5  # amplitude of the tone at two per rev over that at one p
 class ImuErrors:
     """The unit's datasheet in SI: what an estimator may be told. All sizes are 1 sigma per axis.
 
-    Random walks: ``gyro_noise`` [rad/sqrt(s)], ``accel_noise`` [m/s/sqrt(s)]. Biases: ``*_turn_on`` constant of a run,
-    ``*_in_run`` Gauss-Markov with correlation time ``*_in_run_tau`` [s], ``*_random_walk`` per sqrt(s), all
+    Random walks: ``gyro_noise`` [rad/sqrt(s)], ``accel_noise`` [m/s/sqrt(s)]; ``*_vibration`` what an engine adds to
+    them. Biases: ``*_turn_on`` constant of a run, ``*_in_run`` Gauss-Markov with correlation time ``*_in_run_tau`` [s],
+    ``*_random_walk`` per sqrt(s), all
     in rad/s and m/s^2. ``*_scale`` and ``*_scale_asymmetry`` [1], ``*_misalignment`` and ``*_nonorthogonality`` [rad],
     ``gyro_g_sensitivity`` [rad/s per m/s^2], ``*_temperature`` per kelvin. ``*_motion`` and ``vibration_share`` are
     what filters are told of noise that follows motion (`nav.error_model.ImuModel`). ``lever_arm_b`` (3,) [m] from the
@@ -62,6 +64,7 @@ class ImuErrors:
     """
 
     gyro_noise: float
+    gyro_vibration: float
     gyro_turn_on: float
     gyro_in_run: float
     gyro_in_run_tau: float
@@ -73,6 +76,7 @@ class ImuErrors:
     gyro_g_sensitivity: float
     gyro_temperature: float
     accel_noise: float
+    accel_vibration: float
     accel_turn_on: float
     accel_in_run: float
     accel_in_run_tau: float
@@ -93,7 +97,8 @@ class ImuConfig(Section):
     """Keys of an inertial unit. ``grade`` sets all the others; each may be given to override the datasheet.
 
     Errors are 1 sigma per axis. Units end the names: degph deg/h, degprth deg/sqrt(h), degphprth deg/h/sqrt(h),
-    mpsprth m/s/sqrt(h), mgprth mg/sqrt(h), degphpk deg/h/K, degphpg deg/h/g.
+    mpsprth m/s/sqrt(h), mgprth mg/sqrt(h), degphpk deg/h/K, degphpg deg/h/g,
+    degphpg2 deg/h/g^2, mgpg2 mg/g^2.
     """
 
     kind: Literal["imu"] = Field(default="imu", description="what the sensor is; the table's name where it is left out")
@@ -105,6 +110,9 @@ class ImuConfig(Section):
         "drawn", description="drawn from their sigma, or exactly as large as it, with only the signs drawn"
     )
 
+    output: Literal["integrated", "sampled"] = Field(
+        "integrated", description="sums over the interval, or its last value, in which faster vibration folds down"
+    )
     jitter_s: float = Field(
         0.0, ge=0, le=1, description="how late increments are stamped: half-normal, by less than a period"
     )
@@ -159,6 +167,16 @@ class ImuConfig(Section):
     vibration_degps: float = Field(
         0.0, ge=0, le=1e4, description="engine vibration of the rate: amplitude at one per rev and 6000 rpm"
     )
+    gyro_vibration_degprth: float = Field(
+        0.0, ge=0, le=1e3, description="white noise of the rate that the engine adds, at 6000 rpm; told to filters"
+    )
+    accel_vibration_mpsprth: float = Field(
+        0.0, ge=0, le=1e3, description="the same of the specific force; both grow with the square of the engine speed"
+    )
+    gyro_rectification_degphpg2: float = Field(
+        0.0, ge=0, le=1e6, description="bias that vibration makes, per mean square of its specific force"
+    )
+    accel_rectification_mgpg2: float = Field(0.0, ge=0, le=1e6, description="the same of the specific force")
     gyro_motion_percent: float = Field(
         0.0, ge=0, le=100, description="told to filters: of the rate, what goes wrong in each second of a manoeuvre"
     )
@@ -193,6 +211,7 @@ class ImuConfig(Section):
         roll, pitch, heading = (float(a) * DEG for a in self.mounting_deg)
         return ImuErrors(
             gyro_noise=self.angle_random_walk_degprth * DEG_PER_ROOT_H,
+            gyro_vibration=self.gyro_vibration_degprth * DEG_PER_ROOT_H,
             gyro_turn_on=self.gyro_turn_on_degph * DEG_PER_H,
             gyro_in_run=self.gyro_instability_degph * DEG_PER_H / ALLAN_PEAK,
             gyro_in_run_tau=self.gyro_instability_tau_s,
@@ -204,6 +223,7 @@ class ImuConfig(Section):
             gyro_g_sensitivity=self.gyro_g_sensitivity_degphpg * DEG_PER_H / G,
             gyro_temperature=self.gyro_temperature_degphpk * DEG_PER_H,
             accel_noise=self.velocity_random_walk_mpsprth * MPS_PER_ROOT_H,
+            accel_vibration=self.accel_vibration_mpsprth * MPS_PER_ROOT_H,
             accel_turn_on=self.accel_turn_on_mg * MG,
             accel_in_run=self.accel_instability_mg * MG / ALLAN_PEAK,
             accel_in_run_tau=self.accel_instability_tau_s,
@@ -240,9 +260,10 @@ class Imu:
         self._start_processes(seed)
         self._self_heating = (config.self_heating_k, config.self_heating_tau_s)
         self._temperature_at_start = math.nan
-        self._filter = np.stack(
-            [_low_pass(config.gyro_bandwidth_hz, self._tick_s), _low_pass(config.accel_bandwidth_hz, self._tick_s)]
-        )
+        bandwidths = (config.gyro_bandwidth_hz, config.accel_bandwidth_hz)
+        self._filter = np.stack([_low_pass(bandwidth, self._tick_s) for bandwidth in bandwidths])
+        self._bandwidth = np.array([bandwidth or np.inf for bandwidth in bandwidths])
+        self._sampled = config.output == "sampled"
         self._limit = np.repeat([(config.gyro_range_degps or np.inf) * DEG, (config.accel_range_g or np.inf) * G], 3)
         self._resolution = np.repeat([config.gyro_resolution_degps * DEG, config.accel_resolution_mg * MG], 3)
         # Carried from tick to tick: filter states, sum of the running interval, last rate and engine phase.
@@ -276,6 +297,13 @@ class Imu:
         phase = stream(seed, self.name, "vibration").uniform(0, 2 * math.pi, (2, 6))
         harmonics = amplitude * np.array([[1.0], [SECOND_HARMONIC]])
         self._vibration = np.stack([harmonics * np.cos(phase), harmonics * np.sin(phase)], axis=-1)
+        square = (
+            0.5 * np.sum(harmonics[:, 3:] ** 2, axis=0) / G**2
+        )  # of each axis, per fourth power of the engine speed
+        per_square = np.repeat(
+            [config.gyro_rectification_degphpg2 * DEG_PER_H, config.accel_rectification_mgpg2 * MG], 3
+        )
+        self._rectified = draw("rectification", 6) * per_square * np.concatenate([np.repeat(square.sum(), 3), square])
 
     def _start_processes(self, seed: int) -> None:
         def per_axis(gyro: float, accel: float) -> Array:
@@ -285,6 +313,8 @@ class Imu:
         self._white = Process.white(
             stream(seed, self.name, "white"), per_axis(e.gyro_noise, e.accel_noise) / math.sqrt(dt)
         )
+        shaken = per_axis(e.gyro_vibration, e.accel_vibration) / math.sqrt(dt)
+        self._shaken = Process.white(stream(seed, self.name, "vibration noise"), shaken) if shaken.any() else None
         self._in_run = Process.gauss_markov(
             stream(seed, self.name, "in-run"),
             per_axis(e.gyro_in_run, e.accel_in_run),
@@ -319,7 +349,10 @@ class Imu:
             truth.engine_rpm,
             self.errors.lever_arm_b,
             self._vibration,
+            self._rectified,
             self._filter,
+            self._bandwidth,
+            self._sampled,
             self._sensitivity,
             self._g_sensitivity,
             self._asymmetry,
@@ -330,6 +363,9 @@ class Imu:
         )
         bias = self._in_run.take(n)
         bias += self._walk.take(n)
+        white = self._white.take(n)
+        if self._shaken is not None:
+            white += self._shaken.take(n) * (truth.engine_rpm[start :: self._every, None] / VIBRATION_RPM) ** 2
         warmer = truth.temperature[start :: self._every] - self._temperature_at_start
         dtheta, dv = np.empty((n, 3)), np.empty((n, 3))
         degrade(
@@ -341,7 +377,7 @@ class Imu:
             self._temperature_slope,
             warmer,
             *self._self_heating,
-            self._white.take(n),
+            white,
             self._limit,
             self._resolution,
             dtheta,

@@ -144,20 +144,33 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_bandwidth_hz": 145.0,
     },
     # As flown in hobby autopilots: a part of the kind of the InvenSense MPU-6000 (PS-MPU-6000A Rev. 3.4: 0.005
-    # deg/s/sqrt(Hz), zero offset +-20 deg/s and +-50 to 80 mg, scale +-3 %, cross axis +-2 %, 0.1 deg/s/g), its gyros
-    # zeroed at power-up and otherwise not calibrated, on a vibrating airframe. Measured on recorded flights of such:
-    # 430 to 4300 deg/h of gyro bias, scale and alignment of 1 % and 1 deg; white noise is what vibration makes of it,
-    # some ten times the data sheet's. Where they fly briskly, 1 % of the rate and of the force less gravity goes wrong
-    # each second; what vibrates more than usual shows it in its increments.
+    # deg/s/sqrt(Hz), 400 ug/sqrt(Hz), zero offset +-20 deg/s and +-50 to 80 mg, scale +-3 %, cross axis +-2 %, 0.1
+    # deg/s/g), its gyros zeroed at power-up and otherwise not calibrated, on a vibrating airframe. Measured on recorded
+    # flights of such: 430 to 4300 deg/h of gyro bias, scale and alignment of 1 % and 1 deg. At rest white noise is the
+    # data sheet's (0.24 to 0.29 deg/sqrt(h), 0.11 m/s/sqrt(h)); in flight vibration makes ten times that of it, and
+    # what an unfiltered sampling folds down has lines of 0.15 m/s^2 and up to 3 deg/s and leaves 0.2 to 0.4 m/s^2
+    # per axis between 8 and 25 Hz, as 200 mg do here. Where they fly briskly, 1 % of the rate and of the force less
+    # gravity goes wrong each second; what vibrates more than usual shows it in its increments. Steps between stamps
+    # deviate by 0.7 to 1.9 ms. Rectification of the accelerometers: Analog Devices ADXL355 data sheet, 0.4 g at 2.5 g
+    # rms; of the gyros, and losses: assumed.
     "mems-hobby": {
         **INSTALLATION,
+        "output": "sampled",
+        "jitter_s": 0.002,
+        "dropout_percent": 0.5,
+        "vibration_mg": 200.0,
+        "vibration_degps": 2.0,
+        "gyro_vibration_degprth": 1.98,
+        "accel_vibration_mpsprth": 2.99,
+        "gyro_rectification_degphpg2": 100.0,
+        "accel_rectification_mgpg2": 64.0,
         "gyro_motion_percent": 1.0,
         "accel_motion_percent": 1.0,
         "vibration_percent": 50.0,
         "gyro_turn_on_degph": 2000.0,
         "gyro_instability_degph": 30.0,
         "gyro_instability_tau_s": 200.0,
-        "angle_random_walk_degprth": 2.0,
+        "angle_random_walk_degprth": 0.3,
         "gyro_rate_random_walk_degphprth": 20.0,
         "gyro_scale_ppm": 10_000.0,
         "gyro_scale_asymmetry_ppm": 1000.0,
@@ -171,7 +184,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "accel_turn_on_mg": 50.0,
         "accel_instability_mg": 1.0,
         "accel_instability_tau_s": 200.0,
-        "velocity_random_walk_mpsprth": 3.0,
+        "velocity_random_walk_mpsprth": 0.24,
         "accel_random_walk_mgprth": 5.0,
         "accel_scale_ppm": 10_000.0,
         "accel_scale_asymmetry_ppm": 1000.0,

@@ -53,7 +53,10 @@ def accumulate(
     engine_rpm: Array,
     lever: Array,
     vibration: Array,
+    rectified: Array,
     low_pass: Array,
+    bandwidth: Array,
+    sampled: bool,
     sensitivity: Array,
     g_sensitivity: Array,
     asymmetry: Array,
@@ -62,8 +65,11 @@ def accumulate(
     last: Array,
     out: Array,
 ) -> None:
-    """Deterministic part of the chain: sums of sensed increments per output interval into ``out`` (n, 6).
+    """Deterministic part of the chain: sensed increments of each output interval into ``out`` (n, 6).
 
+    They are sums, or, ``sampled``, the filters' output at the end of the interval held over all of it: then vibration
+    has the phase of that moment and the size that filters of this ``bandwidth`` (2,) [Hz] leave of it, and folds.
+    ``rectified`` (6,) is the bias that vibration makes, per fourth power of the engine speed.
     ``state`` (6, 2) of the filters, ``total`` (6,) of the running interval and ``last`` (4,), rate and engine phase at
     the last tick, are carried from call to call.
     """
@@ -74,6 +80,8 @@ def accumulate(
             has_vibration = True
     x = np.empty(6)
     y = np.empty(6)
+    tone = np.zeros(6)
+    drift = np.zeros(6)
     j = 0
     for k in range(dtheta.shape[0]):
         if tick + k == 0:
@@ -98,10 +106,15 @@ def accumulate(
             one = size * half / (0.5 * turn)
             two = size * (2.0 * half * math.cos(0.5 * turn)) / turn
             c2, s2 = c1 * c1 - s1 * s1, 2.0 * c1 * s1
-            for i in range(6):
-                x[i] += one * (vibration[0, i, 0] * c1 - vibration[0, i, 1] * s1)
-                x[i] += two * (vibration[1, i, 0] * c2 - vibration[1, i, 1] * s2)
+            if not sampled:
+                for i in range(6):
+                    x[i] += one * (vibration[0, i, 0] * c1 - vibration[0, i, 1] * s1)
+                    x[i] += two * (vibration[1, i, 0] * c2 - vibration[1, i, 1] * s2)
             last[3] = (last[3] + turn) % (2.0 * math.pi)
+            for i in range(6):
+                drift[i] = rectified[i] * engine_rpm[k] ** 4 * tick_s
+        else:
+            drift[:] = 0.0
         for i in range(6):
             m = low_pass[i // 3]
             if tick + k == 1:
@@ -110,17 +123,39 @@ def accumulate(
             a = m[0, 0] * state[i, 0] + m[0, 1] * state[i, 1] + m[0, 2] * x[i]
             state[i, 1] = m[1, 0] * state[i, 0] + m[1, 1] * state[i, 1] + m[1, 2] * x[i]
             state[i, 0] = a
+        due = (tick + k) % every == 0
+        if sampled:
+            if not due:
+                continue
+            if has_vibration:
+                _tones(engine_rpm[k], last[3], vibration, bandwidth, tone)
+            for i in range(6):
+                filtered = state[i, 0] if math.isfinite(bandwidth[i // 3]) else x[i]
+                y[i] = every * (filtered + tone[i] * tick_s)
         for i in range(3):
             w = sensitivity[0, i, 0] * y[0] + sensitivity[0, i, 1] * y[1] + sensitivity[0, i, 2] * y[2]
             f = sensitivity[1, i, 0] * y[3] + sensitivity[1, i, 1] * y[4] + sensitivity[1, i, 2] * y[5]
             g = g_sensitivity[i, 0] * y[3] + g_sensitivity[i, 1] * y[4] + g_sensitivity[i, 2] * y[5]
             total[i] += w + asymmetry[i] * abs(w) + g
             total[3 + i] += f + asymmetry[3 + i] * abs(f)
-        if (tick + k) % every == 0:
+        if due:
             for i in range(6):
-                out[j, i] = total[i]
+                out[j, i] = total[i] + (every * drift[i] if drift[i] != 0.0 else 0.0)
                 total[i] = 0.0
             j += 1
+
+
+@njit
+def _tones(rpm: float, phase: float, vibration: Array, bandwidth: Array, out: Array) -> None:
+    """Vibration at one and two per rev behind a second-order Butterworth filter, at this moment [rad/s, m/s^2]."""
+    for i in range(6):
+        out[i] = 0.0
+        for harmonic in range(2):
+            angle = (harmonic + 1) * phase
+            share = (harmonic + 1) * rpm / 60.0 / bandwidth[i // 3]
+            gain = rpm * rpm / math.sqrt(1.0 + share**4)
+            real, imaginary = vibration[harmonic, i, 0], vibration[harmonic, i, 1]
+            out[i] += gain * (real * math.cos(angle) - imaginary * math.sin(angle))
 
 
 @njit
