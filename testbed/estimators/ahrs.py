@@ -16,7 +16,7 @@ from nav.earth import STANDARD_GRAVITY
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
 from nav.samples import Array
-from testbed.estimators.datasheet import SOFT_IRON_SHARE, imu_model
+from testbed.estimators.datasheet import CRUISE_THROTTLE, SOFT_IRON_SHARE, imu_model
 from testbed.estimators.lane import Commanded, Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import (
@@ -185,7 +185,8 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
     magnetometer = aids.get("magnetometer")
     if isinstance(magnetometer, MagnetometerConfig):
         m = magnetometer.errors()
-        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, m.current * rig.usual.current_a)
+        stray = math.hypot(m.current * rig.usual.current_a, m.throttle * CRUISE_THROTTLE)
+        iron = math.hypot(SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE, m.hard_iron, stray)
         turn_s = IRON_TURN_S * (UNKNOWN_BODY.turn_rate_radps / rig.usual.turn_rate_radps)
         lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * turn_s * magnetometer.rate_hz)
         field_n = _field_n(rig)

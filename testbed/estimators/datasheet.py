@@ -47,6 +47,7 @@ METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither, where it is not a state
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
+CRUISE_THROTTLE = 0.5  # of full throttle
 SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
 
 
@@ -136,7 +137,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             return BarometerAid(name, sigma=b.noise * METRES_PER_PASCAL, bias_walk=walk)
         case MagnetometerConfig():
             m = section.errors()
-            bias = math.hypot(m.hard_iron, m.current * usual.current_a)
+            bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
             if not m.doubt:
                 return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
             iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE

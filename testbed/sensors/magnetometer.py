@@ -36,7 +36,8 @@ GRADES: dict[str, dict[str, Any]] = {
         "current_ut_per_a": 0.05,
         "range_ut": 2000.0,
     },
-    # Beside motor and wiring, hardly calibrated: residuals of 17 to 24 mG and scales off by 5 % on recorded flights.
+    # Beside motor and wiring, hardly calibrated: residuals of 17 to 24 mG, scales off by 5 % on recorded flights, and
+    # 0.04 to 0.15 uT/A of the motor's current on two (12 A in cruise: 1 to 2 uT, 3 uT or so at full throttle).
     "hobby": {
         "noise_ut": 1.0,
         "hard_iron_ut": 6.0,
@@ -137,13 +138,15 @@ def _interpolate(corners: Array, x: float, y: float, z: float) -> Array:
 @dataclass(frozen=True, slots=True)
 class MagnetometerErrors:
     """The sensor's datasheet in SI, 1 sigma per axis: ``noise``, ``hard_iron`` [T], ``soft_iron`` [1],
-    ``current`` [T/A], ``latency`` [s]; ``doubt`` [1] as `nav.aids.MagnetometerAid` has it.
+    ``current`` [T/A], ``throttle`` [T] at full throttle, ``latency`` [s]; ``doubt`` [1] as `nav.aids.MagnetometerAid`
+    has it.
     """
 
     noise: float
     hard_iron: float
     soft_iron: float
     current: float
+    throttle: float
     latency: float
     doubt: float
 
@@ -166,6 +169,9 @@ class MagnetometerConfig(AidingTiming):
     current_ut_per_a: float = Field(
         0.0, ge=0, le=100, description="stray field of the wiring per axis and ampere of the aircraft's current"
     )
+    throttle_ut: float = Field(
+        0.0, ge=0, le=1000, description="stray field per axis of what feeds a motor at full throttle; told to filters"
+    )
     doubt_percent: float = Field(
         0.0, ge=0, le=1000, description="told to filters: doubt of each axis, of what the field's length is off by"
     )
@@ -183,13 +189,16 @@ class MagnetometerConfig(AidingTiming):
             hard_iron=self.hard_iron_ut * MICROTESLA,
             soft_iron=self.soft_iron_percent * PERCENT,
             current=self.current_ut_per_a * MICROTESLA,
+            throttle=self.throttle_ut * MICROTESLA,
             latency=self.latency_s,
             doubt=self.doubt_percent * PERCENT,
         )
 
 
 class Magnetometer:
-    """One magnetometer on one run: measured = (I + soft iron) C_bn field_n + hard iron + wiring * current + noise."""
+    """One magnetometer on one run: measured = (I + soft iron) C_bn field_n + hard iron + wiring * current
+    + motor * throttle + noise, throttle from 0 to 1.
+    """
 
     def __init__(self, name: str, config: MagnetometerConfig, tick_rate_hz: float, seed: int, site: Site) -> None:
         self.name = name
@@ -201,6 +210,7 @@ class Magnetometer:
         self._hard_iron = stream(seed, name, "hard iron").standard_normal(3) * e.hard_iron
         self._iron = np.eye(3) + stream(seed, name, "soft iron").standard_normal((3, 3)) * e.soft_iron
         self._wiring = stream(seed, name, "wiring").standard_normal(3) * e.current
+        self._motor = stream(seed, name, "motor").standard_normal(3) * e.throttle
         self._white = Process.white(stream(seed, name, "white"), np.full(3, e.noise))
         self._limit = (config.range_ut or math.inf) * MICROTESLA
 
@@ -214,6 +224,8 @@ class Magnetometer:
         for i, k in enumerate(rows):
             fields[i] = self._map.field_n(truth.lat[k], truth.lon[k], truth.h[k])
         measured = self._white.take(n)
+        if self._motor.any():
+            measured += truth.controls[rows.start :: rows.step, 3, None] * self._motor
         _measure(
             rows.start,
             rows.step,

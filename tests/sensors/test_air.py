@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 from worlds.sensor_truth import RATE_HZ, lively, still
 
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
@@ -64,6 +65,44 @@ def test_airspeed_errors():
         errors = np.array([speeds(config, start, seed)[0] - 25.0 for seed in range(3000)])
         assert errors.std() == pytest.approx(sigma, rel=0.05)
         assert config.errors().bias + 25.0 * config.errors().scale == pytest.approx(sigma)
+
+
+@pytest.mark.parametrize("beta_deg", [0.0, 10.0, -20.0])
+def test_static_pressure_is_off_with_dynamic_pressure_and_sideslip(beta_deg):
+    slow, fast = flying(1), flying(1)
+    fast.airspeed[:] = 50.0
+    for one in (slow, fast):
+        one.beta[:] = np.radians(beta_deg)
+    config = BarometerConfig(grade="perfect", dynamic_percent=15.0, sideslip_percent=10.0)
+    q = 0.5 * 1.225 * 25.0**2
+    ratio = np.sin(np.radians(beta_deg)) ** 2 / np.sin(np.radians(10)) ** 2
+    errors = []
+    for seed in range(600):
+        off = [pressures(config, one, seed)[0] - 101_325 for one in (slow, fast)]
+        assert off[1] == pytest.approx(4 * off[0])
+        errors.append(off[0] / q)
+    assert stats.kstest(errors, stats.norm(scale=np.hypot(0.15, 0.10 * ratio)).cdf).pvalue > 1e-3
+
+
+def test_sideslip_is_an_error_of_airspeed():
+    slipping = flying(1)
+    slipping.beta[:] = np.radians(10)
+    along = 0.5 * 1.225 * (25.0 * np.cos(np.radians(10))) ** 2
+    config = AirspeedConfig(grade="perfect", sideslip_percent=10.0)
+    off = [0.5 * 1.225 * speeds(config, slipping, seed)[0] ** 2 - along for seed in range(600)]
+    assert stats.kstest(np.array(off) / (0.5 * 1.225 * 25.0**2), stats.norm(scale=0.1).cdf).pvalue > 1e-3
+    assert speeds(config, flying(1))[0] == pytest.approx(25.0)
+
+
+def test_the_tube_of_a_standing_vehicle_is_blown_into():
+    config = AirspeedConfig(grade="perfect", rate_hz=10.0, blown_pa=15.0)
+    standing = still(40_000, 10.0)
+    blown = 0.5 * 1.225 * speeds(config, standing, rate_hz=10.0) ** 2
+    apart = blown[::100]  # three correlation times
+    assert stats.kstest(apart, stats.halfnorm(scale=15.0).cdf).pvalue > 1e-3
+    sound = AirspeedConfig(grade="perfect", rate_hz=10.0)
+    flown = flying(1000, 10.0)
+    np.testing.assert_array_equal(speeds(config, flown, rate_hz=10.0), speeds(sound, flown, rate_hz=10.0))
 
 
 def test_no_negative_airspeed_and_no_nan_on_the_ground():

@@ -4,6 +4,7 @@ import datetime
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 from worlds.sensor_truth import RATE_HZ, lively, still
 
@@ -101,6 +102,17 @@ def test_current_disturbs_in_proportion():
     one, three = sense(config, quiet)[0] - nothing, sense(config, loud)[0] - nothing
     assert np.all(one != 0)
     np.testing.assert_allclose(three, 3 * one, rtol=1e-6)
+
+
+def test_throttle_disturbs_in_proportion():
+    idle, half, full = still(2), still(2), still(2)
+    half.controls[:, 3], full.controls[:, 3] = 0.5, 1.0
+    stray = []
+    for seed in range(400):
+        at = [sense(MagnetometerConfig(grade="perfect", throttle_ut=3.0), one, seed)[0] for one in (idle, half, full)]
+        np.testing.assert_allclose(at[2] - at[0], 2 * (at[1] - at[0]), rtol=1e-6)
+        stray.append(at[2] - at[0])
+    assert stats.kstest(np.ravel(stray) / 3e-6, "norm").pvalue > 1e-3
 
 
 def test_range():
