@@ -22,6 +22,7 @@ if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is th
 import typer
 
 from testbed.commands.compare import compare, view
+from testbed.commands.denied import denied
 from testbed.commands.export import export
 from testbed.commands.log import log
 from testbed.commands.run import run
@@ -272,6 +273,9 @@ def papers(
         print(printable(str(saved.save(out))))
     if any(claim.verdict is Verdict.MISSED for own in claims.values() for claim in own if claim.paper):
         raise typer.Exit(EXIT_FAILED)
+
+
+app.command()(denied)
 
 
 @app.command()

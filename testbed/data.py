@@ -21,6 +21,14 @@ def data_dir(name: str) -> Path:
     raise UserError(f"{package / name}: the folder of shipped {name} is missing: install the package again")
 
 
+def docs_dir() -> Path:
+    """The manual's folder. Raises UserError where there is none: it is not installed."""
+    folder = data_dir("scenarios").parent / "docs"
+    if not folder.is_dir():
+        raise UserError(f"{folder}: is missing: --save is for a checkout of the testbed")
+    return folder
+
+
 def make_project(folder: Path) -> list[Path]:
     """Copy the template of a user's own project into a new or empty folder; the files made.
 

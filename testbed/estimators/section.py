@@ -42,7 +42,7 @@ WindWalk: TypeAlias = Annotated[
         ge=0,
         le=1,
         description="random walk of the mean wind that the filter expects; none: that of the scenario's wind,"
-        " 0.015 m/s/√s where none is asked for",
+        " 0.015 m/s/√s where that says nothing",
     ),
 ]
 Slip: TypeAlias = Annotated[

@@ -100,7 +100,11 @@ class Wind(Section):
         " and `time_s` where it changes",
     )
     walk_mps_per_sqrt_s: float = Field(
-        default=0.0, ge=0, le=1, description="random walk of the mean wind, north and east alike; PX4 assumes 0.05"
+        default=0.0,
+        ge=0,
+        le=1,
+        description="random walk of the mean wind, north and east alike; PX4 assumes 0.05;"
+        " a 0 that is written down tells filters that it keeps still",
     )
     gauss_markov: GaussMarkov | None = Field(default=None, description="mean wind that wanders and comes back")
     front: Front | None = Field(default=None, description="another wind that comes to stay")

@@ -96,7 +96,7 @@ class Weather:
 
 
 def expected_walk(truth: Section) -> float:
-    """How fast the mean wind of a motion wanders [m/s/sqrt(s)]; `UNKNOWN_WALK` where nothing says that it does.
+    """How fast the mean wind of a motion wanders [m/s/sqrt(s)]; `UNKNOWN_WALK` where nothing is said of it.
 
     Over times short beside its correlation time, a Gauss-Markov part walks by sigma sqrt(2 / tau).
     """
@@ -105,7 +105,8 @@ def expected_walk(truth: Section) -> float:
     wind = truth.wind
     back = wind.gauss_markov
     wanders = back.sigma_mps * math.sqrt(2 / back.correlation_s) if back else 0.0
-    return math.hypot(wind.walk_mps_per_sqrt_s, wanders) or UNKNOWN_WALK
+    said = "walk_mps_per_sqrt_s" in wind.model_fields_set  # of a wind that keeps still, too
+    return math.hypot(wind.walk_mps_per_sqrt_s, wanders) or (0.0 if said else UNKNOWN_WALK)
 
 
 def strongest(wind: Wind) -> float:

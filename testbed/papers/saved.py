@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
-from testbed.data import data_dir, write_file
+from testbed.data import data_dir, docs_dir, write_file
 from testbed.errors import UserError
 from testbed.papers import COLUMNS, RESULTS, Records, counted, find, parted, row, stored
 from testbed.papers.draws import Draws
@@ -16,8 +16,7 @@ TABLE = "papers-table.md"
 
 def require_checkout() -> None:
     """Raises UserError when there is no documentation to write to."""
-    if not _docs().is_dir():
-        raise UserError(f"{_docs()}: is missing: --save is for a checkout of the testbed")
+    docs_dir()
 
 
 def save(folder: Path) -> Path:
@@ -33,7 +32,7 @@ def save(folder: Path) -> Path:
             f"{folder / RESULTS}: {', '.join(missing)} not judged yet: testbed papers {' '.join(missing)} --draw"
             f" {draws.number} --runs {draws.runs} --save"
         )
-    path = _docs() / TABLE
+    path = docs_dir() / TABLE
     write_file(path, page({paper.title: found[name] for name, paper in papers.items()}, draws).encode())
     for paper in papers.values():
         for figure in paper.figures:
@@ -59,7 +58,3 @@ def page(found: Mapping[str, Records], draws: Draws) -> str:
 
 def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-
-def _docs() -> Path:
-    return data_dir("scenarios").parent / "docs"

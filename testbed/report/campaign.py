@@ -27,6 +27,7 @@ from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
 from testbed.report.page import Shown, png, render
 from testbed.results import REPORT, write_result
 from testbed.score.accuracy import AXES
+from testbed.score.claims import student
 from testbed.score.metrics import OUTAGE_MARKS_S
 
 if TYPE_CHECKING:
@@ -207,13 +208,9 @@ def _efficiencies(combination: int, estimator: str, outcomes: Sequence[Outcome])
 
 def _mean(values: Array) -> tuple[float, float, float]:
     """The mean of some values, and the ends of its interval."""
-    from scipy.special import stdtrit  # as scipy.stats, which takes half a second to import
-
-    mean, n = float(values.mean()), len(values)
-    if n < 2:
-        return mean, math.nan, math.nan
-    half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1)) / math.sqrt(n)
-    return mean, mean - half, mean + half
+    if len(values) < 2:
+        return float(values.mean()), math.nan, math.nan
+    return student(values)
 
 
 def _quantile(values: Sequence[float], p: float) -> tuple[float, float, float]:

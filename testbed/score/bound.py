@@ -96,20 +96,22 @@ def of_run(dataset: xarray.DataTree, step_s: float = STEP_S) -> dict[str, Bound]
     found: dict[str, Bound] = {}
     same: dict[tuple[str, ...], Bound | None] = {}
     for section in scenario.estimator:
-        aids = section.aiding(scenario.sensors)
-        receivers = [aid for aid in aids if isinstance(scenario.sensors[aid], GnssConfig)]
-        told_more = section.spare_imus or getattr(section, "nonholonomic_mps", None) is not None
-        if section.name not in accuracy.names(dataset) or section.attitude_only or not receivers or told_more:
+        if section.name not in accuracy.names(dataset) or _none_for(section, scenario):
             continue
-        key = (section.imu, *sorted(aids), str(getattr(section, "handover", None)))
+        key = (section.imu, *sorted(section.aiding(scenario.sensors)), str(getattr(section, "handover", None)))
         if key not in same:
-            same[key] = _bound(dataset, scenario, section, step_s)
+            same[key] = of_estimator(dataset, scenario, section, step_s)
         if (bound := same[key]) is not None:
             found[section.name] = bound
     return found
 
 
-def _bound(dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSection, step_s: float) -> Bound | None:
+def of_estimator(
+    dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSection, step_s: float = STEP_S
+) -> Bound | None:
+    """The bound of one estimator of a simulated ``scenario``, if it has one; of the record, truth and samples count."""
+    if _none_for(section, scenario):
+        return None
     errors = scenario.rig(scenario.seed).imu(section.imu).errors()
     model = Model(way(dataset, errors.C_sb, step_s))
     add_imu(model, errors)
@@ -125,6 +127,13 @@ def _bound(dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSecti
     variance = np.array([P.diagonal()[:MOTION].copy() for P in covariances(start, steps(model))])
     sigma = np.sqrt(np.maximum(variance, 0.0))
     return Bound(model.way.t, sigma[:, POS], sigma[:, VEL], sigma[:, PHI])
+
+
+def _none_for(section: EstimatorSection, scenario: Scenario) -> bool:
+    """Whether an estimator has no bound, whatever its sensors are."""
+    receivers = [aid for aid in section.aiding(scenario.sensors) if isinstance(scenario.sensors[aid], GnssConfig)]
+    told_more = section.spare_imus or getattr(section, "nonholonomic_mps", None) is not None
+    return bool(section.attitude_only or not receivers or told_more)
 
 
 def _start(handover: Handover | None) -> Array:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,15 +64,22 @@ def quantile(p: float) -> Statistic:
     """
 
     def of(values: Array) -> Interval:
-        from scipy.stats import quantile_test  # takes half a second to import
-
-        ranks: Any = quantile_test(np.arange(len(values)), p=p).confidence_interval(CONFIDENCE)
+        first, last = _ranks(len(values), p)
         ordered = np.sort(values)
-        low = -math.inf if math.isnan(ranks.low) else float(ordered[int(ranks.low)])
-        high = math.inf if math.isnan(ranks.high) else float(ordered[int(ranks.high)])
+        low = -math.inf if first is None else float(ordered[first])
+        high = math.inf if last is None else float(ordered[last])
         return Interval(float(np.quantile(values, p, method="inverted_cdf")), low, high)
 
     return Statistic("median" if p == 0.5 else f"{100 * p:g} %", of)
+
+
+@cache
+def _ranks(n: int, p: float) -> tuple[int | None, int | None]:
+    """Of which of ``n`` values in their order the interval of a quantile is made, None where they are too few."""
+    from scipy.stats import quantile_test  # takes half a second to import
+
+    found: Any = quantile_test(np.arange(n), p=p).confidence_interval(CONFIDENCE)
+    return None if math.isnan(found.low) else int(found.low), None if math.isnan(found.high) else int(found.high)
 
 
 def bootstrapped(name: str, function: Callable[[Array], float]) -> Statistic:
@@ -126,12 +133,32 @@ def _ratio_of_rms(values: Array) -> float:
     return float(np.sqrt(square[0] / square[1]))
 
 
+def student(values: Array) -> Interval:
+    """The mean of some values, with the ends of Student's interval: infinite ones where there is one value only."""
+    from scipy.special import stdtrit  # as scipy.stats, which takes half a second to import
+
+    mean, n = float(values.mean()), len(values)
+    if not math.isfinite(mean):
+        return Interval(mean, mean, mean)
+    if n < 2:
+        return Interval(mean, -math.inf, math.inf)
+    half = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2) * values.std(ddof=1)) / math.sqrt(n)
+    return Interval(mean, mean - half, mean + half)
+
+
+def _rms_over_bound(values: Array) -> Interval:
+    """Of (draws, 2), errors and their bounds: the ratio of root mean squares, by Student's interval of the squares."""
+    error, bound = (values**2).T
+    return Interval(*(math.sqrt(max(end, 0.0)) for end in student(error / bound.mean())))
+
+
 MEDIAN = quantile(0.5)
 NEARLY_ALL, HARDLY_ANY = quantile(0.95), quantile(0.05)  # what is said of "any" draw: 100 draws can show no more
 MEAN = bootstrapped("mean", lambda values: float(np.mean(values)))
 RMS = bootstrapped("RMS", lambda values: float(np.sqrt(np.mean(values**2))))
 RATIO_OF_RMS = bootstrapped("ratio of RMS", _ratio_of_rms)  # of (draws, 2): the first over the second
 RATIO_OF_MEANS = bootstrapped("ratio of means", _ratio_of_means)  # likewise
+RMS_OVER_BOUND = Statistic("RMS / bound", _rms_over_bound)
 SHARE = Statistic("share", _share)
 EXACT = Statistic("exact", _exact)  # of a figure that nothing is drawn for
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from testbed import papers
+from testbed import data, papers
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.papers import saved
@@ -41,6 +41,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for folder in ("docs", "scenarios/papers", "out"):
         (tmp_path / folder).mkdir(parents=True)
     monkeypatch.setattr(saved, "data_dir", lambda name: tmp_path / name)
+    monkeypatch.setattr(data, "data_dir", lambda name: tmp_path / name)
     for paper in papers.find([]).values():
         for figure in paper.figures:
             (tmp_path / "out" / figure).write_bytes(b"picture")
@@ -67,6 +68,7 @@ def test_papers_that_are_not_judged_with_the_same_draws_are_named(checkout: Path
 
 def test_without_a_checkout_nothing_is_saved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(saved, "data_dir", lambda name: tmp_path / name)
+    monkeypatch.setattr(data, "data_dir", lambda name: tmp_path / name)
     with pytest.raises(UserError, match="is missing: --save is for a checkout"):
         saved.require_checkout()
 

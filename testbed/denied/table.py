@@ -1,0 +1,190 @@
+"""What the table is of: weather, aids, grades of the IMU, times without GNSS. A line each is all that a new one takes.
+
+Every case, one of each, is a scenario that `testbed run` flies too. `Case.text` is its file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+from testbed.scenario import Scenario
+
+EVERY_S = 10  # how often errors are kept from the loss of GNSS on
+BEYOND_S = 1  # flown after the last time that is asked for
+LONGEST_S = 1800
+FRONT_S = 90  # after the loss
+
+
+class Weather(NamedTuple):
+    """A wind 280 m above ground: ``wind`` are keys of ``truth.wind``. What it says of a walk filters are told.
+
+    {front} stands for the time when it changes, for those in which it does.
+    """
+
+    name: str
+    title: str
+    wind: str
+
+
+class Aids(NamedTuple):
+    """What a filter has beside IMU, GNSS, barometer, magnetometer and airspeed: ``sensors`` are further tables.
+
+    ``fault`` is what goes wrong, if anything does; {half} stands for the time half-way between the loss of GNSS and the
+    {end}. ``ground`` is ``truth.terrain``.
+    """
+
+    name: str
+    title: str
+    sensors: str = ""
+    fault: str = ""
+    ground: str = "height_m = 345"
+
+
+class Grade(NamedTuple):
+    """A grade of the IMU, by its name in ``[sensors.imu]``."""
+
+    name: str
+    grade: str
+
+
+WEATHERS = (
+    Weather("constant", "constant wind", "walk_mps_per_sqrt_s = 0.0"),
+    Weather("walking", "walking wind, 0.02 m/s/√s", "walk_mps_per_sqrt_s = 0.02"),
+    Weather(
+        "front",
+        "walking wind, and a front that nobody is told of",
+        "walk_mps_per_sqrt_s = 0.02, front = {{ time_s = {front}, width_s = 60, from_deg = 310, speed_mps = 10 }}",
+    ),
+)
+AIDS = (
+    Aids("air_data", "air data"),
+    Aids("flow", "flow and range", '[sensors.optical_flow]\ngrade = "camera"\n[sensors.rangefinder]\ngrade = "radar"'),
+    Aids(
+        "pitot_failed",
+        "air data, pitot silent from half-way on",
+        fault='[[fault]]\nsensor = "airspeed"\nkind = "dropout"\nwindow = [{half}, {end}]',
+    ),
+)
+GRADES = (
+    Grade("consumer", "mems-consumer"),
+    Grade("industrial", "mems-industrial"),
+    Grade("tactical", "tactical"),
+)
+# The relief of matplotlib's jacksboro_fault_dem.npz lies here, 345 m high on average within three kilometres.
+SCENARIO = """\
+title = "Denied navigation: {title}"
+duration_s = {duration}
+date = 2026-06-01
+
+[truth]
+source = "flight"
+aircraft = "loiter"
+rate_hz = 200
+start = {{ lat_deg = 36.52, lon_deg = -84.155, alt_m = 625, heading_deg = 30, airspeed_mps = 25 }}
+wind = {{ from_deg = 250, speed_mps = 8, turbulence = "light", {wind} }}
+terrain = {{ {ground} }}
+
+[[plan]]
+leg = "straight"
+length_m = 1500
+[[plan]]
+leg = "turn"
+to_deg = 120
+[[plan]]
+leg = "straight"
+length_m = 1500
+[[plan]]
+leg = "loiter"
+radius_m = 400
+duration_s = 3000
+
+[record]
+rate_hz = 2
+imu = false
+
+[sensors.imu]
+grade = "{grade}"
+rate_hz = 200
+[sensors.gnss]
+rate_hz = 5
+denied = [[{lost}, {end}]]
+[sensors.barometer]
+rate_hz = 5
+[sensors.magnetometer]
+rate_hz = 10
+[sensors.airspeed]
+rate_hz = 5
+{sensors}
+{fault}
+"""
+
+
+class Contestant(NamedTuple):
+    """An estimator that takes part: its name in the table, and its ``kind`` in a scenario."""
+
+    name: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One weather, set of aids and grade, flown until ``longest_s`` after GNSS was lost at ``lost_s`` [s]."""
+
+    weather: Weather
+    aids: Aids
+    grade: Grade
+    contestants: tuple[Contestant, ...]
+    lost_s: int
+    longest_s: int
+
+    @property
+    def text(self) -> str:
+        """The scenario's file."""
+        lost, duration = self.lost_s, self.lost_s + self.longest_s + BEYOND_S
+        end, half = duration + 60, lost + self.longest_s // 2
+        flown = SCENARIO.format(
+            title=f"{self.aids.title}, {self.weather.title}, {self.grade.name} IMU",
+            duration=duration, lost=lost, end=end, wind=self.weather.wind.format(front=lost + FRONT_S),
+            ground=self.aids.ground, grade=self.grade.grade, sensors=self.aids.sensors,
+            fault=self.aids.fault.format(half=half, end=end),
+        )  # fmt: skip
+        aiding = [name for name, one in Scenario.parse(flown).sensors.items() if one.kind != "imu"]
+        entered = [
+            "[[estimator]]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
+            for keys in ({"name": one.name, "kind": one.kind, "aids": aiding} for one in self.contestants)
+        ]
+        return "\n".join([flown.rstrip(), "", *entered])
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The same, checked. Raises UserError."""
+        return Scenario.parse(self.text)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Which part of the table is flown, and how many draws unless somebody says.
+
+    Before GNSS is lost at ``lost_s`` [s] there are two straights, a turn, and a circle and a half.
+    """
+
+    weathers: Sequence[Weather] = WEATHERS
+    aids: Sequence[Aids] = AIDS
+    grades: Sequence[Grade] = GRADES
+    marks_s: Sequence[int] = (60, 120, 600, LONGEST_S)
+    draws: int = 20
+    lost_s: int = 300
+
+    def cases(self, weather: Weather, contestants: tuple[Contestant, ...]) -> Iterator[Case]:
+        """Those of one weather: they share their motion."""
+        for aids in self.aids:
+            for grade in self.grades:
+                yield Case(weather, aids, grade, contestants, self.lost_s, max(self.marks_s))
+
+
+FULL = Table()
+QUICK = Table(grades=GRADES[:1], marks_s=(60, 120), draws=4)

@@ -1,0 +1,75 @@
+"""The figure of the benchmark: horizontal error over the time without GNSS, a panel a weather and set of aids."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nav.samples import Array
+from testbed.report import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from testbed.denied.benchmark import Result
+    from testbed.denied.flight import Outcome
+
+LEAST_M = 0.3  # of the axis: a shorter error is no outage's
+
+
+def figures(result: Result) -> Mapping[str, Figure]:
+    """One for each estimator, by file name."""
+    return {f"denied_{one.name}.png": _figure(result, one.name) for one in result.plan.contestants}
+
+
+def _figure(result: Result, estimator: str) -> Figure:
+    """RMS, 95th percentile and the bound of every grade, over the time since GNSS was lost."""
+    table = result.plan.table
+    drawn = style.sheet(len(table.aids), len(table.weathers), height=1.9, gap=0.42)
+    for column, weather in enumerate(table.weathers):
+        own = [one for one in result.outcomes if one.weather == weather.name]
+        for row, aids in enumerate(table.aids):
+            ax = drawn.axes[row, column]
+            ax.set_title(f"{aids.title}\n{weather.title}", loc="left", fontsize=8)
+            for k, grade in enumerate(table.grades):
+                _curves(ax, own, (aids.name, grade.name, estimator), grade.name, style.COLOURS[k])
+    for row in drawn.axes:
+        row[0].set_ylabel("horizontal error [m]")
+        limits = np.array([ax.dataLim.intervaly for ax in row if ax.lines])
+        for ax in row:
+            ax.set_xlim(10.0, max(table.marks_s))
+            for mark in table.marks_s:
+                ax.axvline(mark, color=style.SHADE, lw=0.8, zorder=0)
+            style.logarithmic(ax, along="x")
+            if len(limits):
+                ax.set_ylim(max(LEAST_M, limits[:, 0].min() / 1.3), limits[:, 1].max() * 1.3)
+                style.logarithmic(ax)
+    for ax in drawn.axes[-1]:
+        ax.set_xlabel("time without GNSS [s]")
+    drawn.legend(style.keys_of(drawn.axes.flat), 0.45)
+    return drawn.figure
+
+
+def _curves(ax: Axes, outcomes: Sequence[Outcome], lane: tuple[str, str, str], grade: str, colour: str) -> None:
+    if not outcomes:
+        return
+    k, since = outcomes[0].lanes.index(lane), outcomes[0].t > 0
+    t = outcomes[0].t[since]
+
+    def over_draws(values: list[Array]) -> Array:
+        return np.array(values)[:, since]
+
+    error = over_draws([one.horizontal[k] for one in outcomes])
+    bound = over_draws([one.bound[k] for one in outcomes])
+    error = np.where(np.isfinite(error), error, np.nan)
+    ax.plot(t, np.sqrt(np.mean(error**2, axis=0)), color=colour, lw=1.6, label=f"{grade}: RMS")
+    ax.plot(
+        t, np.quantile(error, 0.95, axis=0, method="inverted_cdf"), color=colour, lw=0.8, alpha=0.7,
+        label=f"{grade}: 95 %",
+    )  # fmt: skip
+    ax.plot(
+        t, np.sqrt(np.mean(bound**2, axis=0)), color=colour, lw=1.1, ls=(0, (4, 1.5)), label=f"{grade}: bound of RMS"
+    )
