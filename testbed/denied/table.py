@@ -63,6 +63,7 @@ WEATHERS = (
 AIDS = (
     Aids("air_data", "air data"),
     Aids("flow", "flow and range", '[sensors.optical_flow]\ngrade = "camera"\n[sensors.rangefinder]\ngrade = "radar"'),
+    Aids("wind_report", "air data and wind reports", '[sensors.wind_report]\ngrade = "nearby"'),
     Aids(
         "pitot_failed",
         "air data, pitot silent from half-way on",
