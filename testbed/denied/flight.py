@@ -1,4 +1,4 @@
-"""One flight of the benchmark: a motion, sensed and estimated in every case of its weather, and what is kept of it."""
+"""One flight of the benchmark: motions, sensed and estimated in every case of a weather, and what is kept of it."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ FLOWN = 0.8  # of the work, beside that for the bound
 class Outcome:
     """What is kept of one flight at K times: errors are estimate - truth, NaN where an estimator had none to offer.
 
-    ``t`` (K,) [s] since GNSS was lost, ``distance`` (K,) flown over ground since then [m]. Of each of N ``lanes``, by
-    names of aids, grade and estimator: ``error`` (N, K, 2) north and east [m]; ``covariance`` (N, K, 3) claimed of
-    them, north, both, east [m^2]; ``bound`` (N, K), the least RMS of the horizontal error [m], NaN where there is none.
-    ``ended`` says by lane, ``aids/grade/estimator``, why an estimator ended by an error of its own.
+    ``t`` (K,) [s] since GNSS was lost. Of each of N ``lanes``, by names of aids, grade and estimator: ``error``
+    (N, K, 2) north and east [m]; ``covariance`` (N, K, 3) claimed of them, north, both, east [m^2]; ``bound`` (N, K),
+    the least RMS of the horizontal error [m], NaN where there is none; ``distance`` (N, K) flown over ground since GNSS
+    was lost [m]. ``ended`` says by lane, ``aids/grade/estimator``, why an estimator ended by an error of its own.
     """
 
     weather: str
     seed: int
     t: Array
-    distance: Array
     lanes: tuple[tuple[str, str, str], ...]
     error: Array
     covariance: Array
     bound: Array
+    distance: Array
     ended: Mapping[str, str]
 
     @property
@@ -77,7 +77,7 @@ class At(NamedTuple):
     horizontal: Array
     normalised: Array
     bound: Array
-    distance: Array  # (draws, times)
+    distance: Array
 
 
 def at(outcomes: Sequence[Outcome], marks_s: Sequence[int]) -> At:
@@ -85,7 +85,7 @@ def at(outcomes: Sequence[Outcome], marks_s: Sequence[int]) -> At:
     found = []
     for one in outcomes:
         rows = np.searchsorted(one.t, np.array(marks_s) - accuracy.SAME_TIME_S)
-        found.append((one.horizontal[:, rows], one.normalised[:, rows], one.bound[:, rows], one.distance[rows]))
+        found.append((one.horizontal[:, rows], one.normalised[:, rows], one.bound[:, rows], one.distance[:, rows]))
     return At(*(np.array(column) for column in zip(*found, strict=True)))
 
 
@@ -129,10 +129,29 @@ class _Bench:
 
 
 def fly(cases: Sequence[Case], seed: int, tell: Callable[[float], None] = lambda share: None) -> Outcome:
-    """Fly the ``cases``, which share their weather, once with this seed; ``tell`` hears the share that is done.
+    """Fly the ``cases``, which share their weather, once a route with this seed; ``tell`` hears the share that is done.
 
-    Raises UserError when the flight gets out of control, or an estimator can't be had.
+    Raises UserError when a flight gets out of control, or an estimator can't be had.
     """
+    parts: list[Outcome] = []
+    done = 0
+    for route in dict.fromkeys(case.aids.route for case in cases):
+        own = [case for case in cases if case.aids.route == route]
+        before, share = done / len(cases), len(own) / len(cases)
+        parts.append(_route(own, seed, lambda one, before=before, share=share: tell(before + share * one)))  # type: ignore[misc]
+        done += len(own)
+
+    def whole(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    lanes = tuple(lane for part in parts for lane in part.lanes)
+    ended = {lane: why for part in parts for lane, why in part.ended.items()}
+    columns = {name: whole(name) for name in ("error", "covariance", "bound", "distance")}
+    return Outcome(parts[0].weather, seed, parts[0].t, lanes, **columns, ended=ended)
+
+
+def _route(cases: Sequence[Case], seed: int, tell: Callable[[float], None]) -> Outcome:
+    """The same of one route."""
     source = motion(cases[0].scenario, seed)
     flying = [_begin(case, seed) for case in cases]
     bench = _Bench(seed, source.rate_hz)
@@ -209,10 +228,10 @@ def _outcome(
         "/".join((one.case.aids.name, one.case.grade.name, name)): lane.failure
         for one in flying for name, lane in one.lanes.items() if lane.failure
     }  # fmt: skip
-    distance = _flown(next(iter(trees.values())), t)
+    distance = np.tile(_flown(next(iter(trees.values())), t), (len(names), 1))
     return Outcome(
-        flying[0].case.weather.name, seed, t - t[0], distance, tuple(names), np.array(errors), np.array(covariances),
-        np.array(bounds), ended,
+        flying[0].case.weather.name, seed, t - t[0], tuple(names), np.array(errors), np.array(covariances),
+        np.array(bounds), distance, ended,
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def _claims(result: Result, estimator: str) -> Iterator[Claim]:
             k = lanes.index((aids.name, GRADE, estimator))
             for i, mark in enumerate(marks):
                 error, bound = then.horizontal[:, k, i], then.bound[:, k, i]
-                yield from _of_one(aids, mark, error, bound, then.distance[:, i])
+                yield from _of_one(aids, mark, error, bound, then.distance[:, k, i])
     beaten, judged = below_the_bound(result, estimator)
     if judged:
         quantity = f"figures of the whole table that are below the bound, of {judged}"

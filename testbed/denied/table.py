@@ -20,7 +20,7 @@ FRONT_S = 90  # after the loss
 
 
 class Weather(NamedTuple):
-    """A wind 280 m above ground: ``wind`` are keys of ``truth.wind``. What it says of a walk filters are told.
+    """A wind: ``wind`` are keys of ``truth.wind``. What it says of a walk filters are told.
 
     {front} stands for the time when it changes, for those in which it does.
     """
@@ -30,18 +30,48 @@ class Weather(NamedTuple):
     wind: str
 
 
+class Route(NamedTuple):
+    """Where it is flown: keys of ``truth.start`` and ``truth.terrain``, and the plan. Aids of one share its motion."""
+
+    start: str
+    terrain: str
+    plan: str
+
+
+# Two straights, a turn, and in the rest of five minutes with GNSS a circle and a half.
+CIRCLES = Route(
+    "lat_deg = 34.0, lon_deg = 108.0, alt_m = 280, heading_deg = 30, airspeed_mps = 25",
+    "height_m = 0",
+    """\
+[[plan]]
+leg = "straight"
+length_m = 1500
+[[plan]]
+leg = "turn"
+to_deg = 120
+[[plan]]
+leg = "straight"
+length_m = 1500
+[[plan]]
+leg = "loiter"
+radius_m = 400
+duration_s = 3000
+""",
+)
+
+
 class Aids(NamedTuple):
     """What a filter has beside IMU, GNSS, barometer, magnetometer and airspeed: ``sensors`` are further tables.
 
     ``fault`` is what goes wrong, if anything does; {half} stands for the time half-way between the loss of GNSS and the
-    {end}. ``ground`` is ``truth.terrain``.
+    {end}.
     """
 
     name: str
     title: str
     sensors: str = ""
     fault: str = ""
-    ground: str = "height_m = 345"
+    route: Route = CIRCLES
 
 
 class Grade(NamedTuple):
@@ -75,7 +105,6 @@ GRADES = (
     Grade("industrial", "mems-industrial"),
     Grade("tactical", "tactical"),
 )
-# The relief of matplotlib's jacksboro_fault_dem.npz lies here, 345 m high on average within three kilometres.
 SCENARIO = """\
 title = "Denied navigation: {title}"
 duration_s = {duration}
@@ -85,24 +114,11 @@ date = 2026-06-01
 source = "flight"
 aircraft = "loiter"
 rate_hz = 200
-start = {{ lat_deg = 36.52, lon_deg = -84.155, alt_m = 625, heading_deg = 30, airspeed_mps = 25 }}
+start = {{ {start} }}
 wind = {{ from_deg = 250, speed_mps = 8, turbulence = "light", {wind} }}
-terrain = {{ {ground} }}
+terrain = {{ {terrain} }}
 
-[[plan]]
-leg = "straight"
-length_m = 1500
-[[plan]]
-leg = "turn"
-to_deg = 120
-[[plan]]
-leg = "straight"
-length_m = 1500
-[[plan]]
-leg = "loiter"
-radius_m = 400
-duration_s = 3000
-
+{plan}
 [record]
 rate_hz = 2
 imu = false
@@ -150,8 +166,8 @@ class Case:
         flown = SCENARIO.format(
             title=f"{self.aids.title}, {self.weather.title}, {self.grade.name} IMU",
             duration=duration, lost=lost, end=end, wind=self.weather.wind.format(front=lost + FRONT_S),
-            ground=self.aids.ground, grade=self.grade.grade, sensors=self.aids.sensors,
-            fault=self.aids.fault.format(half=half, end=end),
+            grade=self.grade.grade, sensors=self.aids.sensors, fault=self.aids.fault.format(half=half, end=end),
+            **self.aids.route._asdict(),
         )  # fmt: skip
         aiding = [name for name, one in Scenario.parse(flown).sensors.items() if one.kind != "imu"]
         entered = [
@@ -168,10 +184,7 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Which part of the table is flown, and how many draws unless somebody says.
-
-    Before GNSS is lost at ``lost_s`` [s] there are two straights, a turn, and a circle and a half.
-    """
+    """Which part of the table is flown, how many draws unless somebody says, and when GNSS is lost, ``lost_s`` [s]."""
 
     weathers: Sequence[Weather] = WEATHERS
     aids: Sequence[Aids] = AIDS
@@ -181,7 +194,7 @@ class Table:
     lost_s: int = 300
 
     def cases(self, weather: Weather, contestants: tuple[Contestant, ...]) -> Iterator[Case]:
-        """Those of one weather: they share their motion."""
+        """Those of one weather."""
         for aids in self.aids:
             for grade in self.grades:
                 yield Case(weather, aids, grade, contestants, self.lost_s, max(self.marks_s))

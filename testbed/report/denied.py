@@ -149,7 +149,7 @@ def _csv(result: Result) -> str:
         rows = [int(np.searchsorted(one.t, mark - 1e-6)) for mark in result.plan.table.marks_s]
         for k, lane in enumerate(one.lanes):
             for mark, row in zip(result.plan.table.marks_s, rows, strict=True):
-                numbers = (*one.error[k, row], *one.covariance[k, row], one.bound[k, row], one.distance[row])
+                numbers = (*one.error[k, row], *one.covariance[k, row], one.bound[k, row], one.distance[k, row])
                 writer.writerow(
                     [one.weather, *lane, one.seed, mark, *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)]
                 )
