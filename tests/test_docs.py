@@ -37,6 +37,7 @@ NOT_RUN = {
     "make": "installs or runs everything",
     "mavproxy.py": "a ground station, in an environment of its own: tests/clients",
     "testbed campaign": "each starts processes for seconds: tests/many/test_campaign.py",
+    "testbed denied": "takes minutes: tests/denied",
     "testbed check": "flies in processes, for minutes without names: tests/many, tests/test_shipped.py",
     "testbed run loiter_gnss_outage --px4": "waits for PX4: tests/bridges/test_px4.py",
     "testbed run loiter_gnss_outage --ardupilot": "waits for ArduPilot: tests/bridges/test_ardupilot.py",

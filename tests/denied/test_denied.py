@@ -17,7 +17,6 @@ from typer.testing import CliRunner
 
 import testbed.__main__ as cli
 from testbed import Scenario, run
-from testbed.data import data_dir
 from testbed.denied import benchmark, flight, goals, saved
 from testbed.denied.benchmark import Plan, Result, contestants
 from testbed.denied.flight import Outcome
@@ -357,13 +356,3 @@ def test_the_command_shows_table_and_goals(
     scenarios = sorted((tmp_path / "out" / "scenarios").iterdir())
     assert len(scenarios) == len(WEATHERS) * len(AIDS)
     assert Scenario.load(scenarios[0]).estimator[0].name == "ins"
-
-
-# --- the manual
-
-
-def test_the_manual_has_the_table_of_the_draw_that_is_drawn_when_nobody_says() -> None:
-    text = (data_dir("scenarios").parent / "docs" / saved.PAGE).read_text("utf-8")
-    assert f"`testbed denied --save --draw {benchmark.RECORDED_DRAW} --draws" in text
-    assert all(f"\n| {aids.name} |" in text for aids in AIDS)
-    assert (data_dir("scenarios") / saved.FIGURE).is_file()

@@ -312,6 +312,7 @@ def told(*overrides: str) -> Air:
 def test_filters_expect_the_walk_that_the_scenario_has() -> None:
     assert told().wind_walk == UNKNOWN_WALK == 0.015
     assert told("truth.wind.walk_mps_per_sqrt_s=0.02").wind_walk == 0.02
+    assert told("truth.wind.walk_mps_per_sqrt_s=0.0").wind_walk == 0.0  # which was said
     both = told("truth.wind.walk_mps_per_sqrt_s=0.02", "truth.wind.gauss_markov={sigma_mps=1.0, correlation_s=800}")
     assert both.wind_walk == pytest.approx(math.hypot(0.02, 0.05))
     still = KinematicTruth(source="kinematic", start={"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0})  # type: ignore[arg-type]
