@@ -134,7 +134,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
         case BarometerConfig():
             b = section.errors()
             walk = _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL
-            return BarometerAid(name, sigma=b.noise * METRES_PER_PASCAL, bias_walk=walk)
+            return BarometerAid(name, sigma=math.hypot(b.noise, b.unsteady) * METRES_PER_PASCAL, bias_walk=walk)
         case MagnetometerConfig():
             m = section.errors()
             bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
@@ -149,7 +149,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             gust = max(air.gust, section.gust_mps)
             return AirspeedAid(
                 name,
-                sigma=math.hypot(a.noise, SHORT_GUSTS * gust),
+                sigma=math.hypot(math.hypot(a.noise, a.unsteady), SHORT_GUSTS * gust),
                 scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
                 sideslip_sigma=None if section.slips else math.hypot(SIDESLIP, SHORT_GUSTS * gust),
                 wind_walk=max(air.wind_walk, section.wind_walk_mps_per_sqrt_s),

@@ -305,13 +305,15 @@ def add_sensor(model: Model, dataset: xarray.DataTree, name: str, config: Sensor
             _add_gnss(model, times[fixed], config)
         case BarometerConfig():
             b = config.errors()
-            bias = model.add(constant([b.bias]))
-            drift = model.add(gauss_markov([b.drift], b.drift_tau))
+            parts = [model.add(constant([b.bias])), model.add(gauss_markov([b.drift], b.drift_tau))]
+            if b.unsteady:
+                parts.append(model.add(gauss_markov([b.unsteady], b.unsteady_tau)))
             weight = way.density * GRAVITY  # of pressure per metre down
 
             def pressure(H: Array, part: slice) -> float:
                 H[:, 0, POS.start + 2] = weight[part]
-                H[:, :, bias] = H[:, :, drift] = 1.0
+                for error in parts:
+                    H[:, :, error] = 1.0
                 return b.noise
 
             model.observe(times, rows(1, 0.01, pressure))
@@ -411,6 +413,9 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
     """Speed along the tube, and that the aircraft slips as it does: sideways it is a coordinated flight's."""
     way = model.way
     bias, scale = model.add(constant([config.bias_pa])), model.add(constant([config.scale_percent * PERCENT]))
+    off = [bias]
+    if config.unsteady_pa:
+        off.append(model.add(gauss_markov([config.unsteady_pa], config.unsteady_time_s)))
     air_n = way.v_n - way.wind_n
     ahead_n, side_n = way.C_nb[:, :, 0], way.C_nb[:, :, 1]
     along = np.maximum(np.einsum("ki,ki->k", ahead_n, air_n), SLOWEST)
@@ -421,7 +426,9 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
     def speed(H: Array, part: slice) -> Array:
         _through_air(H[:, 0], model, thinness[part, None] * ahead_n[part], air_n[part], part)
         H[:, 0, POS.start + 2] = 0.5 * eas[part] / SCALE_HEIGHT
-        H[:, 0, bias], H[:, 0, scale] = per_pascal[part, None], 0.5 * eas[part, None]
+        for error in off:
+            H[:, 0, error] = per_pascal[part, None]
+        H[:, 0, scale] = 0.5 * eas[part, None]
         noise: Array = config.noise_pa * per_pascal[part, None]
         return noise
 

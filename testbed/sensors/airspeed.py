@@ -26,18 +26,21 @@ GRADES: dict[str, dict[str, Any]] = {
     # ground. What is left after that zero, and the calibration of the tube on the airframe, assumed.
     "mems": {"scale_percent": 1.0, "bias_pa": 3.0, "noise_pa": 2.0},
     # The same kind of part on a hobby airframe, its tube not calibrated and in the propeller's wake: assumed, at the
-    # size that innovations on recorded flights have; in sideslip the static port is off as the barometer is. On the
-    # ground 5 to 18 Pa are blown into the tubes of two recorded aeroplanes, alike for some 3 s.
+    # size that innovations on recorded flights have, nine tenths of which are the same after 0.1 s; in sideslip the
+    # static port is off as the barometer is. On the ground 5 to 18 Pa are blown into the tubes of two recorded
+    # aeroplanes, alike for some 3 s.
     # Near the ground the wind itself walks by 2 m/s in minutes, and gusts turn these small aircraft sideways by degrees
     # for seconds: 1.8 m/s against a constant wind, so that no sideslip is no constraint.
     "hobby": {
         "scale_percent": 5.0,
         "bias_pa": 15.0,
-        "noise_pa": 15.0,
+        "noise_pa": 3.0,
+        "unsteady_pa": 9.5,
+        "unsteady_time_s": 2.0,
         "sideslip_percent": 10.0,
         "blown_pa": 15.0,
         "wind_walk_mps_per_sqrt_s": 0.1,
-        "gust_mps": 2.0,
+        "gust_mps": 1.5,
         "gust_time_s": 3.0,
         "slips": True,
         "fused_hz": 10.0,
@@ -47,13 +50,15 @@ GRADES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class AirspeedErrors:
-    """The sensor's datasheet in SI, 1 sigma, as errors of speed: ``scale`` [1]; ``bias``, ``noise`` [m/s] at
+    """The sensor's datasheet in SI, 1 sigma, as errors of speed: ``scale`` [1]; ``bias``, ``noise``,
+    ``unsteady`` [m/s] at
     `REFERENCE_EAS`, from where they grow as 1/EAS; ``latency`` [s].
     """
 
     scale: float
     bias: float
     noise: float
+    unsteady: float
     latency: float
 
 
@@ -70,6 +75,10 @@ class AirspeedConfig(AidingTiming):
     scale_percent: float = Field(0.0, ge=0, le=50, description="of dynamic pressure: half of it in speed")
     bias_pa: float = Field(0.0, ge=0, le=1e4, description="constant offset of the differential pressure")
     noise_pa: float = Field(0.0, ge=0, le=1e4, description="white noise of the differential pressure")
+    unsteady_pa: float = Field(
+        0.0, ge=0, le=1e4, description="Gauss-Markov error of the airframe's wake; told to filters as white noise"
+    )
+    unsteady_time_s: float = Field(1.0, gt=0, le=1e4, description="correlation time of that")
     sideslip_percent: float = Field(
         0.0, ge=0, le=100, description="of dynamic pressure that 10 deg of sideslip take or add at the static port"
     )
@@ -95,8 +104,9 @@ class AirspeedConfig(AidingTiming):
         """The same in SI, linearised: d(EAS) = dq / (rho0 EAS)."""
         per_pascal = 1 / (SEA_LEVEL_DENSITY * REFERENCE_EAS)
         return AirspeedErrors(
-            self.scale_percent * PERCENT / 2, self.bias_pa * per_pascal, self.noise_pa * per_pascal, self.latency_s
-        )
+            self.scale_percent * PERCENT / 2, self.bias_pa * per_pascal, self.noise_pa * per_pascal,
+            self.unsteady_pa * per_pascal, self.latency_s,
+        )  # fmt: skip
 
 
 class Airspeed:
@@ -114,6 +124,9 @@ class Airspeed:
         self._scale = stream(seed, name, "scale").standard_normal() * config.scale_percent * PERCENT
         self._bias = stream(seed, name, "bias").standard_normal() * config.bias_pa
         self._white = Process.white(stream(seed, name, "white"), [config.noise_pa])
+        self._unsteady = Process.gauss_markov(
+            stream(seed, name, "unsteady"), [config.unsteady_pa], config.unsteady_time_s, 1 / config.rate_hz
+        )
         self._position = position_error(name, 0.0, config.sideslip_percent, seed)
         self._blown = Process.gauss_markov(stream(seed, name, "blown"), [config.blown_pa], BLOWN_S, 1 / config.rate_hz)
 
@@ -127,6 +140,7 @@ class Airspeed:
         along = np.maximum(truth.airspeed[due] * np.cos(truth.alpha[due]) * np.cos(truth.beta[due]), 0.0)
         q = 0.5 * truth.density[due] * along**2
         q = (1 + self._scale) * q + self._bias + self._white.take(n)[:, 0]
+        q += self._unsteady.take(n)[:, 0]
         if self._position.any():
             q -= self._position @ exposure(truth, due)
         standing = (truth.airspeed[due] < FLYING_MPS) & (np.linalg.norm(truth.v_n[due], axis=1) < FLYING_MPS)

@@ -23,13 +23,15 @@ GRADES: dict[str, dict[str, Any]] = {
     "mems": {"bias_pa": 50.0, "drift_pa": 15.0, "drift_time_s": 1800.0, "noise_pa": 1.2},
     # The same in a fuselage without a static port: cabin pressure changes with airspeed, sideslip and propeller.
     # Measured on two recorded aeroplanes against GNSS height, with errors of the receiver in it: 1 to 2 m within 10 s,
-    # 2 to 5 m over minutes; 18 +- 5 and 44 +- 23 % of dynamic pressure in the static one, and with 10 deg of sideslip
-    # 12 +- 14 % more (least squares beside a drift).
+    # 2 to 5 m over minutes, half of it the same after 5 to 10 s; 18 +- 5 and 44 +- 23 % of dynamic pressure in the
+    # static one, and with 10 deg of sideslip 12 +- 14 % more (least squares beside a drift).
     "hobby": {
         "bias_pa": 100.0,
         "drift_pa": 40.0,
         "drift_time_s": 300.0,
-        "noise_pa": 40.0,
+        "noise_pa": 3.0,
+        "unsteady_pa": 40.0,
+        "unsteady_time_s": 8.0,
         "dynamic_percent": 15.0,
         "sideslip_percent": 10.0,
         "fused_hz": 10.0,
@@ -39,11 +41,13 @@ GRADES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class BarometerErrors:
-    """The sensor's datasheet, 1 sigma: ``noise``, constant ``bias``, Gauss-Markov ``drift`` [Pa] with ``drift_tau``,
-    ``latency`` [s]. Near the ground 12 Pa are a metre.
+    """The sensor's datasheet, 1 sigma: ``noise``, Gauss-Markov ``unsteady`` [Pa] with ``unsteady_tau`` [s], constant
+    ``bias``, Gauss-Markov ``drift`` [Pa] with ``drift_tau``, ``latency`` [s]. Near the ground 12 Pa are a metre.
     """
 
     noise: float
+    unsteady: float
+    unsteady_tau: float
     bias: float
     drift: float
     drift_tau: float
@@ -79,6 +83,10 @@ class BarometerConfig(AidingTiming):
     drift_pa: float = Field(0.0, ge=0, le=1e5, description="Gauss-Markov drift of the pressure")
     drift_time_s: float = Field(1800.0, gt=0, le=1e6, description="correlation time of the drift")
     noise_pa: float = Field(0.0, ge=0, le=1e5, description="white noise of the pressure")
+    unsteady_pa: float = Field(
+        0.0, ge=0, le=1e5, description="Gauss-Markov error of the airframe's wake; told to filters as white noise"
+    )
+    unsteady_time_s: float = Field(8.0, gt=0, le=1e4, description="correlation time of that")
     dynamic_percent: float = Field(
         0.0, ge=0, le=100, description="of dynamic pressure that gets into the static one, constant in a run"
     )
@@ -93,11 +101,14 @@ class BarometerConfig(AidingTiming):
 
     def errors(self) -> BarometerErrors:
         """The same as a plain record."""
-        return BarometerErrors(self.noise_pa, self.bias_pa, self.drift_pa, self.drift_time_s, self.latency_s)
+        return BarometerErrors(
+            self.noise_pa, self.unsteady_pa, self.unsteady_time_s, self.bias_pa, self.drift_pa, self.drift_time_s,
+            self.latency_s,
+        )  # fmt: skip
 
 
 class Barometer:
-    """One barometer on one run: measured = pressure + (a + b sin(beta)^2) q + bias + drift + noise.
+    """One barometer on one run: measured = pressure + (a + b sin(beta)^2) q + bias + drift + wake + noise.
 
     q = rho/2 V^2; a and b are drawn: the airframe has another pressure where it is taken (Gracey, NASA RP-1046).
     """
@@ -110,6 +121,9 @@ class Barometer:
         self._bias = stream(seed, name, "bias").standard_normal() * e.bias
         self._drift = Process.gauss_markov(stream(seed, name, "drift"), [e.drift], e.drift_tau, 1 / config.rate_hz)
         self._white = Process.white(stream(seed, name, "white"), [e.noise])
+        self._unsteady = Process.gauss_markov(
+            stream(seed, name, "unsteady"), [e.unsteady], e.unsteady_tau, 1 / config.rate_hz
+        )
         self._position = position_error(name, config.dynamic_percent, config.sideslip_percent, seed)
 
     def sense(self, truth: TruthBlock) -> list[BarometerSample]:
@@ -119,6 +133,7 @@ class Barometer:
         if not n:
             return []
         error = self._bias + self._drift.take(n)[:, 0] + self._white.take(n)[:, 0]
+        error += self._unsteady.take(n)[:, 0]
         due = slice(rows.start, None, rows.step)
         if self._position.any():
             error += self._position @ exposure(truth, due)

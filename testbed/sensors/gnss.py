@@ -98,10 +98,10 @@ GRADES: dict[str, dict[str, Any]] = {
     # last is assumed); steps of stamps that deviate by 5 to 36 ms; of a thousand fixes 3 missing. In two more: stated
     # accuracies that fall from the first fixes on with a time constant of 11 s, or slower.
     "u-blox-m8": {
-        "horizontal_white_m": 1.0,
-        "horizontal_correlated_m": 1.0,
-        "vertical_white_m": 1.5,
-        "vertical_correlated_m": 2.0,
+        "horizontal_white_m": 0.5,
+        "horizontal_correlated_m": 1.3,
+        "vertical_white_m": 0.7,
+        "vertical_correlated_m": 2.4,
         "correlation_time_s": 300.0,
         "horizontal_velocity_white_mps": 0.2,
         "horizontal_velocity_correlated_mps": 0.05,

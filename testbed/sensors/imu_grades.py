@@ -149,16 +149,16 @@ GRADES: dict[str, dict[str, Any]] = {
     # flights of such: 430 to 4300 deg/h of gyro bias, scale and alignment of 1 % and 1 deg. At rest white noise is the
     # data sheet's (0.24 to 0.29 deg/sqrt(h), 0.11 m/s/sqrt(h)); in flight vibration makes ten times that of it, and
     # what an unfiltered sampling folds down has lines of 0.15 m/s^2 and up to 3 deg/s and leaves 0.2 to 0.4 m/s^2
-    # per axis between 8 and 25 Hz, as 200 mg do here. Where they fly briskly, 1 % of the rate and of the force less
-    # gravity goes wrong each second; what vibrates more than usual shows it in its increments. Steps between stamps
-    # deviate by 0.7 to 1.9 ms. Rectification of the accelerometers: Analog Devices ADXL355 data sheet, 0.4 g at 2.5 g
-    # rms; of the gyros, and losses: assumed.
+    # per axis between 8 and 25 Hz, as 100 mg and the noise do here. Where they fly briskly, 1 % of the rate and of the
+    # force less gravity goes wrong each second; what vibrates more than usual shows it in its increments. Steps between
+    # stamps deviate by 0.7 to 1.9 ms. Rectification of the accelerometers: Analog Devices ADXL355 data sheet, 0.4 g at
+    # 2.5 g rms; of the gyros, and losses: assumed.
     "mems-hobby": {
         **INSTALLATION,
         "output": "sampled",
         "jitter_s": 0.002,
         "dropout_percent": 0.5,
-        "vibration_mg": 200.0,
+        "vibration_mg": 100.0,
         "vibration_degps": 2.0,
         "gyro_vibration_degprth": 1.98,
         "accel_vibration_mpsprth": 2.99,

@@ -39,7 +39,7 @@ GRADES: dict[str, dict[str, Any]] = {
     # Beside motor and wiring, hardly calibrated: residuals of 17 to 24 mG, scales off by 5 % on recorded flights, and
     # 0.04 to 0.15 uT/A of the motor's current on two (12 A in cruise: 1 to 2 uT, 3 uT or so at full throttle).
     "hobby": {
-        "noise_ut": 1.0,
+        "noise_ut": 0.5,
         "hard_iron_ut": 6.0,
         "soft_iron_percent": 5.0,
         "current_ut_per_a": 0.1,

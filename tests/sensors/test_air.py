@@ -5,6 +5,8 @@ import pytest
 from scipy import stats
 from worlds.sensor_truth import RATE_HZ, lively, still
 
+from testbed import Scenario
+from testbed.estimators.datasheet import aid_of
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
 from testbed.sensors.barometer import Barometer, BarometerConfig
 
@@ -65,6 +67,22 @@ def test_airspeed_errors():
         errors = np.array([speeds(config, start, seed)[0] - 25.0 for seed in range(3000)])
         assert errors.std() == pytest.approx(sigma, rel=0.05)
         assert config.errors().bias + 25.0 * config.errors().scale == pytest.approx(sigma)
+
+
+def test_unsteady_errors_are_gauss_markov_and_told_as_noise():
+    truth = still(40_000, 10.0)
+    config = BarometerConfig(grade="perfect", rate_hz=10.0, noise_pa=3.0, unsteady_pa=40.0, unsteady_time_s=8.0)
+    off = pressures(config, truth, rate_hz=10.0) - 101_325
+    assert off.std() == pytest.approx(np.hypot(40, 3), rel=0.05)
+    assert np.corrcoef(off[80:], off[:-80])[0, 1] == pytest.approx(np.exp(-1), abs=0.1)
+    tube = AirspeedConfig(grade="perfect", rate_hz=10.0, unsteady_pa=14.0, unsteady_time_s=2.0)
+    off = 0.5 * 1.225 * (speeds(tube, flying(40_000, 10.0), rate_hz=10.0) ** 2 - 25.0**2)
+    assert off.std() == pytest.approx(14, rel=0.05)
+    assert np.corrcoef(off[20:], off[:-20])[0, 1] == pytest.approx(np.exp(-1), abs=0.1)
+    rig = Scenario.load("u_turn", {"sensors.barometer.grade": "hobby", "sensors.airspeed.grade": "hobby"}).rig(1)
+    told = [aid_of(name, rig, rig.imu("imu").errors(), rig.air(0.0)).sigma for name in ("barometer", "airspeed")]
+    assert told[0] == pytest.approx(40.1 / 12, rel=0.01)
+    assert told[1] == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
 
 
 @pytest.mark.parametrize("beta_deg", [0.0, 10.0, -20.0])
