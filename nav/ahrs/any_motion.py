@@ -86,30 +86,35 @@ class AnyMotionLevelling:
         return H, np.full(2, variance / T**2)
 
     def watch(self, s: State, f_n: Array, omega_b: Array, T: float) -> None:
-        """Follow the horizontal specific force ``f_n`` (2,) [m/s^2] and the rate ``omega_b`` (3,) [rad/s]."""
+        """Follow the specific force ``f_n`` (3,) [m/s^2] and the rate ``omega_b`` (3,) [rad/s]."""
         m, told = s.in_motion, self.told
         smoothing, memory, turning = (
             -math.expm1(-T / time)
             for time in (told.acceleration_smoothing_s, told.acceleration_memory_s, told.turn_memory_s)
         )
-        m.force_n += smoothing * (f_n - m.force_n)
+        m.force_n += smoothing * (f_n[:2] - m.force_n)
         m.mean_force_n += memory * (m.force_n - m.mean_force_n)
         beside = m.force_n - m.mean_force_n
         m.force_variance += memory * (0.5 * float(beside @ beside) - m.force_variance)
         m.turn_rate += turning * (float(dcm_from_quat(s.q_nb)[2] @ omega_b) - m.turn_rate)
         m.rate_square += turning * (float(omega_b @ omega_b) - m.rate_square)
+        m.excess += turning * (float(f_n @ f_n) - self._g**2 - m.excess)
 
     def acceleration(self, s: State, compensated: bool) -> float:
         """What to expect of horizontal acceleration, rms of an axis [m/s^2]: what varies, and unless airspeed tells it
         what a lasting turn may hide.
 
-        A turn of the rate w at the speed v accelerates by v w in a direction that lasts for 1 / w: a density of
-        2 v^2 w. It is believed in by the share of w^2 in the mean square of the rate: a hand swings, and does not turn.
+        A turn of the rate w at the speed v accelerates by a = v w in a direction that lasts for 1 / w: a density of
+        2 a^2 / w. It is believed in by the share of w^2 in the mean square of the rate: a hand swings, and does not
+        turn. Nor does it accelerate by more than shows in the size of the specific force, whatever the attitude:
+        |f|^2 = g^2 + a^2, of which a bias b of the accelerometers may hide 2 g b.
         """
         m = s.in_motion
         hidden = 0.0
         if not compensated and m.rate_square > 0:
-            hidden = 2 * self.told.unknown_speed**2 * abs(m.turn_rate) ** 3 / m.rate_square
+            shows = abs(m.excess) + 2 * self._g * self.config.imu.accel_bias_sigma
+            square = min((self.told.unknown_speed * m.turn_rate) ** 2, shows)
+            hidden = 2 * square * abs(m.turn_rate) / m.rate_square
         return math.sqrt(m.force_variance + hidden / self._lasting_s)
 
     def unexplained(self, s: State, f_n: Array, T: float) -> Array:

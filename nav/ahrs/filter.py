@@ -292,7 +292,7 @@ class Ahrs:
             return
         f_n, compensated = self._steady_force(s, t)
         omega_b = s.angle / T - s.gyro_bias
-        how.watch(s, f_n[:2], omega_b, T)
+        how.watch(s, f_n, omega_b, T)
         acceleration = how.acceleration(s, compensated)
         s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
         s.mode_counter += 1

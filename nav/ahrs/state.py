@@ -26,6 +26,7 @@ class InMotion:
     force_variance: float  # about that mean, of one axis
     turn_rate: float  # about the vertical, mean of the last seconds [rad/s]
     rate_square: float  # of the rate about any axis, mean of the last seconds
+    excess: float  # of the square of the specific force over that of gravity, mean of the last seconds [m^2/s^4]
     fields: int  # samples in `State.field_n` since the period began
     sensor: str  # whose they are
     field: Array  # (2,) level and downward part of what counts as the undisturbed field [T], NaN before the first
@@ -103,6 +104,7 @@ def fresh(period_end: float, n: int) -> State:
             force_variance=0.0,
             turn_rate=0.0,
             rate_square=0.0,
+            excess=0.0,
             fields=0,
             sensor="",
             field=UNKNOWN[:2],

@@ -162,6 +162,31 @@ def test_first_levelling_in_motion_claims_what_it_errs():
     assert abs(error[0]) < 2.5 * claimed.max()
 
 
+@pytest.mark.ci
+def test_turned_on_the_spot_it_is_levelled():
+    """100 deg/s in a hand is no turn at speed, the specific force is no larger than gravity: what gyros lose on the way,
+    3 deg in 100 s, is found by it."""
+    t = np.arange(12001) * DT
+    motion = made(t, Rotation.from_rotvec(np.outer(t, [0.0, 0.0, 100 * DEG])), np.zeros((12000, 3)))
+    motion.imu.dtheta[:] += 0.3 * DEG * math.sqrt(DT) * np.random.default_rng(1).normal(size=(12000, 3))
+    _, phi, covariance, *_ = track(motion, BLIND)
+    assert rms(phi[:, :2]) < 0.3 * DEG
+    assert np.all(np.abs(phi[:, :2]) < 4 * np.sqrt(covariance.diagonal(axis1=1, axis2=2)[:, :2]))
+
+
+def test_a_turn_at_speed_does_not_lean_it():
+    """12 deg/s at 15 m/s, leaning by 18 deg as specific force does: half a minute of it is not taken for level."""
+    rate, speed, t = 12 * DEG, 15.0, np.arange(4001) * DT
+    heading = rate * np.maximum(t - 10.0, 0.0)
+    lean = np.where(t > 10.0, math.atan(rate * speed / G), 0.0)
+    velocity = speed * np.column_stack([np.cos(heading), np.sin(heading), 0.0 * t])
+    attitude = Rotation.from_euler("ZYX", np.column_stack([heading, 0.0 * t, lean]))
+    motion = made(t, attitude, np.diff(velocity, axis=0) / DT)
+    _, phi, covariance, *_ = track(motion, BLIND)
+    assert np.abs(phi[:, :2]).max() < 3 * DEG
+    assert np.all(np.abs(phi[:, :2]) < 4 * np.sqrt(covariance.diagonal(axis1=1, axis2=2)[:, :2]))
+
+
 def test_airspeed_levels_in_a_turn():
     """100 s of turns at 3 deg/s and 50 m/s: 15 deg of bank, of which airspeed leaves less than one."""
     truth = level_flight(3.0, (50.0, 550.0))
