@@ -164,8 +164,8 @@ def test_first_levelling_in_motion_claims_what_it_errs():
 
 @pytest.mark.ci
 def test_turned_on_the_spot_it_is_levelled():
-    """100 deg/s in a hand is no turn at speed, the specific force is no larger than gravity: what gyros lose on the way,
-    3 deg in 100 s, is found by it."""
+    """100 deg/s in a hand is no turn at speed, the specific force is no larger than gravity: what gyros lose on the
+    way, 3 deg in 100 s, is found by it."""
     t = np.arange(12001) * DT
     motion = made(t, Rotation.from_rotvec(np.outer(t, [0.0, 0.0, 100 * DEG])), np.zeros((12000, 3)))
     motion.imu.dtheta[:] += 0.3 * DEG * math.sqrt(DT) * np.random.default_rng(1).normal(size=(12000, 3))
