@@ -15,7 +15,12 @@ WEATHER, GRADE = "walking", "consumer"
 
 
 # By aids, and the time since GNSS was lost [s]: median and 95 % of the horizontal error [m] at most.
-ERRORS = {("flow", 120): (8.0, 20.0), ("flow", 600): (25.0, 60.0)}
+ERRORS = {
+    ("flow", 120): (8.0, 20.0),
+    ("flow", 600): (25.0, 60.0),
+    ("terrain", 600): (40.0, 100.0),
+    ("terrain", 1800): (40.0, 100.0),
+}
 SHARES = {("flow", 1800): 1.0}  # 95 % of the error over the distance flown since, at most [%]
 RATIOS = {"air_data": 1.10}  # RMS over the bound, at every time
 BEATEN = 0.05  # probability that any figure of a whole table is taken to be below the bound though none is

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from testbed.denied.benchmark import Result
+    from testbed.denied.table import Weather
 
 SUMMARY, DRAWS = "denied.json", "denied.csv"
 ELLIPSE = -2 * math.log(0.05)  # of chi-square with two degrees of freedom, 95 %
@@ -192,7 +193,7 @@ def tables(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[
     from rich.table import Table
 
     for weather in result.plan.table.weathers:
-        table = Table(title=_heading(result, weather.title), box=box.SIMPLE, title_justify="left")
+        table = Table(title=_heading(result, weather), box=box.SIMPLE, title_justify="left")
         for k, name in enumerate(COLUMNS):
             table.add_column(escape(name), justify="left" if k < 2 else "right", overflow="fold")
         rows = list(_rows(result, found, weather.name))
@@ -206,8 +207,9 @@ def tables(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[
         yield goals
 
 
-def _heading(result: Result, title: str) -> str:
-    return f"{title[:1].upper()}{title[1:]}: {len(result.plan.seeds)} draws"
+def _heading(result: Result, weather: Weather) -> str:
+    draws = sum(one.weather == weather.name for one in result.outcomes)
+    return f"{weather.title[:1].upper()}{weather.title[1:]}: {draws} draws"
 
 
 def page(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[Claim]]) -> str:
@@ -225,7 +227,7 @@ def page(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[Cl
         *_markdown(GOAL_COLUMNS, (row for row, _ in _goal_rows(claims))),
     ]
     for weather in plan.table.weathers:
-        lines += ["", f"## {_heading(result, weather.title)}", ""]
+        lines += ["", f"## {_heading(result, weather)}", ""]
         lines += _markdown(COLUMNS, _rows(result, found, weather.name))
     return "\n".join(lines) + "\n"
 

@@ -38,7 +38,8 @@ def _figure(result: Result, estimator: str) -> Figure:
                 _curves(ax, own, (aids.name, grade.name, estimator), grade.name, style.COLOURS[k])
     for row in drawn.axes:
         row[0].set_ylabel("horizontal error [m]")
-        limits = np.array([ax.dataLim.intervaly for ax in row if ax.lines])
+        limits = np.array([ax.dataLim.intervaly for ax in row])
+        limits = limits[np.isfinite(limits).all(axis=1)]
         for ax in row:
             ax.set_xlim(10.0, max(table.marks_s))
             for mark in table.marks_s:

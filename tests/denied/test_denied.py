@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 import testbed.__main__ as cli
 from testbed import Scenario, run
+from testbed.data import data_dir
 from testbed.denied import benchmark, flight, goals, saved
 from testbed.denied.benchmark import Plan, Result, contestants
 from testbed.denied.flight import Outcome
@@ -70,7 +71,8 @@ def filters(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def entered(filters: Path) -> tuple[Contestant, ...]:
-    return contestants(["ins", "./filters.py:Still", "./filters.py:Ends"], SMALL, filters)
+    begun = data_dir("template") / "filters.py"  # as `testbed init` writes it
+    return contestants(["ins", "./filters.py:Still", "./filters.py:Ends", f"{begun}:Mine"], SMALL, filters)
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +106,9 @@ def test_a_flight_is_what_a_run_of_its_scenario_flies(flown: Outcome, cases: lis
 
 @pytest.mark.ci
 def test_estimators_of_others_are_handed_the_same(flown: Outcome) -> None:
-    assert {lane[2] for lane in flown.lanes} == {"ins", "Still", "Ends"}
+    assert {lane[2] for lane in flown.lanes} == {"ins", "Still", "Ends", "Mine"}
     by_name = dict(zip(flown.lanes, flown.horizontal, strict=True))
-    assert by_name["flow", "consumer", "Still"][-1] > 500
+    assert by_name["flow", "consumer", "Still"][-1] > 500 > 100 > by_name["flow", "consumer", "Mine"][-1]
     assert np.isfinite(by_name["flow", "consumer", "Ends"]).tolist() == [True, True, False]
     assert "ValueError: knows 4 kinds" in flown.ended["air_data/consumer/Ends"]
     assert "ValueError: knows 6 kinds" in flown.ended["flow/consumer/Ends"]
@@ -295,6 +297,13 @@ def test_without_a_bound_there_is_no_efficiency() -> None:
     result = whole(5, change=lambda one: dataclasses.replace(one, bound=np.full_like(one.bound, np.nan)))
     assert {cell.efficiency for cell in report.cells(result)} == {None}
     assert goals.below_the_bound(result, "ins") == (0, 0)
+
+
+def test_the_figure_of_who_never_had_an_estimate_is_empty() -> None:
+    def nothing(one: Outcome) -> Outcome:
+        return dataclasses.replace(one, error=np.full_like(one.error, np.nan), bound=np.full_like(one.bound, np.nan))
+
+    assert list(report.figures(whole(2, change=nothing))) == ["denied_ins.png"]
 
 
 # --- what is written
