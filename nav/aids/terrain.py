@@ -1,7 +1,10 @@
 """What is seen of the ground: its range along the body's down axis, and how its image moves.
 
-Both are predicted from the height over the map, with the error of the map as a state (`TERRAIN`) that they share: a
-rangefinder finds it, and optical flow is a velocity then.
+Both are predicted from the height over the map, with the error of the map as states (`TERRAIN`, `LOCAL`) that they
+share: a rangefinder finds it, and optical flow is a velocity then. Over relief a range tells of the position, too: its
+Jacobian has the slope of the map where the line of sight ends (SITAN: Hostetler and Andreas, Nonlinear Kalman Filtering
+Techniques for Terrain-Aided Navigation, IEEE Trans. Automatic Control 28 (3), 1983). That is right while the position
+is known better than the slope changes from place to place.
 """
 
 from __future__ import annotations
@@ -20,7 +23,8 @@ from nav.rotation import cross, dcm_from_quat
 from nav.samples import Array, OpticalFlowSample, RangeSample, Sample
 from nav.terrain import Terrain, slant_range
 
-TERRAIN = "terrain"  # the state: how much higher the ground is than on the map [m]
+TERRAIN = "terrain"  # the state: how much higher the ground is than on the map, everywhere [m]
+LOCAL = "terrain_local"  # and here, first-order Markov along the way [m]
 RANGE_LIMITS, RATE_LIMIT = (0.0, 20_000.0), 100.0  # what an instrument could possibly report [m], [rad/s]
 LEAST_QUALITY = 0.01
 
@@ -29,7 +33,8 @@ LEAST_QUALITY = 0.01
 class RangefinderAid:
     """Range to the ground along the body's down axis, with white noise and an unknown scale factor.
 
-    ``map_sigma`` [m] is how well the ``terrain`` is known.
+    ``map_sigma`` [m] is how well the ``terrain`` is known as a whole, ``local_sigma`` from place to place, of errors
+    that pass by in ``local_correlation_s``.
     """
 
     sensor: str = "rangefinder"
@@ -37,17 +42,22 @@ class RangefinderAid:
     scale_sigma: float = 0.0  # [1]
     terrain: Terrain = field(default_factory=Terrain)
     map_sigma: float = 5.0
+    local_sigma: float = 0.0
+    local_correlation_s: float = 10.0
 
     parts = (("range", 1),)
 
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        return TERRAIN, f"{self.sensor}_scale"
+        return TERRAIN, LOCAL, f"{self.sensor}_scale"
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        return [Block(TERRAIN, 1, self.map_sigma), Block(self.states[1], 1, self.scale_sigma)]
+        return [
+            *ground_blocks(self.map_sigma, self.local_sigma, self.local_correlation_s),
+            Block(self.states[2], 1, self.scale_sigma),
+        ]
 
     @cached_property
     def _R(self) -> Array:
@@ -56,8 +66,10 @@ class RangefinderAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, RangeSample)
-        state, terrain, (raised, scale) = at.state, self.terrain, at.starts
-        nu, H = range_to_ground(state.q_nb, state.lla, at.x, raised, scale, sample.range, terrain.heights, terrain.grid)
+        state, terrain, (raised, local, scale) = at.state, self.terrain, at.starts
+        nu, H = range_to_ground(
+            state.q_nb, state.lla, at.x, raised, local, scale, sample.range, terrain.heights, terrain.grid
+        )
         return None if math.isnan(nu[0]) else Measurement(nu, H, self._R)
 
 
@@ -76,19 +88,21 @@ class OpticalFlowAid:
     error_correlation_s: float = 300.0
     terrain: Terrain = field(default_factory=Terrain)
     map_sigma: float = 5.0
+    local_sigma: float = 0.0
+    local_correlation_s: float = 10.0
 
     parts = (("optical_flow", 2),)
 
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        return TERRAIN, f"{self.sensor}_scale", f"{self.sensor}_error"
+        return TERRAIN, LOCAL, f"{self.sensor}_scale", f"{self.sensor}_error"
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        _, scale, error = self.states
+        *_, scale, error = self.states
         return [
-            Block(TERRAIN, 1, self.map_sigma),
+            *ground_blocks(self.map_sigma, self.local_sigma, self.local_correlation_s),
             Block(scale, 1, self.scale_sigma),
             markov(error, 2, self.error_sigma, self.error_correlation_s),
         ]
@@ -96,13 +110,18 @@ class OpticalFlowAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, OpticalFlowSample)
-        state, terrain, (raised, scale, error) = at.state, self.terrain, at.starts
+        state, terrain, (raised, local, scale, error) = at.state, self.terrain, at.starts
         nu, H = optical_flow(
-            state.q_nb, state.v_n, state.lla, at.x, raised, scale, error, sample.flow_b, sample.rotation_b,
+            state.q_nb, state.v_n, state.lla, at.x, raised, local, scale, error, sample.flow_b, sample.rotation_b,
             terrain.heights, terrain.grid,
         )  # fmt: skip
         R = np.full(2, self.sigma**2 / max(sample.quality, LEAST_QUALITY))
         return None if math.isnan(nu[0]) else Measurement(nu, H, R)
+
+
+def ground_blocks(map_sigma: float, local_sigma: float, local_correlation_s: float) -> list[Block]:
+    """The error of the map, which all who look at the ground share."""
+    return [Block(TERRAIN, 1, map_sigma), markov(LOCAL, 1, local_sigma, local_correlation_s)]
 
 
 def range_trouble(sample: RangeSample) -> str:
@@ -117,7 +136,9 @@ def flow_trouble(sample: OpticalFlowSample) -> str:
 
 
 @njit
-def _sight(q_nb: Array, lla: Array, x: Array, terrain: int, heights: Array, grid: Array) -> tuple[float, Array]:
+def _sight(
+    q_nb: Array, lla: Array, x: Array, terrain: int, local: int, heights: Array, grid: Array
+) -> tuple[float, Array]:
     """Range r [m] along the body's down axis u to the ground, and dr / d error state (n,); NaN where there is none.
 
     p + r u is on the ground of slope g, so with D = u_D + g_N u_N + g_E u_E, phi turning u by u x phi,
@@ -127,24 +148,36 @@ def _sight(q_nb: Array, lla: Array, x: Array, terrain: int, heights: Array, grid
     C_nb = dcm_from_quat(q_nb)
     u = np.array([C_nb[0, 2], C_nb[1, 2], C_nb[2, 2]])
     h = np.zeros(len(x))
-    length, slope_n, slope_e = slant_range(lla, u, x[terrain] if terrain >= 0 else 0.0, heights, grid)
+    raised = x[terrain] if terrain >= 0 else 0.0
+    if local >= 0:
+        raised += x[local]
+    length, slope_n, slope_e = slant_range(lla, u, raised, heights, grid)
     normal = np.array([slope_n, slope_e, 1.0])
     closing = u[0] * normal[0] + u[1] * normal[1] + u[2]
     turned = cross(normal, u)  # normal . (u x phi) = (normal x u) . phi
     for i in range(3):
         h[PHI + i] = -length * turned[i] / closing
         h[POS + i] = -normal[i] / closing
-    if terrain >= 0:
-        h[terrain] = -1.0 / closing
+    for state in (terrain, local):
+        if state >= 0:
+            h[state] = -1.0 / closing
     return length, h
 
 
 @njit
 def range_to_ground(
-    q_nb: Array, lla: Array, x: Array, terrain: int, scale: int, measured: float, heights: Array, grid: Array
+    q_nb: Array,
+    lla: Array,
+    x: Array,
+    terrain: int,
+    local: int,
+    scale: int,
+    measured: float,
+    heights: Array,
+    grid: Array,
 ) -> tuple[Array, Array]:
     """Range [m]: (1 + scale) r along the body's down axis; see `_sight`."""
-    length, h = _sight(q_nb, lla, x, terrain, heights, grid)
+    length, h = _sight(q_nb, lla, x, terrain, local, heights, grid)
     gain = 1.0 + x[scale] if scale >= 0 else 1.0
     H = np.empty((1, len(x)))
     H[0] = gain * h
@@ -155,8 +188,8 @@ def range_to_ground(
 
 @njit
 def optical_flow(
-    q_nb: Array, v_n: Array, lla: Array, x: Array, terrain: int, scale: int, error: int, flow_b: Array,
-    rotation_b: Array, heights: Array, grid: Array,
+    q_nb: Array, v_n: Array, lla: Array, x: Array, terrain: int, local: int, scale: int, error: int,
+    flow_b: Array, rotation_b: Array, heights: Array, grid: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Flow less rotation about body x and y [rad/s]: (1 + scale)(w_ge + m) + scale w_rotation + error.
 
@@ -165,7 +198,7 @@ def optical_flow(
     ``rotation_b`` (2,) feels the Earth turn as well, so w_ge = -C_nb' w_ie remains.
     """
     C_nb = dcm_from_quat(q_nb)
-    length, h = _sight(q_nb, lla, x, terrain, heights, grid)
+    length, h = _sight(q_nb, lla, x, terrain, local, heights, grid)
     earth_n = earth_rate_n(lla[0])
     gain = 1.0 + x[scale] if scale >= 0 else 1.0
     nu, H = np.empty(2), np.zeros((2, len(x)))

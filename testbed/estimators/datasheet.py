@@ -118,7 +118,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
     from_imu: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
         case RangefinderConfig() | OpticalFlowConfig():
-            return _eye(name, section, rig.site)
+            return _eye(name, section, rig.site, usual)
         case GnssConfig():
             e = section.errors()
             return GnssAid(
@@ -173,10 +173,11 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
     return None if maker is None else maker(name, section, imu)
 
 
-def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site) -> Aid:
-    """A sensor that looks at the ground, with the map."""
+def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, usual: Usual) -> Aid:
+    """A sensor that looks at the ground, with the map, whose errors pass by as fast as the aircraft usually flies."""
+    map_ = site.terrain, site.terrain_sigma, site.local_sigma, site.local_length / usual.airspeed_mps
     if isinstance(section, RangefinderConfig):
         r = section.errors()
-        return RangefinderAid(name, r.noise, r.scale, site.terrain, site.terrain_sigma)
+        return RangefinderAid(name, r.noise, r.scale, *map_)
     f = section.errors()
-    return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, site.terrain, site.terrain_sigma)
+    return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, *map_)

@@ -143,7 +143,11 @@ class Wind(Section):
 
 
 class Terrain(Section):
-    """The ground below, level or with relief, as maps tell; it is higher or lower than these by one draw a run."""
+    """The ground below, level or with relief. Filters have a map of it, from which the ground of a run differs.
+
+    By one height everywhere (``map_sigma_m``), by heights that change from place to place (``map_error_m``), and by
+    what lies between the points of a coarser map (``map_every``).
+    """
 
     height_m: float = Field(default=0.0, ge=-500, le=9000, description="of the map above the WGS84 ellipsoid")
     map_sigma_m: float = Field(
@@ -152,13 +156,22 @@ class Terrain(Section):
     file: str | None = Field(
         default=None,
         description="heights in place of one, seen from this file: an SRTM tile (`.hgt`), or `.npz` with `lat_deg`,"
-        " `lon_deg` and `height_m`",
+        " `lon_deg` and `height_m`; or `jacksboro`, 36.45 to 36.73 north, 84.41 to 84.08 west, which comes along",
+    )
+    map_error_m: float = Field(
+        default=0.0, ge=0, le=1000, description="1 sigma of errors of the map that change over ground; filters know it"
+    )
+    map_correlation_m: float = Field(default=200.0, gt=0, le=1e5, description="over what distance these fall to 1/e")
+    map_every: int = Field(
+        default=1, ge=1, le=100, description="filters' maps have each of so many rows and columns of the file only"
     )
 
     @model_validator(mode="after")
     def _one_ground(self) -> Self:
         if self.file and "height_m" in self.model_fields_set:
             raise ValueError("a file replaces height_m: give one or the other")
+        if not self.file and (self.map_error_m or self.map_every > 1):
+            raise ValueError("map_error_m and map_every are of a map with relief: give a file, or leave them out")
         return self
 
 

@@ -1,4 +1,4 @@
-"""The ground from a file: an SRTM tile, or a grid of heights in a NumPy archive."""
+"""The ground from a file, an SRTM tile or a grid of heights in a NumPy archive, and how maps of it are wrong."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from matplotlib.cbook import get_sample_data
+from scipy.ndimage import map_coordinates
+from scipy.signal import lfilter
 
+from nav.earth import radii
 from nav.samples import Array
 from nav.terrain import Terrain
 from testbed.errors import UserError
@@ -21,18 +25,62 @@ VOID = -32768  # of SRTM, where nothing was measured
 LIMITS = (-500.0, 9000.0)  # [m]
 NEEDED = ("lat_deg", "lon_deg", "height_m")
 EVEN = 1e-6  # of a step
+JACKSBORO = "jacksboro"  # the relief among the sample data of matplotlib, in place of a file
 
 
 def of(section: Section) -> Terrain:
     """The map of a section. Raises UserError where its file can't be read or makes no sense."""
     if section.file is None:
         return Terrain.flat(section.height_m)
+    if section.file == JACKSBORO:
+        return _jacksboro()
     path = Path(section.file)
     try:
         changed = path.stat().st_mtime_ns
     except OSError as error:
         raise UserError(f"{path}: can't be read: {error.strerror or error}") from None
     return _kept(path, changed)
+
+
+def thinned(terrain: Terrain, every: int) -> tuple[Terrain, float]:
+    """A map with each of ``every`` rows and columns, and the rms [m] of what lies between its points.
+
+    Raises UserError where that is less than two of each.
+    """
+    if every == 1:
+        return terrain, 0.0
+    heights = np.ascontiguousarray(terrain.heights[::every, ::every])
+    if min(heights.shape) < 2:
+        raise UserError(f"of the file's {min(terrain.heights.shape)} rows or columns, map_every leaves one: lower it")
+    places = [np.minimum(np.arange(n) / every, (n - 1) // every) for n in terrain.heights.shape]
+    between = map_coordinates(heights, np.meshgrid(*places, indexing="ij"), order=1)
+    grid = terrain.grid * [1.0, every, 1.0, every]
+    return Terrain(heights, grid), float(np.sqrt(np.mean((between - terrain.heights) ** 2)))
+
+
+def uneven(terrain: Terrain, sigma: float, length: float, rng: np.random.Generator) -> Terrain:
+    """The same with errors of ``sigma`` [m] drawn by ``rng``, alike by exp(-(|north| + |east|) / length [m])."""
+    if not sigma:
+        return terrain
+    R_M, R_N = radii(terrain.grid[0])
+    field = rng.standard_normal(terrain.heights.shape)
+    steps = terrain.grid[1] * R_M, terrain.grid[3] * R_N * math.cos(terrain.grid[0])
+    for axis, step in enumerate(steps):
+        phi = math.exp(-step / length)
+        drive = math.sqrt(1 - phi**2)
+        first = np.take(field, [0], axis=axis) * (1 - drive)  # so that the first one is as large as the others
+        phis = phi ** np.arange(field.shape[axis])
+        field = lfilter([drive], [1.0, -phi], field, axis=axis) + first * (phis[:, None] if axis == 0 else phis)
+    return Terrain(terrain.heights + sigma * field, terrain.grid)
+
+
+@lru_cache(maxsize=1)
+def _jacksboro() -> Terrain:
+    """3 arc-seconds from SRTM around a fault in Tennessee; rows from the north, whose bounds the file has swapped."""
+    with np.load(str(get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))) as archive:
+        heights = np.ascontiguousarray(archive["elevation"][::-1].astype(float))
+        south, west, step = float(archive["ymax"]), float(archive["xmin"]), float(archive["dy"])
+    return Terrain(heights, np.radians([south + 0.5 * step, step, west + 0.5 * step, step]))
 
 
 @lru_cache(maxsize=2)

@@ -162,6 +162,7 @@ EXTRA = {
     "body_velocity_scale": Variable("1", "estimated scale factor error of the body velocity sensor", ("body_axis",)),
     "body_velocity_error": Variable("m/s", "estimated correlated error of body velocity", ("body_axis",)),
     "terrain": Variable("m", "estimated height of the ground over the map"),
+    "terrain_local": Variable("m", "estimated height of the ground over the map here, beside that"),
     "rangefinder_scale": Variable("1", "estimated scale factor error of the rangefinder"),
     "optical_flow_scale": Variable("1", "estimated scale factor error of the optics"),
     "optical_flow_error": Variable("rad/s", "estimated slow error of optical flow", ("body_xy",)),

@@ -37,7 +37,7 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         if not isinstance(scenario.truth, LogTruth):  # whose sensors have times of their own
             yield from _tick_mistakes(("sensors", name), config, tick_hz)
     try:
-        terrain.of(scenario.truth.terrain)
+        terrain.thinned(terrain.of(scenario.truth.terrain), scenario.truth.terrain.map_every)
     except UserError as error:
         yield ("truth", "terrain", "file"), str(error)
     yield from _plan_mistakes(scenario)

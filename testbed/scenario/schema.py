@@ -268,9 +268,12 @@ class Scenario(Section):
         if start is None:
             raise UserError("truth.start: is found in the log when it is run; to know it before, give it")
         ground = self.truth.terrain
+        finer = terrain.of(ground)
+        map_, between = terrain.thinned(finer, ground.map_every)
         return Site(
             self.date, math.radians(start.lat_deg), math.radians(start.lon_deg), start.alt_m,
-            terrain.of(ground), ground.map_sigma_m,
+            map_, ground.map_sigma_m, math.hypot(ground.map_error_m, between), ground.map_correlation_m,
+            finer, ground.map_error_m,
         )  # fmt: skip
 
     def rig(self, seed: int) -> Rig:
@@ -357,7 +360,7 @@ def _see_files(truth: dict[str, Any], path: Path | None) -> None:
     if isinstance(named := truth.get("aircraft"), str):
         truth["aircraft"] = _aircraft(named, path)
     for table in (truth if truth.get("source") == "log" else None, truth.get("wind"), truth.get("terrain")):
-        if isinstance(table, dict) and isinstance(file := table.get("file"), str):
+        if isinstance(table, dict) and isinstance(file := table.get("file"), str) and file != terrain.JACKSBORO:
             table["file"] = str(folder / file)
 
 

@@ -124,7 +124,7 @@ class OpticalFlow:
         self._schedule = Schedule.of(name, config, tick_rate_hz)
         self._middle_s = 0.5 * (self._schedule.every - 1) / tick_rate_hz
         self._interruptions = Interruptions(name, config, seed)
-        self._terrain, self._raised = site.terrain, site.raised(seed)
+        self._terrain, self._raised = site.ground(seed), site.raised(seed)
         self._scale = float(stream(seed, name, "scale").standard_normal()) * e.scale
         self._white = Process.white(stream(seed, name, "white"), np.full(2, e.noise))
         self._bias = Process.gauss_markov(stream(seed, name, "bias"), np.full(2, e.bias), e.tau, 1 / config.rate_hz)

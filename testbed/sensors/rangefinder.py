@@ -71,7 +71,7 @@ class Rangefinder:
         self._limits = config.min_range_m, config.max_range_m
         self._schedule = Schedule.of(name, config, tick_rate_hz)
         self._interruptions = Interruptions(name, config, seed)
-        self._terrain, self._raised = site.terrain, site.raised(seed)
+        self._terrain, self._raised = site.ground(seed), site.raised(seed)
         self._scale = float(stream(seed, name, "scale").standard_normal()) * e.scale
         self._white = Process.white(stream(seed, name, "white"), [e.noise])
 

@@ -24,8 +24,8 @@ HILLS = Terrain(
 )
 FLAT = Terrain.flat(120.0)
 TERRAINS = pytest.mark.parametrize("terrain", [FLAT, HILLS], ids=["flat", "hills"])
-TERRAIN, SCALE, ERROR = MOTION, MOTION + 1, MOTION + 2  # states beside the motion
-N = MOTION + 4
+TERRAIN, SCALE, ERROR, LOCAL = MOTION, MOTION + 1, MOTION + 2, MOTION + 4  # states beside the motion
+N = MOTION + 5
 
 
 def test_heights_are_those_between_the_points() -> None:
@@ -78,7 +78,7 @@ def state(seed: int) -> tuple[np.ndarray, ...]:
     q_nb = Rotation.from_euler("ZYX", angles, degrees=True).as_quat(scalar_first=True)
     lla = np.array([LAT + 20 * STEP, LON + 20 * STEP, rng.uniform(700, 1200)])
     x = np.zeros(N)
-    x[MOTION:] = rng.normal(size=4) * [5.0, 0.02, 1e-4, 1e-4]
+    x[MOTION:] = rng.normal(size=5) * [5.0, 0.02, 1e-4, 1e-4, 5.0]
     return q_nb, rng.normal(size=3) * 20, lla, x
 
 
@@ -94,13 +94,13 @@ def displaced(at: tuple[np.ndarray, ...], delta: np.ndarray) -> tuple[np.ndarray
 
 
 def ranged(at: tuple[np.ndarray, ...], terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
-    return range_to_ground(at[0], at[2], at[3], TERRAIN, SCALE, 500.0, terrain.heights, terrain.grid)
+    return range_to_ground(at[0], at[2], at[3], TERRAIN, LOCAL, SCALE, 500.0, terrain.heights, terrain.grid)
 
 
 def flowing(at: tuple[np.ndarray, ...], terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
     rotation = np.array([0.02, -0.03])
     return optical_flow(
-        *at, TERRAIN, SCALE, ERROR, np.array([0.05, 0.01]), rotation, terrain.heights, terrain.grid
+        *at, TERRAIN, LOCAL, SCALE, ERROR, np.array([0.05, 0.01]), rotation, terrain.heights, terrain.grid
     )  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def test_jacobians_are_differences(measurement, terrain: Terrain, seed: int) -> 
     """But for 1e-5 m per metre, by which meridians converge between the aircraft and the ground that it sees."""
     at = state(seed)
     _, H = measurement(at, terrain)
-    steps = [*[1e-5] * 3, *[1e-3] * 3, *[0.1] * 4, 1e-5, 1e-6, 1e-6]
+    steps = [*[1e-5] * 3, *[1e-3] * 3, *[0.1] * 4, 1e-5, 1e-6, 1e-6, 0.1]
     for k, step in enumerate(steps):
         delta = np.zeros(N)
         delta[k] = step
@@ -126,6 +126,6 @@ def test_signs_of_flow() -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
     for v_n, expected in (([10.0, 0, 0], [0, 0.1]), ([0, 10.0, 0], [-0.1, 0])):
         nu, _ = optical_flow(
-            level, np.array(v_n), lla, x, -1, -1, -1, nothing, nothing, FLAT.heights, FLAT.grid
+            level, np.array(v_n), lla, x, -1, -1, -1, -1, nothing, nothing, FLAT.heights, FLAT.grid
         )  # fmt: skip
         np.testing.assert_allclose(-nu, np.array(expected) - [OMEGA_IE * math.cos(LAT), 0], atol=1e-12)
