@@ -136,7 +136,7 @@ class LocalFilter:
         for k, (q_nb, v_n, lla, x) in enumerate(zip(*points, strict=True)):
             there.q_nb[:], there.v_n[:], there.lla[:] = q_nb, v_n, lla
             sensor_errors(there.errors, x, reference.driven)
-            at_point = aid.measure(part, sample, OperatingPoint(reference, there, x, starts))
+            at_point = aid.measure(part, sample, OperatingPoint(reference, there, x, starts, state.P[self.row]))
             assert at_point is not None  # as whether there is a measurement depends on the sample alone
             at_points[k] = at_point.nu
         return measurement._replace(at_points=at_points)
@@ -145,9 +145,8 @@ class LocalFilter:
         self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample
     ) -> Measurement | None:
         """One part of a sample at the nominal state and the filter's own errors of aids, its R as learned."""
-        measurement = aid.measure(
-            part, sample, OperatingPoint(reference, state, state.x[self.row], self._starts[aid.sensor])
-        )
+        here = OperatingPoint(reference, state, state.x[self.row], self._starts[aid.sensor], state.P[self.row])
+        measurement = aid.measure(part, sample, here)
         noise = self._noise(aid.sensor, part)
         if measurement is None or noise is None:
             return measurement

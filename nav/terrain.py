@@ -12,6 +12,7 @@ from nav.earth import radii
 from nav.samples import Array
 
 STEEPEST = 0.3  # sine of the angle below the horizon from which on a line of sight is followed to the ground
+LEAST_REACH = 0.1  # over which a slope is taken [m]
 STEPS, CLOSE_M = 50, 0.01  # until a point of a line of sight is this close to the ground
 
 
@@ -54,10 +55,21 @@ def ground(lat: float, lon: float, heights: Array, grid: Array) -> tuple[float, 
 
 
 @njit
+def slope(lat: float, lon: float, reach: float, heights: Array, grid: Array) -> tuple[float, float]:
+    """Slope of the ground, per metre north and east [1], from its heights ``reach`` [m] to either side."""
+    R_M, R_N = radii(lat)
+    reach = max(reach, LEAST_REACH)
+    north, east = reach / R_M, reach / (R_N * math.cos(lat))
+    up_n = ground(lat + north, lon, heights, grid)[0] - ground(lat - north, lon, heights, grid)[0]
+    up_e = ground(lat, lon + east, heights, grid)[0] - ground(lat, lon - east, heights, grid)[0]
+    return 0.5 * up_n / reach, 0.5 * up_e / reach
+
+
+@njit
 def slant_range(
     lla: Array, direction_n: Array, raised: float, heights: Array, grid: Array
 ) -> tuple[float, float, float]:
-    """Range [m] along a unit vector ``direction_n`` (3,) to the ground ``raised`` [m] over the map; its slope there.
+    """Range [m] along a unit vector ``direction_n`` (3,) to the ground ``raised`` [m] over the map; its place [rad].
 
     The line is straight over a level Earth: over a kilometre it is 8 cm too high. NaN where it looks too near the
     horizon, where the ground is above, and where it meets none.
@@ -76,6 +88,6 @@ def slant_range(
         closing = direction_n[2] + slope_n * direction_n[0] + slope_e * direction_n[1]
         if abs(clearance) < CLOSE_M:
             length += clearance / closing
-            return (length, slope_n, slope_e) if length > 0.0 and closing > 0.0 else nothing
+            return (length, lat, lon) if length > 0.0 and closing > 0.0 else nothing
         length += clearance / max(closing, direction_n[2])  # short of the ground where that falls away
     return nothing

@@ -54,7 +54,7 @@ class Measurement(NamedTuple):
 
 
 class OperatingPoint(NamedTuple):
-    """What a measurement is predicted from: the nominal state and a filter's own states ``x`` (n,).
+    """What a measurement is predicted from: the nominal state, a filter's own states ``x`` (n,), and its ``P`` (n, n).
 
     ``starts`` are the indices where the aid's own blocks begin in ``x`` (`Aid.states`), -1 for one that is left out.
     """
@@ -63,6 +63,7 @@ class OperatingPoint(NamedTuple):
     state: State
     x: Array
     starts: tuple[int, ...]
+    P: Array
 
 
 class Aid(Protocol):

@@ -3,8 +3,9 @@
 Both are predicted from the height over the map, with the error of the map as states (`TERRAIN`, `LOCAL`) that they
 share: a rangefinder finds it, and optical flow is a velocity then. Over relief a range tells of the position, too: its
 Jacobian has the slope of the map where the line of sight ends (SITAN: Hostetler and Andreas, Nonlinear Kalman Filtering
-Techniques for Terrain-Aided Navigation, IEEE Trans. Automatic Control 28 (3), 1983). That is right while the position
-is known better than the slope changes from place to place.
+Techniques for Terrain-Aided Navigation, IEEE Trans. Automatic Control 28 (3), 1983), taken over as far as the position
+is uncertain (`REACH`), as theirs is of a plane fitted there: a slope at a point would make a filter sure of where the
+map has its bends. That is good for as long as that is no farther than hills are wide.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from nav.earth import earth_rate_n
 from nav.error_model import PHI, POS, VEL, Block, markov
 from nav.rotation import cross, dcm_from_quat
 from nav.samples import Array, OpticalFlowSample, RangeSample, Sample
-from nav.terrain import Terrain, slant_range
+from nav.terrain import Terrain, slant_range, slope
 
 TERRAIN = "terrain"  # the state: how much higher the ground is than on the map, everywhere [m]
 LOCAL = "terrain_local"  # and here, first-order Markov along the way [m]
 RANGE_LIMITS, RATE_LIMIT = (0.0, 20_000.0), 100.0  # what an instrument could possibly report [m], [rad/s]
 LEAST_QUALITY = 0.01
+REACH = 2.0  # sigma of the horizontal position, to either side, over which slopes are taken
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class RangefinderAid:
         assert isinstance(sample, RangeSample)
         state, terrain, (raised, local, scale) = at.state, self.terrain, at.starts
         nu, H = range_to_ground(
-            state.q_nb, state.lla, at.x, raised, local, scale, sample.range, terrain.heights, terrain.grid
+            state.q_nb, state.lla, at.x, raised, local, scale, reach(at.P), sample.range, terrain.heights, terrain.grid
         )
         return None if math.isnan(nu[0]) else Measurement(nu, H, self._R)
 
@@ -112,11 +114,16 @@ class OpticalFlowAid:
         assert isinstance(sample, OpticalFlowSample)
         state, terrain, (raised, local, scale, error) = at.state, self.terrain, at.starts
         nu, H = optical_flow(
-            state.q_nb, state.v_n, state.lla, at.x, raised, local, scale, error, sample.flow_b, sample.rotation_b,
-            terrain.heights, terrain.grid,
+            state.q_nb, state.v_n, state.lla, at.x, raised, local, scale, error, reach(at.P), sample.flow_b,
+            sample.rotation_b, terrain.heights, terrain.grid,
         )  # fmt: skip
         R = np.full(2, self.sigma**2 / max(sample.quality, LEAST_QUALITY))
         return None if math.isnan(nu[0]) else Measurement(nu, H, R)
+
+
+def reach(P: Array) -> float:
+    """Over how many metres to either side a filter of covariance ``P`` (n, n) takes slopes."""
+    return REACH * math.sqrt(0.5 * (P[POS, POS] + P[POS + 1, POS + 1]))
 
 
 def ground_blocks(map_sigma: float, local_sigma: float, local_correlation_s: float) -> list[Block]:
@@ -137,7 +144,7 @@ def flow_trouble(sample: OpticalFlowSample) -> str:
 
 @njit
 def _sight(
-    q_nb: Array, lla: Array, x: Array, terrain: int, local: int, heights: Array, grid: Array
+    q_nb: Array, lla: Array, x: Array, terrain: int, local: int, reach: float, heights: Array, grid: Array
 ) -> tuple[float, Array]:
     """Range r [m] along the body's down axis u to the ground, and dr / d error state (n,); NaN where there is none.
 
@@ -151,7 +158,10 @@ def _sight(
     raised = x[terrain] if terrain >= 0 else 0.0
     if local >= 0:
         raised += x[local]
-    length, slope_n, slope_e = slant_range(lla, u, raised, heights, grid)
+    length, lat, lon = slant_range(lla, u, raised, heights, grid)
+    if math.isnan(length):
+        return length, h
+    slope_n, slope_e = slope(lat, lon, reach, heights, grid)
     normal = np.array([slope_n, slope_e, 1.0])
     closing = u[0] * normal[0] + u[1] * normal[1] + u[2]
     turned = cross(normal, u)  # normal . (u x phi) = (normal x u) . phi
@@ -172,12 +182,13 @@ def range_to_ground(
     terrain: int,
     local: int,
     scale: int,
+    reach: float,
     measured: float,
     heights: Array,
     grid: Array,
 ) -> tuple[Array, Array]:
     """Range [m]: (1 + scale) r along the body's down axis; see `_sight`."""
-    length, h = _sight(q_nb, lla, x, terrain, local, heights, grid)
+    length, h = _sight(q_nb, lla, x, terrain, local, reach, heights, grid)
     gain = 1.0 + x[scale] if scale >= 0 else 1.0
     H = np.empty((1, len(x)))
     H[0] = gain * h
@@ -189,7 +200,7 @@ def range_to_ground(
 @njit
 def optical_flow(
     q_nb: Array, v_n: Array, lla: Array, x: Array, terrain: int, local: int, scale: int, error: int,
-    flow_b: Array, rotation_b: Array, heights: Array, grid: Array,
+    reach: float, flow_b: Array, rotation_b: Array, heights: Array, grid: Array,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Flow less rotation about body x and y [rad/s]: (1 + scale)(w_ge + m) + scale w_rotation + error.
 
@@ -198,7 +209,7 @@ def optical_flow(
     ``rotation_b`` (2,) feels the Earth turn as well, so w_ge = -C_nb' w_ie remains.
     """
     C_nb = dcm_from_quat(q_nb)
-    length, h = _sight(q_nb, lla, x, terrain, local, heights, grid)
+    length, h = _sight(q_nb, lla, x, terrain, local, reach, heights, grid)
     earth_n = earth_rate_n(lla[0])
     gain = 1.0 + x[scale] if scale >= 0 else 1.0
     nu, H = np.empty(2), np.zeros((2, len(x)))

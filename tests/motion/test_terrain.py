@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nav.terrain import ground
+from nav.earth import radii
+from nav.terrain import Terrain, ground
 from testbed import Scenario, run
 from testbed.errors import UserError
-from testbed.motion.terrain import read
+from testbed.motion.sections import Terrain as Section
+from testbed.motion.terrain import of, read, thinned, uneven
 
 LAT, LON = np.linspace(33.9, 34.1, 21), np.linspace(107.9, 108.1, 31)
 HEIGHTS = 100 + 50 * np.sin(40 * LAT[:, None]) * np.cos(30 * LON)
@@ -113,4 +115,61 @@ def test_a_scenario_flies_over_the_map_beside_it(tmp_path: Path) -> None:
 def test_a_map_that_is_not_there_is_named(tmp_path: Path) -> None:
     (tmp_path / "hills.toml").write_text(SCENARIO, "utf-8")
     with pytest.raises(UserError, match=r"truth\.terrain\.file.*ground\.npz: can't be read: No such file"):
+        Scenario.load(tmp_path / "hills.toml")
+
+
+def test_the_relief_that_comes_along() -> None:
+    """Hills in the north-west, a valley in the south-east, as on any map of Campbell County."""
+    terrain = of(Section(file="jacksboro"))
+    heights = terrain.heights
+    assert (heights.min(), heights.max(), heights.shape) == (236.0, 1076.0, (344, 403))
+    assert heights[172:, :200].mean() > heights[:172, 200:].mean() + 100
+    south, step, west, _ = np.degrees(terrain.grid)
+    assert (south, west) == pytest.approx((36.44625 + step / 2, -84.41375 + step / 2))
+
+
+def test_a_coarser_map_says_how_much_is_between_its_points() -> None:
+    steps = math.radians(3 / 3600)
+    rows, columns = np.mgrid[0:31, 0:41]
+    bowl = Terrain(0.01 * (rows - 10.0) ** 2 + 0.0 * columns, np.array([0.6, steps, 1.9, steps]))
+    known, between = thinned(bowl, 10)
+    assert known.heights.shape == (4, 5)
+    # between x = 0 and 10 a parabola 0.01 x^2 is lower than its chord by 0.01 x (10 - x)
+    chord = np.array([0.01 * x * (10 - x) for x in range(10)])
+    assert between == pytest.approx(math.sqrt(np.sum(3 * chord**2) / 31), rel=1e-9)
+    for i, j in ((0, 0), (2, 3)):
+        height = ground(0.6 + 10 * i * steps, 1.9 + 10 * j * steps, known.heights, known.grid)[0]
+        assert height == pytest.approx(bowl.heights[10 * i, 10 * j])
+    assert thinned(bowl, 1) == (bowl, 0.0)
+    with pytest.raises(UserError, match="map_every leaves one"):
+        thinned(bowl, 40)
+
+
+def test_errors_of_a_map_are_as_large_and_as_alike_as_is_told() -> None:
+    steps = math.radians(3 / 3600)
+    flat = Terrain(np.zeros((1200, 1200)), np.array([0.6, steps, 1.9, steps]))
+    field = uneven(flat, 4.0, 300.0, np.random.default_rng(1)).heights
+    R_M, R_N = radii(0.6)
+    assert field.std() == pytest.approx(4.0, rel=0.03)
+    assert field[0].std() == pytest.approx(4.0, rel=0.25)  # some 100 independent values
+    assert field[:, 0].std() == pytest.approx(4.0, rel=0.25)
+    for axis, apart in ((0, steps * R_M), (1, steps * R_N * math.cos(0.6))):
+        ahead, here = field.take(range(3, 1200), axis), field.take(range(1197), axis)
+        assert np.mean(ahead * here) / 16 == pytest.approx(math.exp(-3 * apart / 300.0), abs=0.05)
+    assert uneven(flat, 0.0, 300.0, np.random.default_rng(1)) is flat
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("map_error_m = 4", "are of a map with relief"),
+        ('file = "jacksboro", map_every = 500', "map_every"),
+        ('file = "jacksborough"', r"truth\.terrain\.file.*jacksborough: can't be read"),
+        ('file = "jacksboro", map_error_m = -1', "map_error_m"),
+    ],
+)
+def test_mistakes_in_the_section(tmp_path: Path, text: str, says: str) -> None:
+    written = SCENARIO.replace('file = "ground.npz", map_sigma_m = 0', text)
+    (tmp_path / "hills.toml").write_text(written, "utf-8")
+    with pytest.raises(UserError, match=says):
         Scenario.load(tmp_path / "hills.toml")

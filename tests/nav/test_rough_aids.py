@@ -35,7 +35,7 @@ def circling(aid, t=0.7, v_n=None):
     force_n = np.array([-SPEED * TURN * math.sin(heading), SPEED * TURN * math.cos(heading), -gravity(LAT, H)])
     state.rates[:] = attitude.inv().apply([[0.0, 0.0, TURN], force_n])
     starts = tuple(map(ins.model.start, aid.states))
-    return OperatingPoint(reference, state, state.x[0], starts)
+    return OperatingPoint(reference, state, state.x[0], starts, state.P[0])
 
 
 def velocity(t):

@@ -94,13 +94,13 @@ def displaced(at: tuple[np.ndarray, ...], delta: np.ndarray) -> tuple[np.ndarray
 
 
 def ranged(at: tuple[np.ndarray, ...], terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
-    return range_to_ground(at[0], at[2], at[3], TERRAIN, LOCAL, SCALE, 500.0, terrain.heights, terrain.grid)
+    return range_to_ground(at[0], at[2], at[3], TERRAIN, LOCAL, SCALE, 0.0, 500.0, terrain.heights, terrain.grid)
 
 
 def flowing(at: tuple[np.ndarray, ...], terrain: Terrain) -> tuple[np.ndarray, np.ndarray]:
     rotation = np.array([0.02, -0.03])
     return optical_flow(
-        *at, TERRAIN, LOCAL, SCALE, ERROR, np.array([0.05, 0.01]), rotation, terrain.heights, terrain.grid
+        *at, TERRAIN, LOCAL, SCALE, ERROR, 0.0, np.array([0.05, 0.01]), rotation, terrain.heights, terrain.grid
     )  # fmt: skip
 
 
@@ -126,6 +126,6 @@ def test_signs_of_flow() -> None:
     level = np.array([1.0, 0.0, 0.0, 0.0])
     for v_n, expected in (([10.0, 0, 0], [0, 0.1]), ([0, 10.0, 0], [-0.1, 0])):
         nu, _ = optical_flow(
-            level, np.array(v_n), lla, x, -1, -1, -1, -1, nothing, nothing, FLAT.heights, FLAT.grid
+            level, np.array(v_n), lla, x, -1, -1, -1, -1, 0.0, nothing, nothing, FLAT.heights, FLAT.grid
         )  # fmt: skip
         np.testing.assert_allclose(-nu, np.array(expected) - [OMEGA_IE * math.cos(LAT), 0], atol=1e-12)

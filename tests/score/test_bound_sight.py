@@ -44,7 +44,7 @@ def test_ranges(k: int) -> None:
     H, _ = jacobians(RangefinderConfig(grade="radar"))
     flat = Terrain.flat(50.0)
     q_nb = BODY[k].as_quat(scalar_first=True)
-    _, own = range_to_ground(q_nb, WAY.lla[k], np.zeros(MOTION + 2), 9, -1, 10, 400.0, flat.heights, flat.grid)
+    _, own = range_to_ground(q_nb, WAY.lla[k], np.zeros(MOTION + 2), 9, -1, 10, 0.0, 400.0, flat.heights, flat.grid)
     np.testing.assert_allclose(H[k], own, rtol=1e-9, atol=1e-9)
 
 
@@ -54,7 +54,7 @@ def test_flow(k: int) -> None:
     flat = Terrain.flat(50.0)
     q_nb = BODY[k].as_quat(scalar_first=True)
     _, own = optical_flow(
-        q_nb, WAY.v_n[k], WAY.lla[k], np.zeros(MOTION + 4), 9, -1, 10, 11, np.zeros(2), WAY.omega_b[k, :2],
+        q_nb, WAY.v_n[k], WAY.lla[k], np.zeros(MOTION + 4), 9, -1, 10, 11, 0.0, np.zeros(2), WAY.omega_b[k, :2],
         flat.heights, flat.grid,
     )  # fmt: skip
     np.testing.assert_allclose(H[k], own, rtol=1e-9, atol=1e-4)  # of the scale, the Earth's turning
