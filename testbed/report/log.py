@@ -90,9 +90,17 @@ def _likeness(row: Row) -> str:
         return "alike"
     if math.isnan(row.ratio):
         return "only the flight has it" if math.isnan(row.simulation) else "only the simulation has it"
+    if row.opposite:
+        return "[red]of the other sign[/]"
+    if math.isinf(row.ratio):
+        return "[red]only the simulation has any[/]"
     if row.ratio > 1:
         return f"[red]the simulation's is {row.ratio:.3g} times as large[/]"
-    return f"[red]the flight's is {1 / row.ratio if row.ratio else math.inf:.3g} times as large[/]"
+    return (
+        f"[red]the flight's is {1 / row.ratio:.3g} times as large[/]"
+        if row.ratio
+        else "[red]only the flight has any[/]"
+    )
 
 
 def _table(title: str, *columns: str) -> Table:

@@ -49,9 +49,15 @@ class Row(NamedTuple):
         return second / first if first else math.inf
 
     @property
+    def opposite(self) -> bool:
+        """Of different signs, beyond the slack."""
+        return self.flight * self.simulation < 0 and abs(self.flight - self.simulation) > self.slack
+
+    @property
     def alike(self) -> bool:
-        """Within `ALIKE`; what only one of them has is not."""
-        return (1 + ROUNDING) * self.ratio >= 1 / ALIKE and self.ratio <= (1 + ROUNDING) * ALIKE
+        """Within `ALIKE` and of the same sign; what only one of them has is not."""
+        within = (1 + ROUNDING) * self.ratio >= 1 / ALIKE and self.ratio <= (1 + ROUNDING) * ALIKE
+        return within and not self.opposite
 
 
 def compare(flight: Survey, simulation: Survey) -> list[Row]:

@@ -16,6 +16,7 @@ from nav.samples import FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log
 from testbed.feeds.survey import survey
+from testbed.report.log import beside
 from testbed.score import likeness
 from testbed.score.likeness import Row
 
@@ -75,6 +76,23 @@ def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None
     assert math.isnan(row.simulation)
     assert not row.alike
     assert not [one for one in likeness.compare(flight, flight) if one.what == row.what]
+
+
+@pytest.mark.parametrize(
+    ("flight", "simulation", "said"),
+    [
+        (0.9, -0.9, "of the other sign"),
+        (5.0, 0.0, "only the flight has any"),
+        (0.0, 5.0, "only the simulation has any"),
+        (9.0, 3.0, "the flight's is 3 times as large"),
+        (3.0, 9.0, "the simulation's is 3 times as large"),
+        (0.05, -0.04, "alike"),  # within the slack
+    ],
+)
+def test_what_is_said_of_figures_that_differ(flight: float, simulation: float, said: str) -> None:
+    row = Row("ins: airspeed", "correlation with the innovation before", "", flight, simulation, slack=0.1)
+    assert row.alike == (said == "alike")
+    assert beside([row]).columns[4]._cells[0].removeprefix("[red]").removesuffix("[/]") == said
 
 
 def test_a_flight_of_other_sensors_is_refused() -> None:
