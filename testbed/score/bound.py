@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from nav.samples import Array
 from testbed.errors import UserError
@@ -153,22 +153,27 @@ def steps(model: Model) -> Iterator[Step]:
 
 def covariances(P: Array, along: Iterable[Step]) -> Iterator[Array]:
     """The bound (n, n) after each step, from that before the first, ``P``; each is good until the next is asked for."""
-    P = P.copy()
+    P = np.ascontiguousarray(P).copy()
+    diagonal = P.reshape(-1)[:: len(P) + 1]
     for Phi, decay, variance, H in along:
         moving = len(Phi)
-        P[np.diag_indices_from(P)] += 0.5 * variance
+        diagonal += 0.5 * variance
         moved = Phi @ P
         P[moving:, moving:] *= np.outer(decay[moving:], decay[moving:])
         P[:moving, :moving] = moved @ Phi.T
         P[:moving, moving:] = moved[:, moving:] * decay[moving:]
         P[moving:, :moving] = P[:moving, moving:].T
-        P[np.diag_indices_from(P)] += 0.5 * variance
+        diagonal += 0.5 * variance
         seen = H.any(axis=1)
         if seen.any():
             HP = H[seen] @ P if not seen.all() else H @ P
             S = HP @ H[seen].T
-            S[np.diag_indices_from(S)] += 1.0
-            whitened = solve_triangular(cholesky(S, lower=True), HP, lower=True)
+            S.reshape(-1)[:: len(S) + 1] += 1.0
+            # As scipy.linalg's cholesky and solve_triangular, whose checks take longer than what they check.
+            root, failed = dpotrf(S, lower=1)
+            if failed:
+                raise np.linalg.LinAlgError("the innovation covariance of the bound is not positive definite")
+            whitened, _ = dtrtrs(root, HP, lower=1)
             P -= whitened.T @ whitened
         yield P
 
