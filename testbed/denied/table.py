@@ -38,14 +38,11 @@ class Route(NamedTuple):
     plan: str
 
 
-# Two straights, a turn, and in the rest of five minutes with GNSS a circle and a half.
-CIRCLES = Route(
-    "lat_deg = 34.0, lon_deg = 108.0, alt_m = 280, heading_deg = 30, airspeed_mps = 25",
-    "height_m = 0",
-    """\
+# Two straights, a turn, and in the rest of five minutes with GNSS the first of the circles.
+PLAN = """\
 [[plan]]
 leg = "straight"
-length_m = 1500
+length_m = {straight_m}
 [[plan]]
 leg = "turn"
 to_deg = 120
@@ -54,9 +51,18 @@ leg = "straight"
 length_m = 1500
 [[plan]]
 leg = "loiter"
-radius_m = 400
+radius_m = {radius_m}
 duration_s = 3000
-""",
+"""
+CIRCLES = Route(
+    "lat_deg = 34.0, lon_deg = 108.0, alt_m = 280, heading_deg = 30, airspeed_mps = 25",
+    "height_m = 0",
+    PLAN.format(straight_m=1500, radius_m=400),
+)
+HILLS = Route(
+    "lat_deg = 36.58, lon_deg = -84.34, alt_m = 900, heading_deg = 30, airspeed_mps = 25",
+    'file = "jacksboro", map_error_m = 4',
+    PLAN.format(straight_m=3000, radius_m=1500),
 )
 
 
@@ -93,6 +99,7 @@ WEATHERS = (
 AIDS = (
     Aids("air_data", "air data"),
     Aids("flow", "flow and range", '[sensors.optical_flow]\ngrade = "camera"\n[sensors.rangefinder]\ngrade = "radar"'),
+    Aids("terrain", "air data and height over hills", '[sensors.rangefinder]\ngrade = "radar"', route=HILLS),
     Aids("wind_report", "air data and wind reports", '[sensors.wind_report]\ngrade = "nearby"'),
     Aids(
         "pitot_failed",
