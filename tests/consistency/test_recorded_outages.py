@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import bisect
 import copy
 from pathlib import Path
 
@@ -37,6 +38,10 @@ class Flight:
         self.feed = Recorded(scenario, 1)
         section = next(one for one in scenario.estimator if one.name == "ins")
         self.lane = registry.build([section], scenario.rig(1))["ins"]
+        self.samples = sorted(
+            (one for name in self.lane.sensors for one in self.feed._samples[name]), key=lambda one: one.t_arrival
+        )
+        self.arrivals = [one.t_arrival for one in self.samples]
         self.t = self.known = 0.0  # and up to where there are increments
 
     def branch(self) -> Flight:
@@ -54,13 +59,11 @@ class Flight:
             first, stop = np.searchsorted(imu.t, [self.t + 1e-6, end + 1e-6])
             rows = slice(int(first), int(stop))
             block = ImuSamples(imu.t[rows], imu.dt[rows], imu.dtheta[rows], imu.dv[rows])
+            arrived = slice(*(bisect.bisect_right(self.arrivals, edge + 1e-6) for edge in (self.t, end)))
             samples = [
                 one
-                for name in self.lane.sensors
-                for one in self.feed._samples[name]
-                if self.t + 1e-6 < one.t_arrival <= end + 1e-6
-                and not (denied and isinstance(one, GnssSample))
-                and self.lane._spaced(name, one)
+                for one in self.samples[arrived]
+                if not (denied and isinstance(one, GnssSample)) and self.lane._spaced(one.sensor, one)
             ]
             known = float(imu.t[stop - 1]) if stop else 0.0
             here = [t for t in times if self.known < t <= known]
