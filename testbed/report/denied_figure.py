@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,11 +13,17 @@ from testbed.report import style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     from testbed.denied.benchmark import Result
     from testbed.denied.flight import Outcome
 
 LEAST_M = 0.3  # of the axis: a shorter error is no outage's
+LINES: Mapping[str, dict[str, Any]] = {
+    "RMS": {"lw": 1.6},
+    "95 %": {"lw": 0.8, "alpha": 0.7},
+    "bound of the RMS": {"lw": 1.1, "ls": (0, (4, 1.5))},
+}
 
 
 def figures(result: Result) -> Mapping[str, Figure]:
@@ -35,7 +41,7 @@ def _figure(result: Result, estimator: str) -> Figure:
             ax = drawn.axes[row, column]
             ax.set_title(f"{aids.title}\n{weather.title}", loc="left", fontsize=8)
             for k, grade in enumerate(table.grades):
-                _curves(ax, own, (aids.name, grade.name, estimator), grade.name, style.COLOURS[k])
+                _curves(ax, own, (aids.name, grade.name, estimator), style.COLOURS[k])
     for row in drawn.axes:
         row[0].set_ylabel("horizontal error [m]")
         limits = np.array([ax.dataLim.intervaly for ax in row])
@@ -50,27 +56,32 @@ def _figure(result: Result, estimator: str) -> Figure:
                 style.logarithmic(ax)
     for ax in drawn.axes[-1]:
         ax.set_xlabel("time without GNSS [s]")
-    drawn.legend(style.keys_of(drawn.axes.flat), 0.45)
+    drawn.legend(_keys(result), 0.45)
     return drawn.figure
 
 
-def _curves(ax: Axes, outcomes: Sequence[Outcome], lane: tuple[str, str, str], grade: str, colour: str) -> None:
+def _keys(result: Result) -> dict[str, Line2D]:
+    """A colour for each grade, a line for each quantity."""
+    from matplotlib.lines import Line2D
+
+    colours = {grade.name: {"color": style.COLOURS[k], "lw": 4.0} for k, grade in enumerate(result.plan.table.grades)}
+    lines = {name: {"color": style.GUIDE, **line} for name, line in LINES.items()}
+    return {name: Line2D([], [], **look) for name, look in (colours | lines).items()}
+
+
+def _curves(ax: Axes, outcomes: Sequence[Outcome], lane: tuple[str, str, str], colour: str) -> None:
+    """One estimator in one case; what it has no estimate for is a gap."""
     if not outcomes:
         return
     k, since = outcomes[0].lanes.index(lane), outcomes[0].t > 0
-    t = outcomes[0].t[since]
-
-    def over_draws(values: list[Array]) -> Array:
-        return np.array(values)[:, since]
-
-    error = over_draws([one.horizontal[k] for one in outcomes])
-    bound = over_draws([one.bound[k] for one in outcomes])
+    error = np.array([one.horizontal[k] for one in outcomes])[:, since]
+    bound = np.array([one.bound[k] for one in outcomes])[:, since]
     error = np.where(np.isfinite(error), error, np.nan)
-    ax.plot(t, np.sqrt(np.mean(error**2, axis=0)), color=colour, lw=1.6, label=f"{grade}: RMS")
-    ax.plot(
-        t, np.quantile(error, 0.95, axis=0, method="inverted_cdf"), color=colour, lw=0.8, alpha=0.7,
-        label=f"{grade}: 95 %",
-    )  # fmt: skip
-    ax.plot(
-        t, np.sqrt(np.mean(bound**2, axis=0)), color=colour, lw=1.1, ls=(0, (4, 1.5)), label=f"{grade}: bound of RMS"
-    )
+    curves = (_rms(error), np.quantile(error, 0.95, axis=0, method="inverted_cdf"), _rms(bound))
+    for curve, line in zip(curves, LINES.values(), strict=True):
+        ax.plot(outcomes[0].t[since], curve, color=colour, **line)
+
+
+def _rms(values: Array) -> Array:
+    found: Array = np.sqrt(np.mean(values**2, axis=0))
+    return found

@@ -36,6 +36,11 @@ class Verdict(StrEnum):
     MISPRINT = "misprint"
 
 
+def _three(value: float) -> str:
+    """Three digits; thousands without an exponent."""
+    return f"{float(f'{value:.3g}'):.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
 class Interval(NamedTuple):
     """A statistic and the ends of its 95 % interval; an end that the draws are too few for is infinite."""
 
@@ -46,8 +51,8 @@ class Interval(NamedTuple):
     def __str__(self) -> str:
         """As tables and texts have it, three digits each: ``0.52 (0.48 to 0.55)``; a number alone where it is sure."""
         if self.low == self.high:
-            return f"{self.value:.3g}"
-        return f"{self.value:.3g} ({self.low:.3g} to {self.high:.3g})"
+            return _three(self.value)
+        return f"{_three(self.value)} ({_three(self.low)} to {_three(self.high)})"
 
 
 class Statistic(NamedTuple):
