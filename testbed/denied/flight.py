@@ -161,7 +161,7 @@ def _route(cases: Sequence[Case], seed: int, tell: Callable[[float], None]) -> O
         records.setdefault(one.case.aids.name, Recorder(None, one.scenario, seed))
     end = round(flying[0].scenario.duration_s * source.rate_hz) + 1
     wanted = [cases[0].lost_s + t for t in range(0, cases[0].longest_s + 1, EVERY_S)]
-    kept: list[TruthBlock] = []
+    kept: list[Array] = []  # time, latitude, longitude and height
     tick, part = 0, round(PART_S * source.rate_hz)
     while tick < end:
         block = source.advance(min(part, end - tick))
@@ -169,7 +169,7 @@ def _route(cases: Sequence[Case], seed: int, tell: Callable[[float], None]) -> O
             break
         bench.sense(block)
         rows = np.searchsorted(block.t, [t - accuracy.SAME_TIME_S for t in _within(wanted, block)])
-        kept += [block.rows(row, row + 1) for row in rows.tolist()]
+        kept.append(np.column_stack([block.t[rows], block.lat[rows], block.lon[rows], block.h[rows]]))
         recorded: set[str] = set()
         for one in flying:
             into = None if one.case.aids.name in recorded else records[one.case.aids.name]
@@ -178,7 +178,7 @@ def _route(cases: Sequence[Case], seed: int, tell: Callable[[float], None]) -> O
         tick += len(block)
         tell(FLOWN * tick / end)
     require_control(source.failure)
-    return _outcome(flying, records, kept, seed, tell)
+    return _outcome(flying, records, np.concatenate(kept), seed, tell)
 
 
 def _begin(case: Case, seed: int) -> _Flying:
@@ -205,10 +205,10 @@ def _part(one: _Flying, block: TruthBlock, bench: _Bench, times: Sequence[float]
 
 
 def _outcome(
-    flying: Sequence[_Flying], records: Mapping[str, Recorder], kept: Sequence[TruthBlock], seed: int,
+    flying: Sequence[_Flying], records: Mapping[str, Recorder], kept: Array, seed: int,
     tell: Callable[[float], None],
 ) -> Outcome:  # fmt: skip
-    t = np.array([row.t[0] for row in kept])
+    t = kept[:, 0]
     trees = {name: record.dataset() for name, record in records.items()}
     names, errors, covariances, bounds = [], [], [], []
     for k, one in enumerate(flying):
@@ -235,12 +235,11 @@ def _outcome(
     )  # fmt: skip
 
 
-def _errors(estimates: Sequence[Estimate], kept: Sequence[TruthBlock]) -> tuple[Array, Array]:
+def _errors(estimates: Sequence[Estimate], kept: Array) -> tuple[Array, Array]:
     """Horizontal errors (K, 2) [m] and their claimed covariance (K, 3) [m^2]; the IMU sits at the centre of gravity."""
     lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
-    true = [np.array([getattr(row, name)[0] for row in kept]) for name in ("lat", "lon", "h")]
     P = np.array([e.covariance[:2, :2] for e in estimates])
-    return position_difference_n(lat, lon, h, *true)[:, :2], np.column_stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
+    return position_difference_n(lat, lon, h, *kept.T[1:])[:, :2], np.column_stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
 
 
 def _flown(tree: xarray.DataTree, t: Array) -> Array:

@@ -330,6 +330,19 @@ def test_files_and_page_have_every_cell(tmp_path: Path) -> None:
     ]
 
 
+def test_saving_writes_page_and_figure_into_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = dataclasses.replace(whole(2), plan=Plan(FULL, INS, tmp_path, 5, 2))
+    (tmp_path / saved.FIGURE).write_bytes(b"picture")
+    for folder in ("docs", "scenarios"):
+        (tmp_path / "checkout" / folder).mkdir(parents=True)
+    monkeypatch.setattr(saved, "docs_dir", lambda: tmp_path / "checkout" / "docs")
+    monkeypatch.setattr(saved, "data_dir", lambda name: tmp_path / "checkout" / name)
+    path = saved.save(result, report.cells(result), goals.claims(result))
+    assert path == tmp_path / "checkout" / "docs" / saved.PAGE
+    assert "# The table of denied navigation" in path.read_text("utf-8")
+    assert (tmp_path / "checkout" / "scenarios" / saved.FIGURE).read_bytes() == b"picture"
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [
