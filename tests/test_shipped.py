@@ -28,7 +28,7 @@ def test_the_promised_scenarios_are_shipped() -> None:
         "static_bench",
     }
     promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
-    promised |= {"regression"}
+    promised |= {"regression", "hardware_loiter", "hardware_gnss_outage"}
     promised |= {f"closed_loop_{x}" for x in ("gnss_outage", "ahrs_only", "spoofed", "pitot_blocked", "gyro_failed")}
     assert promised <= set(SCENARIOS)
 

@@ -81,7 +81,12 @@ def imu_keys(noise: Noise | None) -> dict[str, Any]:
         if all(value <= _margin(key) * told[key] for key, value in shown.items()):
             return {"grade": name}
     told = IMUS[WORST]
-    return {"grade": WORST} | {key: _rounded(value) for key, value in shown.items() if value > told[key]}
+    beside = {
+        "angle_random_walk_degprth": "gyro_vibration_degprth",
+        "velocity_random_walk_mpsprth": "accel_vibration_mpsprth",
+    }
+    covered = {key: math.hypot(told[key], told[beside[key]] if key in beside else 0.0) for key in shown}
+    return {"grade": WORST} | {key: _rounded(value) for key, value in shown.items() if value > covered[key]}
 
 
 def _margin(key: str) -> float:
