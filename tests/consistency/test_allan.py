@@ -32,7 +32,7 @@ def at_rest(config, seed, seconds=HOURS * 3600):
     body, imu = Kinematic(place, RATE_HZ), Imu("imu", config, RATE_HZ, seed)
     imu.sense(body.advance(round(WARM_UP_S * RATE_HZ) + 1))
     samples = imu.sense(body.advance(round(seconds * RATE_HZ)))
-    return np.stack([samples.dtheta.T, samples.dv.T]) * RATE_HZ
+    return np.stack([samples.dtheta.T, samples.dv.T]) / samples.dt
 
 
 def allan_variance(rates, tau):
@@ -41,14 +41,18 @@ def allan_variance(rates, tau):
 
 
 def measured(config):
-    """((ARW, VRW), (gyro, accel instability)) in SI, averaged over axes and seeds."""
+    """((ARW, VRW), (gyro, accel instability)) in SI, averaged over axes and seeds.
+
+    From the variance at the floor those of white noise and of the random walk are taken: N^2 / T and K^2 T / 3.
+    """
     flat = FLAT * np.array([config.gyro_instability_tau_s, config.accel_instability_tau_s])
     short, long = np.zeros(2), np.zeros(2)
     for seed in range(SEEDS):
         for triad, axes in enumerate(at_rest(config, seed)):
             short[triad] += np.mean([allan_variance(axis, 1.0) for axis in axes]) / SEEDS
             long[triad] += np.mean([allan_variance(axis, flat[triad]) for axis in axes]) / SEEDS
-    return np.sqrt(short), np.sqrt(long - short / flat)
+    walk = np.array([config.errors().gyro_random_walk, config.errors().accel_random_walk])
+    return np.sqrt(short), np.sqrt(long - short / flat - walk**2 * flat / 3)
 
 
 @pytest.mark.slow
