@@ -5,7 +5,7 @@ share: a rangefinder finds it, and optical flow is a velocity then. Over relief 
 Jacobian has the slope of the map where the line of sight ends (SITAN: Hostetler and Andreas, Nonlinear Kalman Filtering
 Techniques for Terrain-Aided Navigation, IEEE Trans. Automatic Control 28 (3), 1983), taken over as far as the position
 is uncertain (`REACH`), as theirs is of a plane fitted there: a slope at a point would make a filter sure of where the
-map has its bends. That is good for as long as that is no farther than hills are wide.
+map has its bends. Where that is farther than hills are wide, all places are tried instead (`Search`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import Measurement, OperatingPoint, range_problem
-from nav.earth import earth_rate_n
+from nav.aids.position_fix import position_fix
+from nav.earth import earth_rate_n, radii
 from nav.error_model import PHI, POS, VEL, Block, markov
+from nav.point_mass import Fix, PointMass
 from nav.rotation import cross, dcm_from_quat
 from nav.samples import Array, OpticalFlowSample, RangeSample, Sample
 from nav.terrain import Terrain, slant_range, slope
@@ -28,12 +30,63 @@ TERRAIN = "terrain"  # the state: how much higher the ground is than on the map,
 LOCAL = "terrain_local"  # and here, first-order Markov along the way [m]
 RANGE_LIMITS, RATE_LIMIT = (0.0, 20_000.0), 100.0  # what an instrument could possibly report [m], [rad/s]
 LEAST_QUALITY = 0.01
+TIME_TOLERANCE = 1e-6  # [s]
+LOST_M, FOUND_M = 100.0, 50.0  # sigma of the position per axis from which on it is searched, and no more
+WEIGH_S, FIX_S = 1.0, 5.0  # in a search, from one range that is used to the next, and from one attempt at a fix
+GAP_S, GIVE_UP_S = 5.0, 240.0  # without a range, or without a fix, it begins again
 REACH = 2.0  # sigma of the horizontal position, to either side, over which slopes are taken
+
+
+class Search:
+    """Where over the map a filter is that doesn't know: from its ranges, as fixes in place of these (`PointMass`)."""
+
+    def __init__(self, places: PointMass) -> None:
+        self.places = places
+        self.lost = self._begun = False
+        self.fix: Fix | None = None
+        self._t = self._tried = -math.inf
+        self._v_n = np.zeros(3)
+
+    def hear(self, sample: RangeSample, at: OperatingPoint, height_sigma: float) -> None:
+        """Take in a sample, once. A filter is `lost` from then on or not; `fix` is of this sample, if there is one.
+
+        ``height_sigma`` [m] is that of what makes heights wrong as a whole, beside the filter's own height.
+        """
+        t, state, places = sample.t, at.state, self.places
+        if t == self._t:
+            return
+        self._t, self.fix = t, None
+        P, own = at.P[POS : POS + 2, POS : POS + 2], at.x[: POS + 3]
+        sigma = math.sqrt(0.5 * P.trace())
+        self.lost = sigma > (FOUND_M if self.lost else LOST_M)
+        if not self.lost:
+            self._begun = False
+            return
+        R_M, R_N = radii(state.lla[0])
+        lat = state.lla[0] + own[POS] / R_M
+        lon = state.lla[1] + own[POS + 1] / (R_N * math.cos(lat))
+        v_n, h = state.v_n + own[VEL : VEL + 3], state.lla[2] - own[POS + 2]
+        if not self._begun or t - places.t > GAP_S or t - places.t_begun > GIVE_UP_S:
+            height_sigma = math.hypot(height_sigma, math.sqrt(at.P[POS + 2, POS + 2]))
+            places.begin(t, np.array([lat, lon, h]), P, height_sigma)
+            self._begun, self._tried, self._v_n = True, t, v_n
+        elif t - places.t >= WEIGH_S - TIME_TOLERANCE:
+            variance = at.P.diagonal()[VEL : VEL + 3]
+            places.move(t, 0.5 * (v_n + self._v_n), np.sqrt([0.5 * (variance[0] + variance[1]), variance[2]]))
+            self._v_n = v_n
+            places.weigh(sample.range * dcm_from_quat(state.q_nb)[:, 2])
+            if t - self._tried >= FIX_S:
+                self._tried = t
+                self.fix = places.fix(lat, lon, P)
+                self._begun = self.fix is None
 
 
 @dataclass(frozen=True)
 class RangefinderAid:
     """Range to the ground along the body's down axis, with white noise and an unknown scale factor.
+
+    With a ``search`` a filter that doesn't know where it is has fixes instead, one for many ranges, along the axes of
+    their covariance.
 
     ``map_sigma`` [m] is how well the ``terrain`` is known as a whole, ``local_sigma`` from place to place, of errors
     that pass by in ``local_correlation_s``.
@@ -46,8 +99,12 @@ class RangefinderAid:
     map_sigma: float = 5.0
     local_sigma: float = 0.0
     local_correlation_s: float = 10.0
+    search: Search | None = None
 
-    parts = (("range", 1),)
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        return (("range", 1),) if self.search is None else (("range", 1), ("terrain_fix", 2))
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -68,6 +125,12 @@ class RangefinderAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, RangeSample)
+        if self.search is not None:
+            self.search.hear(sample, at, math.hypot(self.map_sigma, self.scale_sigma * sample.range))
+            if part == "terrain_fix":
+                return None if self.search.fix is None else _fixed(self.search.fix, at)
+            if self.search.lost:
+                return None
         state, terrain, (raised, local, scale) = at.state, self.terrain, at.starts
         nu, H = range_to_ground(
             state.q_nb, state.lla, at.x, raised, local, scale, reach(at.P), sample.range, terrain.heights, terrain.grid
@@ -119,6 +182,13 @@ class OpticalFlowAid:
         )  # fmt: skip
         R = np.full(2, self.sigma**2 / max(sample.quality, LEAST_QUALITY))
         return None if math.isnan(nu[0]) else Measurement(nu, H, R)
+
+
+def _fixed(fix: Fix, at: OperatingPoint) -> Measurement:
+    """A fix as a measurement, along the axes of its covariance."""
+    nu, H = position_fix(at.state.q_nb, at.state.lla, at.x, np.zeros(3), fix.lat, fix.lon, math.nan)
+    R, axes = np.linalg.eigh(fix.R)
+    return Measurement(axes.T @ nu, axes.T @ H, R)
 
 
 def reach(P: Array) -> float:

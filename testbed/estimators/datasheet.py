@@ -23,8 +23,10 @@ from nav.aids import (
     WindReportAid,
 )
 from nav.aids.magnetometer import FIELD_SIZE
+from nav.aids.terrain import Search
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
+from nav.point_mass import PointMass
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
@@ -178,6 +180,7 @@ def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, 
     map_ = site.terrain, site.terrain_sigma, site.local_sigma, site.local_length / usual.airspeed_mps
     if isinstance(section, RangefinderConfig):
         r = section.errors()
-        return RangefinderAid(name, r.noise, r.scale, *map_)
+        places = PointMass(site.terrain, r.noise, *map_[2:])
+        return RangefinderAid(name, r.noise, r.scale, *map_, Search(places) if site.terrain.heights.size > 1 else None)
     f = section.errors()
     return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, *map_)

@@ -196,6 +196,7 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "star_attitude": ("rad", ("body",)),
     "position_fix": ("m", ("component",)),
     "range": ("m", ("component",)),
+    "terrain_fix": ("m", ("component",)),
     "optical_flow": ("rad/s", ("body_xy",)),
     "wind_report": ("m/s", ("north_east",)),
     "gnss_course": ("rad", ("component",)),
