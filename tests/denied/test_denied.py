@@ -378,3 +378,13 @@ def test_the_command_shows_table_and_goals(
     scenarios = sorted((tmp_path / "out" / "scenarios").iterdir())
     assert len(scenarios) == len(WEATHERS) * len(AIDS)
     assert Scenario.load(scenarios[0]).estimator[0].name == "ins"
+
+
+# --- the manual
+
+
+def test_the_manual_has_the_table_of_the_draw_that_is_drawn_when_nobody_says() -> None:
+    text = (data_dir("scenarios").parent / "docs" / saved.PAGE).read_text("utf-8")
+    assert f"`testbed denied --save --draw {benchmark.RECORDED_DRAW} --draws" in text
+    assert all(f"\n| {aids} |" in text for aids in ("air_data", "flow", "wind_report", "pitot_failed"))
+    assert (data_dir("scenarios") / saved.FIGURE).is_file()
