@@ -138,14 +138,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             walk = _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL
             return BarometerAid(name, sigma=math.hypot(b.noise, b.unsteady) * METRES_PER_PASCAL, bias_walk=walk)
         case MagnetometerConfig():
-            m = section.errors()
-            bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
-            if not m.doubt:
-                return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
-            iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
-            return MagnetometerAid(
-                name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt
-            )
+            return _compass(name, section, usual)
         case AirspeedConfig():
             a = section.errors()
             gust = max(air.gust, section.gust_mps)
@@ -173,6 +166,16 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             return WindReportAid(name, w.local, w.tau, left, air.wind_walk)
     maker = registry.of(section).aid  # of a sensor of the user's
     return None if maker is None else maker(name, section, imu)
+
+
+def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
+    """A magnetometer, with soft iron as states, or, of one that is doubted, as an anomaly."""
+    m = section.errors()
+    bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
+    if not m.doubt:
+        return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
+    iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
+    return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt)
 
 
 def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, usual: Usual) -> Aid:

@@ -39,9 +39,9 @@ from testbed.score.bound_model import (
     add_air,
     add_imu,
     add_sensor,
-    way,
 )
 from testbed.score.bound_sight import add_sight
+from testbed.score.bound_way import way
 from testbed.sensors.gnss import GnssConfig
 
 if TYPE_CHECKING:

@@ -16,14 +16,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from nav.earth import SEA_LEVEL_DENSITY
 from nav.samples import Array, has_fix
 from testbed.motion.gusts import gust_statistics
 from testbed.motion.sections import FlightTruth, Wind
 from testbed.score.accuracy import SAME_TIME_S, column
+from testbed.score.bound_way import Way
 from testbed.sensors import SensorConfig
 from testbed.sensors.airspeed import AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -49,7 +48,6 @@ SCALE_HEIGHT = 1.04e4  # of the air's density near the ground [m]
 MOTION = 9
 PHI, VEL, POS = slice(0, 3), slice(3, 6), slice(6, 9)
 UNKNOWN_WIND = 20.0  # mean wind per axis, before anything is known of it [m/s]
-MEAN_WIND_S = 120.0  # over which the direction of the mean wind is taken
 SLOWEST = 5.0  # along the tube, below which a pitot tube tells nothing [m/s]
 EXACT_SLIP = 0.1  # of its own sigma: how exactly the slip is known to be what it is
 Measured: TypeAlias = Callable[[slice, int], tuple[Array, Array]]  # H (K, m, n) and 1-sigma (K, m) of one sample each
@@ -93,75 +91,6 @@ def gauss_markov(sigma: Array | Sequence[float], correlation_s: Array | float) -
     """Stationary first-order Gauss-Markov processes; ``sigma`` (n,), or (K, n) and so its correlation time."""
     sigma = np.asarray(sigma, float)
     return Block(np.diag(np.square(np.atleast_2d(sigma)[0])), sigma, correlation_s)
-
-
-@dataclass(frozen=True, slots=True)
-class Way:
-    """Truth over K steps that end at ``t`` (K,), each ``T`` (K,) long [s].
-
-    Integrals over each step, with s the axes of the IMU: ``turned`` (K, 3, 3) of C_ns, ``turned_rate`` and
-    ``turned_force`` (K, 3, 3, 3) of C_ns times each component, the last index, of omega_s and f_s; ``force_n`` (K, 3)
-    of f_n. At the ends of steps: ``C_nb`` (K, 3, 3), ``omega_b``, ``v_n``, ``wind_n``, ``mean_wind_n``, ``lla`` (K, 3),
-    ``density``, ``current``, ``airspeed`` (K,). ``temperature`` (K,) is a step's, less that of the start. ``slip`` (N,)
-    is the velocity [m/s] of the air from the side, at rows ``row_s`` apart.
-    """
-
-    t: Array
-    T: Array
-    turned: Array
-    turned_rate: Array
-    turned_force: Array
-    force_n: Array
-    C_nb: Array
-    omega_b: Array
-    v_n: Array
-    lla: Array
-    wind_n: Array
-    mean_wind_n: Array
-    density: Array
-    current: Array
-    temperature: Array
-    airspeed: Array
-    slip: Array
-    row_s: float
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-
-def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
-    """The true way of a recorded run in steps of about ``step_s``, at least a row of truth each."""
-
-    def true(name: str) -> Array:
-        return np.asarray(column(dataset, f"truth/{name}"), float)
-
-    t = true("time")
-    row_s = float(np.median(np.diff(t)))
-    every = max(1, round(step_s / row_s))
-    steps = (len(t) - 1) // every
-    ends = every * np.arange(1, steps + 1)
-    rows = slice(1, every * steps + 1)
-    C_nb = Rotation.from_quat(np.roll(true("q_nb"), -1, axis=-1)).as_matrix()  # the scalar last
-    C_ns = (0.5 * (C_nb[1:] + C_nb[:-1]) @ C_sb.T)[: rows.stop - 1]
-    dt, dtheta_s, dv_s = np.diff(t)[: rows.stop - 1], true("dtheta")[rows] @ C_sb.T, true("dv")[rows] @ C_sb.T
-    starts = every * np.arange(steps)
-
-    def summed(values: Array) -> Array:
-        return np.add.reduceat(values, starts, axis=0)
-
-    wind_n, airspeed, warmer = true("wind_n"), true("airspeed"), true("temperature") - true("temperature")[0]
-    mean_wind_n = uniform_filter1d(wind_n, max(1, round(MEAN_WIND_S / row_s)), axis=0, mode="nearest")
-    return Way(
-        t=t[ends], T=summed(dt), turned=summed(C_ns * dt[:, None, None]),
-        turned_rate=summed(C_ns[:, :, :, None] * dtheta_s[:, None, None, :]),
-        turned_force=summed(C_ns[:, :, :, None] * dv_s[:, None, None, :]),
-        force_n=summed(np.einsum("kij,kj->ki", C_ns, dv_s)),
-        C_nb=C_nb[ends], omega_b=true("omega_b")[ends], v_n=true("v_n")[ends],
-        lla=np.column_stack([true(name) for name in ("lat", "lon", "h")])[ends],
-        wind_n=wind_n[ends], mean_wind_n=mean_wind_n[ends], density=true("density")[ends],
-        current=true("current")[ends], temperature=0.5 * (warmer[starts] + warmer[ends]),
-        airspeed=airspeed[ends], slip=airspeed * np.sin(true("beta")), row_s=row_s,
-    )  # fmt: skip
 
 
 @dataclass
@@ -304,19 +233,7 @@ def add_sensor(model: Model, dataset: xarray.DataTree, name: str, config: Sensor
             fixed = has_fix(column(dataset, f"sensors/{name}/fix_type")) if recorded else np.zeros(0, bool)
             _add_gnss(model, times[fixed], config)
         case BarometerConfig():
-            b = config.errors()
-            parts = [model.add(constant([b.bias])), model.add(gauss_markov([b.drift], b.drift_tau))]
-            if b.unsteady:
-                parts.append(model.add(gauss_markov([b.unsteady], b.unsteady_tau)))
-            weight = way.density * GRAVITY  # of pressure per metre down
-
-            def pressure(H: Array, part: slice) -> float:
-                H[:, 0, POS.start + 2] = weight[part]
-                for error in parts:
-                    H[:, :, error] = 1.0
-                return b.noise
-
-            model.observe(times, rows(1, 0.01, pressure))
+            _add_barometer(model, times, config)
         case MagnetometerConfig():
             _add_magnetometer(model, times, config, date)
         case AirspeedConfig():
@@ -385,6 +302,22 @@ def _add_gnss(model: Model, times: Array, config: GnssConfig) -> None:
         return np.concatenate([e.position_white_n, e.velocity_white_n])
 
     model.observe(times, rows(6, 1e-4, fix))
+
+
+def _add_barometer(model: Model, times: Array, config: BarometerConfig) -> None:
+    b = config.errors()
+    parts = [model.add(constant([b.bias])), model.add(gauss_markov([b.drift], b.drift_tau))]
+    if b.unsteady:
+        parts.append(model.add(gauss_markov([b.unsteady], b.unsteady_tau)))
+    weight = model.way.density * GRAVITY  # of pressure per metre down
+
+    def pressure(H: Array, part: slice) -> float:
+        H[:, 0, POS.start + 2] = weight[part]
+        for error in parts:
+            H[:, :, error] = 1.0
+        return b.noise
+
+    model.observe(times, rows(1, 0.01, pressure))
 
 
 def _add_magnetometer(model: Model, times: Array, config: MagnetometerConfig, date: datetime.date) -> None:

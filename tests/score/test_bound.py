@@ -19,7 +19,7 @@ from testbed.many.campaign import Combination, Outcome
 from testbed.motion.gusts import gust_statistics
 from testbed.motion.sections import FlightTruth
 from testbed.report.campaign import statistics
-from testbed.score import bound, metrics
+from testbed.score import bound, bound_way, metrics
 from testbed.score import bound_model as model
 from testbed.sensors.airspeed import AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
@@ -153,7 +153,7 @@ def test_the_motion_is_that_of_its_equations(flown: tuple[list[Pose], xarray.Dat
     """Phi of every state of motion and IMU beside finite differences over three seconds of turning flight."""
     poses, record = flown
     errors = ImuConfig(gyro_instability_degph=0, accel_instability_mg=0).errors()
-    made = model.Model(model.way(record, np.eye(3), 0.1))
+    made = model.Model(bound_way.way(record, np.eye(3), 0.1))
     model.add_imu(made, errors)
     # biases, temperature and matrix of each, then the pull on the gyros
     assert made.size == 9 + 2 * (3 + 3 + 9) + 9
@@ -185,7 +185,7 @@ def test_the_motion_is_that_of_its_equations(flown: tuple[list[Pose], xarray.Dat
 def test_measurements_are_those_of_the_sensors(flown: tuple[list[Pose], xarray.DataTree]) -> None:
     """Each row beside the difference that an error of the motion makes to what the sensor says."""
     poses, record = flown
-    way = model.way(record, np.eye(3), SECONDS)
+    way = bound_way.way(record, np.eye(3), SECONDS)
     C, v, lla = poses[-1]
     arm, wind, rate = np.array([0.5, -0.3, 0.2]), np.array([3.0, -2.0, 0.5]), omega_b(SECONDS)
     field = FieldMap(DATE)
@@ -217,7 +217,7 @@ def test_measurements_are_those_of_the_sensors(flown: tuple[list[Pose], xarray.D
 
 def test_gusts_along_their_axes_and_the_mean_wind_carry_the_air(flown: tuple[list[Pose], xarray.DataTree]) -> None:
     _, record = flown
-    made = model.Model(model.way(record, np.eye(3), SECONDS))
+    made = model.Model(bound_way.way(record, np.eye(3), SECONDS))
     truth = FlightTruth.model_validate(
         {"source": "flight", "start": {"lat_deg": 34, "lon_deg": 108, "alt_m": 280, "heading_deg": 0,
          "airspeed_mps": 25}, "wind": {"speed_mps": 5, "turbulence": "light", "walk_mps_per_sqrt_s": 0.02,
