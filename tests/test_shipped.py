@@ -22,6 +22,7 @@ def test_the_promised_scenarios_are_shipped() -> None:
         "loiter_gnss_outage",
         "denied_walking_wind",
         "denied_optical_flow",
+        "denied_terrain",
         "u_turn",
         "survey_racetrack_wind",
         "jammer_zone",

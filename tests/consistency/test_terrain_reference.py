@@ -20,6 +20,7 @@ from nav.error_model import MOTION, POS, VEL
 from nav.kalman import update
 from nav.samples import RangeSample
 from nav.terrain import Terrain, ground
+from testbed import Scenario, run
 from testbed.motion.sections import Terrain as Section
 from testbed.motion.terrain import of, thinned, uneven
 
@@ -104,3 +105,19 @@ def test_what_errors_of_the_map_do(sigma: float, length: float, every: int, limi
     print(f"{sigma:g} m over {length:g} m, every {every}: median {median:.1f} m, 95 % {worst:.1f} m, NEES {nees:.2f}")
     assert median < limit
     assert 0.3 < nees < (1.2 if every == 1 else 2.0)
+
+
+@pytest.mark.slow
+def test_the_shipped_flight_knows_how_good_it_is() -> None:
+    """Four seeds, ten minutes without GNSS each, over the same hills lap by lap."""
+    changes = [
+        "duration_s=900",
+        "expect={}",
+        'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", \
+"airspeed", "rangefinder"]}]',
+    ]
+    metrics = [run(Scenario.load("denied_terrain", changes), seed=seed).metrics for seed in range(4)]
+    nees = np.mean([one["ins.outage_position_nees_mean"] for one in metrics])
+    print(f"NEES per degree of freedom {nees:.2f}")
+    assert 0.3 < nees < 2.5
+    assert max(one["ins.outage_position_horizontal_max_m"] for one in metrics) < 150
