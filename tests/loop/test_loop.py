@@ -379,4 +379,9 @@ def test_late_stamps_and_losses_give_the_same_bits_live_batch_and_as_a_log(
     path = tmp_path / "again.toml"
     path.write_text(log_of(scenario.text, tmp_path / "run.nc", 'aircraft = "loiter"'), "utf-8")
     again = run(Scenario.load(path, {"duration_s": 20, **changes}))
-    assert same(batch.dataset["estimators"], again.dataset["estimators"])
+    # the log ends with the last stamp, a moment before the run did
+    for node in again.dataset["estimators"].subtree:
+        for name, variable in node.variables.items():
+            first = batch.dataset[node.path][name].values
+            assert len(variable) >= len(first) - 2
+            np.testing.assert_array_equal(variable.values, first[: len(variable)], err_msg=f"{node.path}/{name}")
