@@ -60,7 +60,7 @@ CIRCLES = Route(
     PLAN.format(straight_m=1500, radius_m=400),
 )
 HILLS = Route(
-    "lat_deg = 36.58, lon_deg = -84.34, alt_m = 900, heading_deg = 30, airspeed_mps = 25",
+    "lat_deg = 36.58, lon_deg = -84.34, alt_m = 1050, heading_deg = 30, airspeed_mps = 25",
     'file = "jacksboro", map_error_m = 4',
     PLAN.format(straight_m=3000, radius_m=1500),
 )
