@@ -249,7 +249,7 @@ def test_a_flight_that_fails_stops_no_other(
 # --- statistics
 
 
-@pytest.mark.ci
+@pytest.mark.slow
 def test_an_efficient_and_honest_estimator_is_found_to_be_one() -> None:
     result = whole(100)
     found = report.cells(result)

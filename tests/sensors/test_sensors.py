@@ -272,6 +272,9 @@ def error_keys(kind, grade):
         "rate_hz",
         "mean_s",
         "delay",
+        "jitter",
+        "dropout",
+        "rectification",  # of the vibration: nothing by itself
     )
     numbers = {key: value for key, value in preset.items() if isinstance(value, (int, float))}
     return [key for key, value in numbers.items() if not any(w in key for w in words) and value != 0]
