@@ -377,7 +377,7 @@ def test_an_interrupt_from_the_keyboard_leaves_a_record(tmp_path: Path) -> None:
     )
     assert "Traceback" not in rest
     rows = record.load(tmp_path / "runs/static_bench/run.nc")["truth"].sizes["time"]
-    assert rows >= 30 * percent  # at 10 Hz over 300 s
+    assert rows >= 30 * (percent - 0.5)  # at 10 Hz over 300 s; what is shown is rounded
 
 
 @pytest.mark.ci
