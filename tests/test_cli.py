@@ -136,6 +136,14 @@ print("heavy:", sorted(heavy & sys.modules.keys()))
     assert shown.splitlines()[-1] == "heavy: []"
 
 
+def test_a_run_imports_nothing_slow_that_it_does_not_use() -> None:
+    code = """
+import sys, testbed.loop.loop
+print("slow:", sorted({"matplotlib", "scipy.signal", "scipy.stats", "scipy.spatial", "pandas"} & sys.modules.keys()))
+"""
+    assert python("-c", code).stdout.splitlines()[-1] == "slow: []"
+
+
 # --- what goes wrong ends with one message and code 2
 
 

@@ -9,9 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from matplotlib.cbook import get_sample_data
-from scipy.ndimage import map_coordinates
-from scipy.signal import lfilter
 
 from nav.earth import radii
 from nav.samples import Array
@@ -49,6 +46,8 @@ def thinned(terrain: Terrain, every: int) -> tuple[Terrain, float]:
     """
     if every == 1:
         return terrain, 0.0
+    from scipy.ndimage import map_coordinates  # takes long to load, and few need it; the same of those below
+
     heights = np.ascontiguousarray(terrain.heights[::every, ::every])
     if min(heights.shape) < 2:
         raise UserError(f"of the file's {min(terrain.heights.shape)} rows or columns, map_every leaves one: lower it")
@@ -62,6 +61,8 @@ def uneven(terrain: Terrain, sigma: float, length: float, rng: np.random.Generat
     """The same with errors of ``sigma`` [m] drawn by ``rng``, alike by exp(-(|north| + |east|) / length [m])."""
     if not sigma:
         return terrain
+    from scipy.signal import lfilter
+
     R_M, R_N = radii(terrain.grid[0])
     field = rng.standard_normal(terrain.heights.shape)
     steps = terrain.grid[1] * R_M, terrain.grid[3] * R_N * math.cos(terrain.grid[0])
@@ -77,6 +78,8 @@ def uneven(terrain: Terrain, sigma: float, length: float, rng: np.random.Generat
 @lru_cache(maxsize=1)
 def _jacksboro() -> Terrain:
     """3 arc-seconds from SRTM around a fault in Tennessee; rows from the north, whose bounds the file has swapped."""
+    from matplotlib.cbook import get_sample_data
+
     with np.load(str(get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))) as archive:
         heights = np.ascontiguousarray(archive["elevation"][::-1].astype(float))
         south, west, step = float(archive["ymax"]), float(archive["xmin"]), float(archive["dy"])

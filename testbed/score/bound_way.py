@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from nav.samples import Array
 from testbed.score.accuracy import column
@@ -54,6 +52,8 @@ class Way:
 
 def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
     """The true way of a recorded run in steps of about ``step_s``, at least a row of truth each."""
+    from scipy.ndimage import uniform_filter1d  # as long to load as the rest of the scores, for runs with an outage
+    from scipy.spatial.transform import Rotation
 
     def true(name: str) -> Array:
         return np.asarray(column(dataset, f"truth/{name}"), float)

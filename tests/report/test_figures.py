@@ -11,6 +11,7 @@ import allantools
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from scipy.signal import welch
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
@@ -179,6 +180,14 @@ def test_density_of_white_noise_is_that_of_its_random_walk() -> None:
     frequency, density = imu._density(rate, dt)
     assert frequency[-1] == pytest.approx(100.0)
     np.testing.assert_allclose(np.sqrt(np.mean(density**2, axis=0)), np.sqrt(2) * N, rtol=0.01)
+
+
+def test_density_is_that_of_scipy() -> None:
+    rate = np.random.default_rng(2).standard_normal((9001, 3)).cumsum(axis=0)
+    frequency, density = imu._density(rate, 0.005)
+    expected, power = welch(rate, 200.0, nperseg=4000, axis=0)
+    np.testing.assert_allclose(frequency, expected[1:])
+    np.testing.assert_allclose(density**2, power[1:], rtol=1e-9)
 
 
 def test_allan_needs_rest(run: Run) -> None:
