@@ -11,6 +11,7 @@ How information is shared, what is done about faults, and what speaks for which 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance
-from nav.local_filter import LocalFilter
+from nav.local_filter import NO_SENSOR, LocalFilter
 from nav.monitor import Change, Isolation, Monitor
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -172,10 +173,7 @@ class Federated:
         return sample.sensor in (self._aligning if self._state is None else self._users)
 
     def update(self, sample: Sample) -> list[UpdateReport]:
-        """Use a sample valid at the estimator's own time (ValueError otherwise: `nav.horizon.FusionHorizon`).
-
-        One report per part of the sample and local filter that has its sensor.
-        """
+        """Use a sample valid at the estimator's own time, else ValueError; a report per part and filter that has it."""
         if isinstance(sample, GnssSample) and not sample.has_fix:
             return []
         trouble = aids.problem(sample)
@@ -194,6 +192,9 @@ class Federated:
         reports: list[UpdateReport] = []
         for filter_ in self._users.get(sample.sensor, ()):
             reports += self._use(state, filter_, sample)
+        for filter_ in self.locals:
+            if (silent := filter_.stand_in(sample)) is not None:
+                reports += [replace(report, sensor=NO_SENSOR) for report in self._use(state, filter_, silent)]
         config = self.config
         if sample.t - self._fused_at >= config.fusion_period_s - TIME_TOLERANCE:
             if config.cross_check:

@@ -21,7 +21,7 @@ from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Verdict
 from nav.error_model import MOTION, POS, VEL, ImuModel
-from nav.local_filter import LocalFilter
+from nav.local_filter import NO_SENSOR, LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -213,6 +213,9 @@ class Ins:
             reports = self._update_gnss(state, sample, aid)
         else:
             reports = self._update_part_by_part(state, sample, aid)
+        if (silent := self._filter.stand_in(sample)) is not None:
+            known = self._update_part_by_part(state, silent, self._filter.aids[silent.sensor])
+            reports += [replace(report, sensor=NO_SENSOR) for report in known]
         if self._smoother is not None:
             self._smoother.pause(self.t, state)
         return reports

@@ -14,7 +14,7 @@ import numpy as np
 
 from nav import unscented
 from nav._jit import njit
-from nav.aids.airspeed import AirspeedAid
+from nav.aids.airspeed import AirspeedAid, Silence
 from nav.aids.base import FUSED, OUTSIDE, Aid, Measurement, OperatingPoint, Ruling, aid_blocks, report_on
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, VEL, ErrorModel, ImuModel, sensor_errors
@@ -28,6 +28,7 @@ from nav.unscented import CURVED, Scaling
 from nav.weighting import Fading, Policy, SageHusa, split
 
 LEFT_OUT = Ruling(Outcome.WEAKENED, "left out by the measurement policy")
+NO_SENSOR = "no sensor"  # that a report is of what is known without a sample
 
 
 class LocalFilter:
@@ -58,6 +59,8 @@ class LocalFilter:
         self.fadings: Mapping[str, Fading] = {}
         self.smoother: Smoother | None = None  # told of each update of a closed filter, if there is one
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
+        air = self._air()
+        self._silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
         """Monitor each part of a sensor's samples, from a clean record."""
@@ -79,8 +82,15 @@ class LocalFilter:
 
     def wind_memory(self) -> WindMemory | None:
         """An empty memory of the wind that this filter estimates, None when it estimates none."""
-        aid = next((aid for aid in self.aids.values() if isinstance(aid, AirspeedAid)), None)
+        aid = self._air()
         return None if aid is None else WindMemory(aid.wind_walk, aid.gust_sigma)
+
+    def _air(self) -> AirspeedAid | None:
+        return next((aid for aid in self.aids.values() if isinstance(aid, AirspeedAid)), None)
+
+    def stand_in(self, sample: Sample) -> Sample | None:
+        """What stands in for a pitot tube that has fallen silent, once a sound ``sample`` of any sensor was used."""
+        return None if self._silence is None else self._silence.stand_in(sample)
 
     def remember_wind(self, memory: WindMemory | None, state: State, t: float) -> None:
         """Put the mean wind into the ``memory``, if there is one."""

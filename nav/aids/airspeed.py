@@ -19,11 +19,17 @@ AIRSPEED_LIMITS = (-10.0, 300.0)  # what an instrument could possibly report [m/
 TOO_SLOW = Ruling(Outcome.OUT_OF_RANGE, "too slow for the pitot tube")
 STANDING = Ruling(Outcome.OUT_OF_RANGE, "standing, and blown upon")
 STANDING_SPEED = 2.0  # over ground: what blows at a vehicle at rest tells of gusts near the ground only [m/s]
+SILENT_S, SILENT_INTERVALS = 1.0, 3.0  # without a sample for longer than both, a pitot tube has fallen silent
+TIME_TOLERANCE = 1e-4  # [s]
 
 
 @dataclass(frozen=True)
 class AirspeedAid:
-    """Airspeed along body x, and the constraint of no sideslip (None leaves it out); a filter has one wind."""
+    """Airspeed along body x, and the constraint of no sideslip (None leaves it out); a filter has one wind.
+
+    A sample of no airspeed, NaN, stands for a tube that has fallen silent (`Silence`): of that the constraint is left,
+    as long as the filter's own velocity through the air is that of flight.
+    """
 
     sensor: str = "airspeed"
     sigma: float = 0.5  # [m/s]
@@ -62,7 +68,12 @@ class AirspeedAid:
         """See `Aid`."""
         assert isinstance(sample, AirspeedSample)
         state, (wind, gust, scale) = at.state, at.starts
-        slow = None if sample.eas >= self.minimum else TOO_SLOW
+        eas = sample.eas
+        if math.isnan(eas):
+            if part == "airspeed":
+                return None
+            eas = -float(airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, 0.0)[0][0])
+        slow = None if eas >= self.minimum else TOO_SLOW
         if slow is None and float(state.v_n @ state.v_n) < STANDING_SPEED**2:
             slow = STANDING
         if part == "airspeed":
@@ -70,6 +81,35 @@ class AirspeedAid:
             return Measurement(nu, H, self._R[0], slow)
         nu, H = sideslip(state.q_nb, state.v_n, at.x, wind, gust)
         return Measurement(nu, H, self._R[1], slow)
+
+
+@dataclass
+class Silence:
+    """Watches whether a pitot tube still says anything.
+
+    That no air comes from the side is known without it: how fast the aircraft flies hardly matters, so that
+    the filter's own velocity through the air will do.
+    """
+
+    sensor: str
+    _heard: float = -math.inf  # the latest sample [s]
+    _interval: float = math.inf  # between the latest two
+    _stood_in: float = -math.inf
+
+    def stand_in(self, sample: Sample) -> AirspeedSample | None:
+        """What stands in for the tube, given the newest ``sample`` of any sensor: nothing unless it has fallen silent.
+
+        It comes as often as the tube had said something, or other sensors do if that is less often.
+        """
+        t = sample.t
+        if sample.sensor == self.sensor:
+            self._interval, self._heard = t - self._heard, t
+            return None
+        silent = t - self._heard > max(SILENT_S, SILENT_INTERVALS * self._interval)
+        if not silent or t - self._stood_in < self._interval - TIME_TOLERANCE:
+            return None
+        self._stood_in = t
+        return AirspeedSample(t, t, math.nan, self.sensor)
 
 
 def problem(sample: AirspeedSample) -> str:

@@ -18,9 +18,9 @@ from nav.federation import Config, Local
 from nav.fusion import blend, combine, reset, weights_by_covariance
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import LocalFilter
+from nav.local_filter import NO_SENSOR, LocalFilter
 from nav.monitor import MonitoredAid
-from nav.samples import BarometerSample, FixType, ImuSamples, Outcome, Status
+from nav.samples import AirspeedSample, BarometerSample, FixType, ImuSamples, Outcome, Status
 from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
 INFORMATION = Config(CONSUMER, (Local("only", ()),))
@@ -749,6 +749,19 @@ def test_looking_at_an_estimate_changes_none():
     assert first.lat == second.lat
     for a, b in zip(before, federated.local("one"), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_pitot_that_falls_silent_leaves_its_filter_the_constraint_of_no_sideslip():
+    truth, increments, one, *_ = world()
+    speeds = airspeed(truth, np.random.default_rng(3))
+    locals_ = Local("one", (MonitoredAid(GnssAid()),)), Local("air", (MonitoredAid(AirspeedAid(sideslip_sigma=1.0)),))
+    heard = [s for s in [*one, *speeds] if s.t < 30 and (s.t < 15 or not isinstance(s, AirspeedSample))]
+    first = increments.t <= 30.0
+    increments = ImuSamples(*(getattr(increments, name)[first] for name in ("t", "dt", "dtheta", "dv")))
+    _, _, reports = fly(Config(CONSUMER, locals_), heard, increments)
+    known = [r for r in reports if r.sensor == NO_SENSOR]
+    assert known[0].t == pytest.approx(16.0)
+    assert {(r.aid, r.outcome) for r in known} == {("sideslip", Outcome.FUSED)}
 
 
 def test_two_filters_may_share_a_sensor_or_a_name_of_a_state():

@@ -14,6 +14,7 @@ from worlds.ins import (
     NOISELESS,
     WIND_N,
     airspeed,
+    at_rest,
     barometer,
     error,
     feed,
@@ -28,6 +29,7 @@ from nav.alignment import InitialState
 from nav.detection import SURE, GnssMonitor, Verdict, WindMemory
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.local_filter import NO_SENSOR
 from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
 
 ARM = (0.5, 0.1, -0.3)
@@ -368,6 +370,48 @@ def test_sideslip_observes_the_wind_across():
         sigma.append(math.sqrt(across @ ins._state.P[0][where, where] @ across))
     assert sigma[0] > 4
     assert sigma[1] < 1
+
+
+def silent_pitot(truth, until, slip):
+    """Reports of a flight whose pitot tube, 10 Hz, says nothing any more from ``until`` [s] on; 1-sigma of the wind."""
+    aids = RECEIVER, PRESSURE, AirspeedAid(sideslip_sigma=slip, wind_walk=0.1)
+    rng = np.random.default_rng(5)
+    increments, fixes, others = everything(truth, rng)
+    samples = [s for s in others if not isinstance(s, AirspeedSample) or s.t < until]
+    ins = Ins(InsConfig(CONSUMER, aids), field)
+    ins.start(true_start(truth))
+    _, reports = feed(FusionHorizon(ins), increments, [f for f in fixes if f.t < until] + samples)
+    where = ins.model.slices["wind"]
+    return reports, np.sqrt(ins._state.P[0].diagonal()[where])
+
+
+@pytest.mark.ci
+def test_a_pitot_that_falls_silent_leaves_the_constraint_of_no_sideslip():
+    """As often as it was heard, from a second later on, against the filter's own velocity through the air."""
+    truth = flight(60)
+    reports, sigma = silent_pitot(truth, 20.0, 1.0)
+    heard = [r for r in reports if r.aid == "sideslip" and r.sensor == "airspeed"]
+    known = [r for r in reports if r.aid == "sideslip" and r.sensor == NO_SENSOR]
+    assert max(r.t for r in reports if r.aid == "airspeed") == max(r.t for r in heard) < 20.0
+    assert known[0].t == pytest.approx(21.0)
+    assert np.diff([r.t for r in known]) == pytest.approx(0.1)
+    assert known[-1].t == pytest.approx(60.0, abs=0.2)
+    assert np.mean([r.weight for r in known]) > 0.99
+    assert np.mean([r.nis for r in known]) < 2.0
+    _, without = silent_pitot(truth, 20.0, None)
+    assert np.all(sigma < 0.7 * without)
+
+
+def test_who_stands_still_knows_nothing_of_the_air_from_the_side():
+    truth = at_rest(5)
+    ins = Ins(InsConfig(CONSUMER, (PRESSURE, AirspeedAid(wind_sigma=40.0))), field)
+    ins.start(true_start(truth))
+    increments = exact(truth)
+    winds = [AirspeedSample(t, t, 20.0) for t in (0.2, 0.4)]
+    _, reports = feed(FusionHorizon(ins), increments, winds + barometer(truth, np.random.default_rng(1)))
+    known = [r for r in reports if r.sensor == NO_SENSOR]
+    assert known[0].t > 1.4
+    assert {(r.aid, r.outcome) for r in known} == {("sideslip", Outcome.OUT_OF_RANGE)}
 
 
 def test_a_sample_at_another_time_is_a_mistake_of_the_caller():
