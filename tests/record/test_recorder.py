@@ -96,8 +96,7 @@ def test_samples_estimates_reports_and_events_come_back(run_file: Path) -> None:
     np.testing.assert_array_equal(gnss["fix_type"], np.where(out, 1, 3))
     np.testing.assert_array_equal(gnss["v_n"][~out], truth.v_n[::40][~out])
     assert np.isnan(gnss["lat"].values[out]).all()
-    rng = np.random.default_rng([0, 0])
-    estimates = [synthetic_run.estimate(truth, k, TWO["ins"], rng) for k in range(0, len(truth), 20)]
+    estimates = list(synthetic_run.estimates(truth, TWO["ins"], np.random.default_rng([0, 0])).values())
     ins = tree["estimators/ins"]
     for name in ("lat", "lon", "h", "v_n", "q_nb", "gyro_bias", "accel_bias", "sigma_gyro_bias", "sigma_accel_bias"):
         np.testing.assert_array_equal(ins[name], np.array([getattr(e, name) for e in estimates]), err_msg=name)
@@ -195,13 +194,12 @@ def test_every_flush_can_be_read_and_flushing_changes_nothing(tmp_path: Path, ru
     path = tmp_path / "run.nc"
     recorder = Recorder(path, scenario(), 3)
     truth = circle(60.0)
-    rng = np.random.default_rng(0)
+    told = synthetic_run.estimates(truth, Errors(), np.random.default_rng(0))
     for start in range(0, len(truth), 397):
         block = truth.rows(start, min(start + 397, len(truth)))
         recorder.truth(block)
-        for k in range(start, start + len(block)):
-            if k % 20 == 0:
-                recorder.estimate("late" if k > 6000 else "ins", synthetic_run.estimate(truth, k, Errors(), rng))
+        for k in range(-(-start // 20) * 20, start + len(block), 20):
+            recorder.estimate("late" if k > 6000 else "ins", told[k])
         recorder.flush()
         tree = load(path)
         assert tree["truth"]["time"].values[-1] == truth.t[(start + len(block) - 1) // 20 * 20]
@@ -217,10 +215,10 @@ def test_every_flush_can_be_read_and_flushing_changes_nothing(tmp_path: Path, ru
 def test_a_column_that_appears_late_is_blank_before(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.nc", scenario(), 3)
     truth = circle(20.0)
-    rng = np.random.default_rng(0)
+    told = synthetic_run.estimates(truth, Errors(), np.random.default_rng(0))
     recorder.truth(truth)
     for k in (0, 20, 2000, 2020):  # the extra states come with alignment at 5 s
-        recorder.estimate("ins", synthetic_run.estimate(truth, k, Errors(), rng))
+        recorder.estimate("ins", told[k])
         recorder.flush()
     recorder.close()
     wind = load(tmp_path / "run.nc")["estimators/ins"]["wind"].values
@@ -350,12 +348,10 @@ def kill_and_read(folder: Path, number: int, delay: float) -> float:
     rows = len(t)
     assert t[-1] >= np.floor(flushed * 10) / 10 - 1e-9
     np.testing.assert_array_equal(tree["truth"]["v_n"], truth.v_n[::20][:rows])
-    rng = np.random.default_rng([0, 0])
     ins = tree["estimators/ins"]
     assert ins["time"].values[-1] >= np.floor(flushed * 10) / 10 - 1.0 - 1e-9
-    expected = [
-        synthetic_run.estimate(truth, 20 * k, Errors(denied=((30.0, 50.0),)), rng) for k in range(len(ins["time"]))
-    ]
+    told = synthetic_run.estimates(truth, Errors(denied=((30.0, 50.0),)), np.random.default_rng([0, 0]))
+    expected = list(told.values())[: len(ins["time"])]
     np.testing.assert_array_equal(ins["lat"], [e.lat for e in expected])
     np.testing.assert_array_equal(tree["sensors/imu"]["dv"], truth.dv[: len(tree["sensors/imu"]["time"])])
     with xarray.open_datatree(path) as plain:
@@ -403,9 +399,9 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
 
     monkeypatch.setattr(Table, "rows", dying)
     recorder.truth(truth.rows(2001, 4001))
-    rng = np.random.default_rng(5)
+    told = synthetic_run.estimates(truth, Errors(), np.random.default_rng(5))
     for k in range(2020, 4001, 20):
-        recorder.estimate("ins", synthetic_run.estimate(truth, k, Errors(), rng))
+        recorder.estimate("ins", told[k])
     with pytest.raises(Died):
         recorder.flush()
     with pytest.raises(Died):

@@ -412,11 +412,9 @@ def recovering(path: Path, bad_until: float, relapse: float | None = None) -> di
     truth = circle(200.0)
     recorder = Recorder(None, scenario(200.0), 1)
     recorder.truth(truth)
-    rng = np.random.default_rng(0)
-    for k in range(0, len(truth), 20):
+    for k, good in synthetic_run.estimates(truth, Errors(sigma_position=0.1), np.random.default_rng(0)).items():
         t = truth.t[k]
         off = 90 <= t < bad_until or (relapse is not None and relapse <= t < relapse + 1)
-        good = synthetic_run.estimate(truth, k, Errors(sigma_position=0.1), rng)
         recorder.estimate(
             "ins",
             type(good)(
