@@ -36,9 +36,11 @@ class Course:
 class GnssAid:
     """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED).
 
-    Where it is not known to ``latency_sigma`` when a sample was valid, position is uncertain by the velocity times that
-    and velocity by the acceleration, beside the sigmas. A velocity older by ``velocity_lag`` than the position of the
-    same sample, as of receivers that smooth it, is held against the velocity at that time, to first order.
+    A velocity older by ``velocity_lag`` than the position of the same sample, as of receivers that smooth it, is held
+    against the velocity at that time, to first order. Where it is known to ``latency_sigma`` only when a sample was
+    valid, two states say by how much earlier the position was, and by how much more the velocity lags. The receiver's
+    own filters make both change with each manoeuvre by as much: velocity times that is noise of the position beside its
+    sigma, and acceleration times that of the velocity.
     """
 
     sensor: str = "gnss"
@@ -61,15 +63,16 @@ class GnssAid:
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        own = f"{self.sensor}_position_error", f"{self.sensor}_velocity_error"
+        own = tuple(f"{self.sensor}_{name}" for name in ("position_error", "velocity_error", "latency"))
         return (*own, "wind", "gust") if self.course else own
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        position, velocity = self.states[:2]
+        position, velocity, latency = self.states[:3]
         return [
             markov(position, 3, self.position_error_sigma, self.position_error_correlation_s),
             markov(velocity, 3, self.velocity_error_sigma, self.velocity_error_correlation_s),
+            Block(latency, 2, self.latency_sigma),
         ]
 
     @cached_property
@@ -84,11 +87,17 @@ class GnssAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, GnssSample)
-        state = at.state
+        state, latency = at.state, at.starts[2]
         if part == "gnss_position":
             nu, H = gnss_position(state.q_nb, state.lla, at.x, self.arm, at.starts[0], sample.lat, sample.lon, sample.h)
             R = _white(sample.sigma_position_n, self._correlated[0])
-            return Measurement(nu, H, R + (self.latency_sigma * state.v_n) ** 2 if self.latency_sigma else R)
+            if latency >= 0:
+                older = float(at.x[latency])
+                nu += older * state.v_n
+                H[:, VEL : VEL + 3] -= older * np.eye(3)
+                H[:, latency] = -state.v_n
+                R = R + (self.latency_sigma * state.v_n) ** 2
+            return Measurement(nu, H, R)
         if not has_velocity(sample):
             return None
         if part == "gnss_course":
@@ -99,12 +108,16 @@ class GnssAid:
         )  # fmt: skip
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         R = _white(sample.sigma_velocity_n, self._correlated[1])
-        if self.latency_sigma or self.velocity_lag:
+        if latency >= 0 or self.velocity_lag:
             acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
             if state.rates[1].any():
                 acceleration[2] += gravity(float(state.lla[0]), float(state.lla[2]))
-            R = R + (self.latency_sigma * acceleration) ** 2
-            nu += self.velocity_lag * acceleration
+            lag = self.velocity_lag
+            if latency >= 0:
+                lag += float(at.x[latency] + at.x[latency + 1])
+                H[:, latency] = H[:, latency + 1] = -acceleration
+                R = R + (self.latency_sigma * acceleration) ** 2
+            nu += lag * acceleration
         return Measurement(nu, H, R, unknown)
 
     def _course(self, sample: GnssSample, at: OperatingPoint) -> Measurement | None:
@@ -112,7 +125,7 @@ class GnssAid:
         speed2 = float(sample.v_n[0] ** 2 + sample.v_n[1] ** 2)
         if not speed2 > self.course.minimum**2:
             return None
-        nu, H = gnss_course(at.state.q_nb, at.state.v_n, at.x, at.starts[2], at.starts[3], sample.v_n)
+        nu, H = gnss_course(at.state.q_nb, at.state.v_n, at.x, at.starts[3], at.starts[4], sample.v_n)
         sigma2 = float(sample.sigma_velocity_n[:2] @ sample.sigma_velocity_n[:2]) / 2
         return Measurement(nu, H, np.array([(sigma2 + self.course.slip**2) / speed2]))
 

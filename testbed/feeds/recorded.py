@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,9 +18,11 @@ from testbed.feeds.feed import Turn
 from testbed.feeds.log import SAMPLES, Log, Reference
 from testbed.feeds.reference import ReferenceMotion, of_receiver, with_rates
 from testbed.feeds.stamps import at_times, bridged
+from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario
+from testbed.sensors import SensorConfig
 from testbed.sensors.faults import Faults
 from testbed.sensors.gnss import REPORTED_AT_LEAST, GnssConfig, Reception, without_fix
 from testbed.sensors.imu import ImuConfig
@@ -114,7 +116,7 @@ class Recorded:
         }
         self._times = {name: [one.t for one in own] for name, own in self._samples.items()}
         rows = self._rows(scenario)
-        reference = self._reference(truth, log)
+        reference = self._reference(truth, log, scenario.sensors)
         self._motion = ReferenceMotion(reference, truth.rate_hz, rows)
         self.source: MotionSource = self._motion
         self.origin = {
@@ -162,7 +164,7 @@ class Recorded:
         end = min((float(own.t[-1]) for own in self._imus.values()), default=scenario.duration_s)
         return math.floor(end * self.rate_hz + EDGE_S) + 1
 
-    def _reference(self, truth: LogTruth, log: Log) -> Reference:
+    def _reference(self, truth: LogTruth, log: Log, sections: Mapping[str, SensorConfig]) -> Reference:
         """What is judged against."""
         if truth.reference == "none":
             return NOBODY
@@ -172,10 +174,10 @@ class Recorded:
         elif (receiver := log.receiver) is None:
             return NOBODY if solution is None else replace(solution, t=solution.t - self._start)
         else:
-            told = self._samples.get(receiver)
-            if told is None:
-                told = _told(GnssConfig.model_validate({}), log, receiver, self._start)
+            section = sections.get(receiver, GnssConfig.model_validate({}))
+            told = self._samples.get(receiver) or _told(section, log, receiver, self._start)
             found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver)
+            found = _when_felt(found, section, log, receiver)
             if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
                 found = _with_attitude(found, solution, self._start)
         return with_rates(found, next(iter(self._imus.values()))) if self._imus else found
@@ -197,6 +199,19 @@ class Recorded:
         if reception.has_fix(sample.t, sample.lat, sample.lon):
             return sample  # type: ignore[no-any-return]
         return without_fix(sample.t, sample.t_arrival, sample.sensor)
+
+
+def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:
+    """A receiver's reference at the times when the IMU felt its velocities, of one whose latency is not known well.
+
+    No estimator has a part in it: one that finds a latency must not be judged by what it was told.
+    """
+    if log.valid_times or not section.latency_sigma_s or not log.imus:
+        return found
+    late = latency(next(iter(log.imus.values())), log.samples[receiver])
+    if late is None:
+        return found
+    return replace(found, name=f"{found.name}, {late:.2f} s late by the IMU", t=found.t + section.latency_s - late)
 
 
 def _with_attitude(found: Reference, solution: Reference, start: float) -> Reference:

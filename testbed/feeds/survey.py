@@ -27,7 +27,8 @@ REST_RATE, REST_FORCE = 0.02, 0.3  # deviation from the mean within a window [ra
 REST_SPEED, FLYING_SPEED, FLYING_HEIGHT = 1.0, 6.0, 8.0  # of GNSS [m/s, m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
-CLEARER = 1.1  # times as bad must no latency be, to believe in one
+CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
+OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
 LEAST_SPREAD = 0.05  # of a field about its mean, over its size, in the direction of the least
@@ -108,10 +109,10 @@ def survey(log: Log) -> Survey:
     times = {name: imu.t for name, imu in log.imus.items()}
     times |= {name: np.array([one.t for one in own]) for name, own in log.samples.items()}
     main = next(iter(log.imus.values()))
-    latency, spheres, scales = {}, {}, {}
+    late, spheres, scales = {}, {}, {}
     for name, own in log.samples.items():
-        if isinstance(own[0], GnssSample) and (lag := _latency(main, own)) is not None:
-            latency[name] = lag
+        if isinstance(own[0], GnssSample) and (lag := latency(main, own)) is not None:
+            late[name] = lag
         elif isinstance(own[0], MagnetometerSample):
             field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
             if (sphere := _sphere(field)) is not None:
@@ -119,7 +120,7 @@ def survey(log: Log) -> Survey:
         elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
-    return Survey(log, rates, phases, noise, vibration, latency, spheres, scales)
+    return Survey(log, rates, phases, noise, vibration, late, spheres, scales)
 
 
 def _rate(t: Array) -> Rate:
@@ -237,7 +238,7 @@ def _gained(dtheta: Array, dv: Array) -> Array:
     return total
 
 
-def _latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
+def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it."""
     t, v_n, place = fixes(own)
     if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
@@ -257,9 +258,11 @@ def _latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
         moved = np.column_stack([np.interp(t - lag, at, column) for column in gained.T])
         felt = np.linalg.norm(np.diff(moved, axis=0), axis=1)
         apart = ((felt - told) / step)[steady]
-        costs.append(float(np.median(np.abs(apart - np.median(apart)))))
+        apart = np.abs(apart - np.median(apart))
+        costs.append(float(np.sqrt(np.mean(np.minimum(apart, OUTLYING * np.median(apart)) ** 2))))
     best = int(np.argmin(costs))
-    return float(LAGS[best]) if costs[0] > CLEARER * costs[best] and best < len(LAGS) - 1 else None
+    clearer = 2 * steady.sum() * math.log(costs[0] / costs[best]) if costs[best] else math.inf
+    return float(LAGS[best]) if clearer > CLEARER and 0 < best < len(LAGS) - 1 else None
 
 
 def _sphere(field: Array) -> tuple[float, float] | None:

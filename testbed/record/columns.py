@@ -15,6 +15,7 @@ AXES: dict[str, tuple[str, ...]] = {
     "ned": ("north", "east", "down"),
     "body": ("forward", "right", "down"),
     "north_east": ("north", "east"),
+    "fix_part": ("position", "velocity"),
     "body_xy": ("x", "y"),
     "quaternion": ("w", "x", "y", "z"),
     "inertial_quaternion": ("w", "x", "y", "z"),
@@ -151,6 +152,9 @@ EXTRA = {
     "accel_scale": Variable("1", "estimated accelerometer scale factor error", ("body",)),
     "gnss_position_error": Variable("m", "estimated correlated error of GNSS position", ("ned",)),
     "gnss_velocity_error": Variable("m/s", "estimated correlated error of GNSS velocity", ("ned",)),
+    "gnss_latency": Variable(
+        "s", "estimated latency of GNSS position, and further lag of its velocity, beyond what is told", ("fix_part",)
+    ),
     "barometer_bias": Variable("m", "estimated bias of pressure altitude"),
     "magnetometer_bias": Variable("T", "estimated magnetometer bias", ("body",)),
     "magnetometer_anomaly": Variable("T", "estimated error of the reference field, constant over ground", ("ned",)),

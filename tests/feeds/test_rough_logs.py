@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -173,6 +174,28 @@ def test_gnss_that_is_taken_away_is_what_it_is_judged_by(log: Log, tmp_path: Pat
     place = result.dataset["sensors/gnss/lat"].values
     assert np.isnan(place).sum() >= 95
     assert np.isfinite(result.dataset["truth/lat"].values).mean() > 0.95
+
+
+WRONG = {"sensors.gnss.latency_s": 0.25}
+
+
+@pytest.mark.ci
+def test_gnss_told_a_wrong_latency_is_the_reference_of_when_it_was_felt(log: Log, tmp_path: Path) -> None:
+    """The log's receiver is 0.1 s late. One that finds that is not judged by what it was told, if that is uncertain."""
+    uncertain = fly(arrays(log), tmp_path, ALL, WRONG | {"sensors.gnss.latency_sigma_s": 0.1})
+    found = re.search(r", (0\.\d+) s late by the IMU", uncertain.dataset.attrs["reference"])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.1, abs=0.02)
+    sure = fly(arrays(log), tmp_path, ALL, WRONG)
+    assert "late by" not in sure.dataset.attrs["reference"]
+    # what the one has at some time the other has where the receiver is told to have been then
+    apart = 0.25 - float(found[1])
+    t, lat, earlier = (
+        result.dataset[f"truth/{name}"].values for result, name in ((sure, "time"), (sure, "lat"), (uncertain, "lat"))
+    )
+    then = np.interp(t + apart, t, earlier)
+    flown = np.isfinite(lat) & np.isfinite(then) & (t < t[-1] - 1)
+    np.testing.assert_allclose(then[flown], lat[flown], rtol=0, atol=1e-7)
 
 
 @pytest.mark.ci

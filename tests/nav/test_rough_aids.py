@@ -48,13 +48,17 @@ def fix(v_n):
 
 
 def test_an_uncertain_latency_counts_with_velocity_and_acceleration():
-    """0.1 s at 20 m/s is 2 m along the track; at 10 m/s^2 across it 1 m/s."""
+    """0.1 s at 20 m/s is 2 m along the track; at 10 m/s^2 across it 1 m/s: as noise, and as states at first."""
     aid, at = GnssAid(latency_sigma=0.1), circling(GnssAid(latency_sigma=0.1))
     along, across = velocity(0.7) / SPEED, np.array([-math.sin(0.35), math.cos(0.35), 0.0])
+    late, lag = at.starts[2], at.starts[2] + 1
     position = aid.measure("gnss_position", fix(velocity(0.7)), at)
     np.testing.assert_allclose(position.R, 1.0 + (0.1 * SPEED * along) ** 2)
+    np.testing.assert_allclose(position.H[:, [late, lag]], np.outer(-SPEED * along, [1, 0]))
     speed = aid.measure("gnss_velocity", fix(velocity(0.7)), at)
     np.testing.assert_allclose(speed.R, 0.01 + (0.1 * SPEED * TURN * across) ** 2, atol=1e-9)
+    np.testing.assert_allclose(speed.H[:, [late, lag]], np.outer(-SPEED * TURN * across, [1, 1]), atol=1e-9)
+    np.testing.assert_allclose(at.P[late : lag + 1, late : lag + 1], 0.01 * np.eye(2))
 
 
 @pytest.mark.parametrize("lag", [0.1, -0.1, 0.2])

@@ -1,0 +1,137 @@
+"""Latency of GNSS as states: of the position, and how much more the velocity lags."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+from worlds.ins import CONSUMER, FIELD_N, feed, flight, imu, magnetometer
+from worlds.motion import DT
+
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.aids.base import OperatingPoint, aid_blocks
+from nav.alignment import InitialState
+from nav.earth import radii
+from nav.error_model import POS, VEL, ErrorModel
+from nav.federated import Federated
+from nav.federation import Config, Local
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.monitor import MonitoredAid
+from nav.reference import Reference
+from nav.samples import FixType, GnssSample
+
+SIGMA = 0.1  # of the latency [s]
+DURATION = 60
+FIRST = 91201
+RECEIVER = GnssAid(latency_sigma=SIGMA)
+AIDS = (RECEIVER, MagnetometerAid())
+MODEL = ErrorModel(CONSUMER, aid_blocks(AIDS))
+STEPS = {"dv": 1e-2, "dp": 1.0, "gnss_latency": 1e-3}
+ACCELERATION_N = np.array([1.5, -4.0, 0.5])
+
+
+def predicted_from(latency, lag, error):
+    """Where a fix is predicted from: a state with this latency and lag, to which an ``error`` (n,) is added."""
+    attitude, lat, h = Rotation.from_euler("ZYX", [0.3, 0.1, -0.5]), 0.8, 300.0
+    v_n = np.array([20.0, 5.0, -2.0]) + error[VEL : VEL + 3]
+    R_M, R_N = radii(lat)
+    d = error[POS : POS + 3]
+    place = lat + d[0] / (R_M + h), 0.1 + d[1] / ((R_N + h) * math.cos(lat)), h - d[2]
+    reference = Reference([MODEL], [1.0], 10, lambda *_: FIELD_N)
+    state = reference.start(InitialState(0.0, *place, v_n, attitude.as_quat(scalar_first=True), np.eye(9)))
+    state.rates[1] = attitude.inv().apply(ACCELERATION_N - [0.0, 0.0, 9.80665])
+    start = MODEL.start("gnss_latency")
+    state.x[0, start : start + 2] = latency, lag
+    state.x[0, start:] += error[start:]
+    starts = tuple(map(MODEL.start, RECEIVER.states))
+    return OperatingPoint(reference, state, state.x[0], starts, state.P[0])
+
+
+@pytest.mark.parametrize("part", ["gnss_position", "gnss_velocity"])
+def test_the_jacobian_is_that_of_the_prediction(part):
+    sigma = np.full(3, 0.1)
+    fix = GnssSample(0.0, 0.0, 0.8, 0.1, 300.0, np.ones(3), 10 * sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+    H = RECEIVER.measure(part, fix, predicted_from(0.07, -0.03, np.zeros(MODEL.size))).H
+    for name, step in STEPS.items():
+        for column in range(MODEL.slices[name].start, MODEL.slices[name].stop):
+            errors = step * np.eye(MODEL.size)[column] * np.array([[1], [-1]])
+            plus, minus = (RECEIVER.measure(part, fix, predicted_from(0.07, -0.03, e)).nu for e in errors)
+            np.testing.assert_allclose(H[:, column], (minus - plus) / (2 * step), rtol=1e-4, atol=1e-5)
+
+
+def late_fixes(truth, rng, latency, lag, rate_hz=2.0):
+    """Fixes whose position and velocity are older than their time, by what moves by `SIGMA` from fix to fix."""
+    every, samples = round(1 / rate_hz / DT), []
+    for k in range(every, len(truth.t), every):
+        moves = latency + rng.normal(0.0, SIGMA), latency + lag + rng.normal(0.0, SIGMA)
+        p, v = (min(max(k - round(move / DT), 0), len(truth.t) - 1) for move in moves)
+        R_M, R_N = radii(truth.lat[p])
+        off = 1.5 * rng.normal(size=3)
+        samples.append(
+            GnssSample(
+                truth.t[k], truth.t[k], truth.lat[p] + off[0] / (R_M + truth.h[p]),
+                truth.lon[p] + off[1] / ((R_N + truth.h[p]) * math.cos(truth.lat[p])), truth.h[p] - off[2],
+                truth.v_n[v] + 0.1 * rng.normal(size=3), np.full(3, 1.5), np.full(3, 0.1), FixType.FIX_3D, 12, 0.8, 1.2,
+            )
+        )  # fmt: skip
+    return samples
+
+
+def flown(seed, estimator=None, smooth=False):
+    """What a filter has in the end, and the latency and lag that were drawn."""
+    truth, rng = flight(DURATION), np.random.default_rng(seed)
+    drawn = SIGMA * rng.normal(size=2)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    samples = late_fixes(truth, rng, *drawn)
+    samples += magnetometer(truth, rng, MagnetometerAid().bias_sigma * rng.normal(size=3), rate_hz=2.0)
+    filter_ = estimator or Ins(InsConfig(CONSUMER, AIDS, smooth=smooth), lambda *_: FIELD_N)
+    estimates, _ = feed(FusionHorizon(filter_), increments, samples, 10.0)
+    return filter_, estimates[-1], drawn
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Of each of some draws: the filter, its last estimate, and what was drawn."""
+    return [flown(seed, smooth=seed == FIRST) for seed in range(FIRST, FIRST + 8)]
+
+
+@pytest.mark.ci
+def test_a_latency_that_nobody_told_is_found(flights):
+    """To a quarter of what was known before, and as well as is claimed."""
+    squared = []
+    for ins, estimate, drawn in flights:
+        value, sigma = estimate.extra["gnss_latency"]
+        start = ins.model.start("gnss_latency")
+        P = ins._state.P[0][start : start + 2, start : start + 2]
+        assert (sigma < SIGMA / 4).all()
+        squared.append((value - drawn) @ np.linalg.solve(P, value - drawn))
+    low, high = chi2.ppf([0.005, 0.995], 2 * len(squared)) / (2 * len(squared))
+    assert low < np.mean(squared) / 2 < high
+
+
+@pytest.mark.ci
+def test_looking_back_the_latency_was_known_from_the_start(flights):
+    ins, estimate, _ = flights[0]
+    value, sigma = estimate.extra["gnss_latency"]
+    first = next(ins.smoothed([10.0])).extra["gnss_latency"]
+    np.testing.assert_allclose(first[0], value, atol=1e-6)
+    np.testing.assert_allclose(first[1], sigma, rtol=1e-3)
+
+
+@pytest.mark.ci
+def test_a_federation_finds_what_its_filter_would(flights):
+    drawn = flights[0][2]
+    locals_ = (
+        Local("gnss", (MonitoredAid(RECEIVER), MonitoredAid(MagnetometerAid()))),
+        Local("height", (MonitoredAid(BarometerAid()),)),
+    )
+    federated = Federated(Config(CONSUMER, locals_), lambda *_: FIELD_N)
+    value, sigma = flown(FIRST, federated)[1].extra["gnss_latency"]
+    assert (np.abs(value - drawn) < 3 * sigma).all()
+    assert (sigma < SIGMA / 2).all()
+
+
+def test_an_exact_latency_is_no_state():
+    assert "gnss_latency" not in ErrorModel(CONSUMER, aid_blocks((GnssAid(),))).slices
