@@ -276,7 +276,8 @@ class Ins:
         threshold = self._gate.threshold(3)
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
         odds = self._filter.odds(self._winds, state, v_n, sample.t) if nis > threshold else 0.0
-        verdict = self._monitor.judge(replace(sample, sigma_position_n=sigma_p), v_n, sigma_v, nis <= threshold, odds)
+        fix = sample if sigma_p is sample.sigma_position_n else replace(sample, sigma_position_n=sigma_p)
+        verdict = self._monitor.judge(fix, v_n, sigma_v, nis <= threshold, odds)
         self._doubt[:] = 0.0
         if self._monitor.contradicted:
             self._doubt[POS : POS + 3], self._doubt[VEL : VEL + 3] = nu, v_n - state.v_n

@@ -135,14 +135,24 @@ def compensate(imu: ImuSamples, previous: ImuSamples | None = None) -> ImuSample
     """
     if len(imu) == 0:
         return imu
-    before = imu if previous is None or len(previous) == 0 else previous
-    dtheta_prev = np.vstack([before.dtheta[-1:], imu.dtheta[:-1]])
-    dv_prev = np.vstack([before.dv[-1:], imu.dv[:-1]])
-    if before is imu:
-        dtheta_prev[0] = dv_prev[0] = 0.0
-    return ImuSamples(
-        imu.t,
-        imu.dt,
-        imu.dtheta + np.cross(dtheta_prev, imu.dtheta) / 12,
-        imu.dv + (np.cross(dtheta_prev, imu.dv) + np.cross(dv_prev, imu.dtheta)) / 12,
+    before = (
+        (np.zeros(3), np.zeros(3)) if previous is None or not len(previous) else (previous.dtheta[-1], previous.dv[-1])
     )
+    increments = np.ascontiguousarray(imu.dtheta), np.ascontiguousarray(imu.dv)
+    return ImuSamples(imu.t, imu.dt, *_compensated(*increments, *before))
+
+
+@njit
+def _compensated(dtheta: Array, dv: Array, dtheta_0: Array, dv_0: Array) -> tuple[Array, Array]:
+    """`compensate` of increments (N, 3), the ones before them (3,)."""
+    turned, gained = dtheta.copy(), dv.copy()
+    for k in range(len(dtheta)):
+        for j in range(3):
+            one, two = (j + 1) % 3, (j + 2) % 3
+            coning = dtheta_0[one] * dtheta[k, two] - dtheta_0[two] * dtheta[k, one]
+            sculling = dtheta_0[one] * dv[k, two] - dtheta_0[two] * dv[k, one]
+            sculling += dv_0[one] * dtheta[k, two] - dv_0[two] * dtheta[k, one]
+            turned[k, j] += coning / 12
+            gained[k, j] += sculling / 12
+        dtheta_0, dv_0 = dtheta[k], dv[k]
+    return turned, gained

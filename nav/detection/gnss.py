@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum, auto
 
-import numpy as np
-
+from nav._jit import njit
 from nav.detection.witness import SURE
 from nav.earth import displacement_n
 from nav.samples import Array, GnssSample
@@ -99,8 +98,16 @@ class GnssMonitor:
 
 def jump(before: GnssSample, fix: GnssSample, velocities: Array, sigma_v: Array) -> float:
     """Squared distance, chi-square of three, of a fix from where the one before and both velocities' sum say [m/s]."""
-    dt = fix.t - before.t
-    off = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h) - 0.5 * dt * velocities
-    variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2
-    variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
-    return float(np.sum(off * off / variance))
+    off = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
+    return _jump(off, fix.t - before.t, velocities, fix.sigma_position_n, before.sigma_position_n, sigma_v)
+
+
+@njit
+def _jump(off: Array, dt: float, velocities: Array, sigma: Array, sigma_before: Array, sigma_v: Array) -> float:
+    """`jump`, by how far the fixes are apart (3,) [m]."""
+    squared = 0.0
+    for k in range(3):
+        variance = sigma[k] ** 2 + sigma_before[k] ** 2 + (dt * sigma_v[k]) ** 2
+        variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
+        squared += (off[k] - 0.5 * dt * velocities[k]) ** 2 / variance
+    return squared
