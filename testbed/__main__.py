@@ -21,7 +21,7 @@ if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is th
 
 import typer
 
-from testbed.commands.compare import compare, view
+from testbed.commands.compare import compare
 from testbed.commands.denied import denied
 from testbed.commands.export import export
 from testbed.commands.log import log
@@ -39,6 +39,7 @@ from testbed.commands.shared import (
     output_folder,
     remark,
 )
+from testbed.commands.view import view
 from testbed.data import data_dir
 from testbed.errors import UserError, printable
 from testbed.results import METRICS, held, require_own

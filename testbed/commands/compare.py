@@ -1,4 +1,4 @@
-"""``testbed compare`` and ``testbed view``: runs beside each other, and a page in the browser."""
+"""``testbed compare``: runs beside each other."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 
 from testbed.commands.shared import RUNS, Force, console, output_folder, remark
 from testbed.errors import UserError, printable
-from testbed.results import METRICS, RECORD, REPORT
+from testbed.results import METRICS, RECORD
 
 if TYPE_CHECKING:
     import xarray
@@ -27,7 +27,6 @@ Compared = Annotated[
     ),
 ]
 Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for report.html.")]
-Viewed = Annotated[Path, typer.Argument(metavar="RUN", help="A record, the folder that it is in, or a page.")]
 
 
 def compare(runs: Compared, out: Folder = RUNS / "compare", force: Force = False) -> None:
@@ -44,18 +43,6 @@ def compare(runs: Compared, out: Folder = RUNS / "compare", force: Force = False
     with output_folder(out):
         title = " and ".join(case.name for case in cases)
         page = pages.write_comparison(blocks, {case.name: run for case, run in found}, out, title, force)
-    print(printable(f"report: {page}"))
-
-
-def view(run: Viewed) -> None:
-    """Open the page of a run in the browser."""
-    import webbrowser
-
-    page = run if run.suffix == ".html" else (run if run.is_dir() else run.parent) / REPORT
-    if not page.is_file():
-        raise UserError(f"{page}: no such file: `testbed report {run if run.suffix else run / RECORD}` makes it")
-    if not webbrowser.open(page.resolve().as_uri()):
-        raise UserError(f"{page}: there is no browser to open it in here: open it in one")
     print(printable(f"report: {page}"))
 
 

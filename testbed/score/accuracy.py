@@ -84,8 +84,10 @@ def column(dataset: xarray.DataTree, path: str) -> npt.NDArray[Any]:
 
 
 def names(dataset: xarray.DataTree) -> list[str]:
-    """The recorded estimators, in the order of the scenario."""
-    return list(dataset["estimators"].children) if "estimators" in dataset.children else []
+    """The recorded estimators with estimates, in the order of the scenario: a run that was cut off may lack some."""
+    if "estimators" not in dataset.children:
+        return []
+    return [name for name, node in dataset["estimators"].children.items() if "time" in node.coords]
 
 
 def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:

@@ -25,11 +25,16 @@ def program() -> str | None:
     return next((path for path in map(shutil.which, PROGRAMS) if path), None)
 
 
+class LeftError(Exception):
+    """The page was left for another while it was asked."""
+
+
 class Page:
     """One tab. What goes wrong in it, in the console or by an exception, is in ``complaints``."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, socket: WebSocketClientConnection) -> None:
         self.complaints: list[str] = []
+        self._served = "file:"
         self._loop, self._socket, self._last, self._loaded = loop, socket, 0, False
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.send(f"{domain}.enable")
@@ -44,6 +49,8 @@ class Page:
         await self._socket.write_message(command)
         while (message := await self._next()).get("id") != number:
             pass
+        if "navigated" in message.get("error", {}).get("message", ""):
+            raise LeftError
         assert "error" not in message, message
         return dict(message["result"])
 
@@ -63,7 +70,9 @@ class Page:
             self.complaints.append(json.dumps(params["args"])[:1000])
         elif method == "Log.entryAdded" and params["entry"]["level"] in ("error", "warning"):
             self.complaints.append(params["entry"]["text"])
-        elif method == "Network.requestWillBeSent" and not re.match("(file|data|blob):", params["request"]["url"]):
+        elif method == "Network.requestWillBeSent" and not params["request"]["url"].startswith(
+            ("file:", "data:", "blob:", self._served)
+        ):
             self.complaints.append(f"asked for {params['request']['url']}")
 
     def run(self, script: str) -> Any:
@@ -73,15 +82,21 @@ class Page:
         return said["result"].get("value")
 
     def until(self, condition: str) -> None:
-        """Wait until an expression of JavaScript is true."""
+        """Wait until an expression of JavaScript is true, of this page or the one that takes its place."""
         script = f"new Promise((done) => (function look() {{ if ({condition}) done(); else setTimeout(look, 20) }})())"
-        self.run(script)
+        while True:
+            try:
+                self.run(script)
+            except LeftError:
+                continue
+            return
 
-    def open(self, path: Path, ready: str = "document.readyState == 'complete'") -> None:
-        """Show a file, and wait until it is ``ready``."""
+    def open(self, page: Path | str, ready: str = "document.readyState == 'complete'") -> None:
+        """Show a file, or an address, which may be asked for more, and wait until it is ``ready``."""
         self.complaints.clear()
         self._loaded = False
-        self.send("Page.navigate", url=path.resolve().as_uri())
+        self._served = page if isinstance(page, str) else "file:"
+        self.send("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._loop.run_until_complete(asyncio.wait_for(self._next(), PATIENCE_S))
         self.until(ready)

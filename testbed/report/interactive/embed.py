@@ -13,15 +13,17 @@ from testbed.errors import UserError
 
 BOKEH = ("bokeh.min.js", "bokeh-api.min.js")
 SCRIPTS = ("state.js", "plots.js", "map.js", "controls.js")  # in this order
+LIVE = "live.js"  # after those, of a run in progress
 STATIC = Path(__file__).parent / "static"
 
 
 def script(contents: Mapping[str, Any]) -> str:
-    """Everything that is run in a page which shows these contents.
+    """Everything that is run in a page which shows these contents; one that has "live" listens for newer ones.
 
     Raises UserError when BokehJS is missing.
     """
-    own = "\n".join((STATIC / name).read_text("utf-8") for name in SCRIPTS)
+    names = (*SCRIPTS, LIVE) if "live" in contents else SCRIPTS
+    own = "\n".join((STATIC / name).read_text("utf-8") for name in names)
     # Within a script element "<" could begin the end of it, or a comment.
     shown = json.dumps(contents, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     return f'{_bokeh()}\n(() => {{\n"use strict";\nconst PAGE = {shown};\n{own}\n}})();'

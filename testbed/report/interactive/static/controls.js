@@ -46,21 +46,23 @@ function legend() {
   }, true);
   listen("shown", () => bands.setAttribute("aria-pressed", seen.bands));
   row.append(bands, key("truth", PAGE.reference));
-  if (PAGE.windows.length) row.append(key("denied", "no GNSS fix"));
-  if (PAGE.faults.length) row.append(key("fault", "fault of a sensor"));
+  if (PAGE.windows.length || PAGE.live) row.append(key("denied", "no GNSS fix"));
+  if (PAGE.faults.length || PAGE.live) row.append(key("fault", "fault of a sensor"));
   return row;
 }
 
 // --- time
 
-const marks = [
+/** What happened, in its order: events, faults and where there is no fix. */
+const marks = () => [
   ...PAGE.events.map(({ t, severity, text: said }) => ({ t, severity, said })),
   ...PAGE.faults.map(({ start, text: said }) => ({ t: start, severity: "fault", said })),
   ...PAGE.windows.map(([start]) => ({ t: start, severity: "denied", said: "no GNSS fix from here" })),
 ].filter(({ t }) => t >= PAGE.start && t <= PAGE.end).sort((a, b) => a.t - b.t);
 
 function step(way) {
-  const ahead = way > 0 ? marks.find(({ t }) => t > seen.cursor + 0.05) : marks.findLast(({ t }) => t < seen.cursor - 0.05);
+  const later = ({ t }) => t > seen.cursor + 0.05;
+  const ahead = way > 0 ? marks().find(later) : marks().findLast(({ t }) => t < seen.cursor - 0.05);
   if (ahead) jump(ahead.t);
 }
 
@@ -68,37 +70,40 @@ function timeline() {
   const share = (t) => `${(100 * (t - PAGE.start)) / (PAGE.end - PAGE.start)}%`;
   const strip = make("div", "strip");
   const stretch = make("div", "stretch");
-  strip.append(stretch);
-  const stripes = [...PAGE.windows.map(([start, end]) => [start, end, "denied", "no GNSS fix"]),
-    ...PAGE.faults.map(({ start, end, text: said }) => [start, end, "fault", said])];
-  for (const [start, end, what, said] of stripes) {
-    const stripe = make("div", what);
-    stripe.style.left = share(start);
-    stripe.style.width = `calc(${share(end)} - ${share(start)})`;
-    stripe.title = said;
-    strip.append(stripe);
-  }
-  for (const { t, severity, said } of marks) {
-    const mark = button("", `${timeText(t)}: ${said}`, () => jump(t));
-    mark.className = `mark ${severity}`;
-    mark.style.left = share(t);
-    mark.tabIndex = -1; // keys n and p lead to each, and so does the table
-    strip.append(mark);
-  }
+  const between = (one, start, end) => {
+    one.style.left = share(start);
+    one.style.width = `calc(${share(end)} - ${share(start)})`;
+  };
   const slider = make("input", "slider");
-  Object.assign(slider, { type: "range", min: PAGE.start, max: PAGE.end, step: "any", value: seen.cursor });
+  Object.assign(slider, { type: "range", step: "any" });
+  const showMarks = () => {
+    Object.assign(slider, { min: PAGE.start, max: PAGE.end });
+    const stripes = [...PAGE.windows.map(([start, end]) => [start, end, "denied", "no GNSS fix"]),
+      ...PAGE.faults.map(({ start, end, text: said }) => [start, end, "fault", said])];
+    strip.replaceChildren(stretch, ...stripes.map(([start, end, what, said]) => {
+      const stripe = make("div", what);
+      between(stripe, start, end);
+      stripe.title = said;
+      return stripe;
+    }), ...marks().map(({ t, severity, said }) => {
+      const mark = button("", `${timeText(t)}: ${said}`, () => jump(t));
+      mark.className = `mark ${severity}`;
+      mark.style.left = share(t);
+      mark.tabIndex = -1; // keys n and p lead to each, and so does the table
+      return mark;
+    }));
+  };
   slider.setAttribute("aria-label", "Time");
   slider.addEventListener("input", () => setCursor(Number(slider.value)));
   const showCursor = () => {
     slider.value = seen.cursor;
     slider.setAttribute("aria-valuetext", timeText(seen.cursor));
   };
-  const showStretch = () => {
-    stretch.style.left = share(seen.start);
-    stretch.style.width = `calc(${share(seen.end)} - ${share(seen.start)})`;
-  };
+  const showStretch = () => between(stretch, seen.start, seen.end);
   listen("cursor", showCursor);
   listen("stretch", showStretch);
+  listen("grown", showMarks);
+  showMarks();
   showCursor();
   showStretch();
   const whole = make("div", "time");
@@ -111,7 +116,7 @@ function buttons() {
   const now = make("output", "now", timeText(seen.cursor));
   listen("cursor", () => (now.textContent = timeText(seen.cursor)));
   row.append(now);
-  if (marks.length) row.append(
+  if (marks().length || PAGE.live) row.append(
     button("◂ event", "the event before (key p)", () => step(-1)),
     button("event ▸", "the next event (key n)", () => step(1)),
   );
@@ -225,22 +230,26 @@ function resized() {
 
 /** What the colours of crosses mean, of those that there are. */
 function crosses(own) {
-  const found = own.flatMap(({ dots }) => dots.flatMap(({ not_used }) => not_used.map(({ outcome }) => outcome)));
   const row = make("div", "keys");
-  for (const outcome of [...new Set(found)].sort((a, b) => a - b)) {
-    const made = key("cross", PAGE.outcomes[outcome].name);
-    const paint = () => made.style.setProperty("--own", PAGE.outcomes[outcome][dark() ? "dark" : "light"]);
-    listen("theme", paint);
-    paint();
-    row.append(made);
-  }
+  const show = () => {
+    const found = own.flatMap(({ dots }) => dots.flatMap(({ not_used }) => not_used.map(({ outcome }) => outcome)));
+    row.replaceChildren(...[...new Set(found)].sort((a, b) => a - b).map((outcome) => {
+      const made = key("cross", PAGE.outcomes[outcome].name);
+      made.style.setProperty("--own", PAGE.outcomes[outcome][dark() ? "dark" : "light"]);
+      return made;
+    }));
+  };
+  listen("theme", show);
+  listen("grown", show);
+  show();
   return row;
 }
 
 async function start() {
   bar.append(legend(), timeline(), buttons());
-  for (const row of document.querySelectorAll("[data-t]")) row.addEventListener("click", () => {
-    jump(Number(row.dataset.t));
+  document.addEventListener("click", ({ target }) => {
+    if (target.dataset?.t === undefined) return;
+    jump(Number(target.dataset.t));
     bar.nextElementSibling.scrollIntoView();
   });
   PAGE.chapters.forEach((chapter, k) => {
@@ -269,11 +278,11 @@ async function start() {
   });
   new ResizeObserver(() => panels.forEach((panel) => panel.follow())).observe(document.body);
   sight();
-  setCursor(PAGE.windows.length ? PAGE.windows[0][0] : (PAGE.start + PAGE.end) / 2);
+  setCursor(PAGE.live ? PAGE.end : PAGE.windows.length ? PAGE.windows[0][0] : (PAGE.start + PAGE.end) / 2);
   document.documentElement.dataset.state = "open";
   idle();
 }
 
 // What tests and the curious may look at.
 window.page = { seen, panels, planes, setStretch, setCursor, toggle, jump };
-start();
+const started = start();

@@ -42,14 +42,23 @@ class Plane {
     this.figure.yaxis.formatter = TICKS();
     this.parts = []; // [subject, renderer]
     this.themed = [];
+    this.fresh = []; // what takes over newer numbers
   }
 
   source(data = { x: [], y: [], colour: [] }) {
     return new Bokeh.ColumnDataSource({ data });
   }
 
-  line(of, x, y, style = {}) {
-    const renderer = this.figure.line({ field: "x" }, { field: "y" }, { source: this.source({ x, y }), ...style });
+  /** A source of what `columns` gives, now and whenever there are newer numbers. */
+  growing(columns) {
+    const source = this.source(columns());
+    this.fresh.push(() => (source.data = columns()));
+    return source;
+  }
+
+  line(of, columns, style = {}) {
+    const source = this.growing(columns);
+    const renderer = this.figure.line({ field: "x" }, { field: "y" }, { source, ...style });
     if (!style.line_color) this.themed.push(() => renderer.glyph.setv({ line_color: colourOf(of) }));
     this.parts.push([of, renderer]);
     return renderer;
@@ -90,18 +99,15 @@ class Plane {
 class Chart extends Plane {
   constructor(place, spec) {
     super(place, "Map", "east of the start [m]", "north of the start [m]");
-    this.truths = spec.truths.map((one) => ({ ...one, t: numbers(one.t), n: numbers(one.n), e: numbers(one.e) }));
-    this.tracks = spec.tracks.map((one) => ({
-      ...one, t: numbers(one.t), n: numbers(one.n), e: numbers(one.e),
-      error: one.error.map(numbers), covariance: one.covariance.map(numbers),
-    }));
+    this._read(spec);
     this.sigmas = spec.sigmas;
     this.follows = false;
     this._denied();
-    for (const fixes of spec.fixes) this._fixes(fixes);
-    for (const { of, n, e } of this.tracks) this.line(of, e, n, stroke(of));
-    for (const { n, e } of this.truths) this.line(-1, e, n, stroke(-1));
-    this._ends();
+    for (const k of this.fixes.keys()) this._fixes(k);
+    const way = (kind, k) => () => ({ x: this[kind][k].e, y: this[kind][k].n });
+    this.tracks.forEach(({ of }, k) => this.line(of, way("tracks", k), stroke(of)));
+    this.truths.forEach((_, k) => this.line(-1, way("truths", k), stroke(-1)));
+    for (const k of this.truths.keys()) this._ends(k);
     this.around = this.source({ x: [], y: [], colour: [] });
     const outlines = { source: this.around, line_color: { field: "colour" }, fill_color: { field: "colour" } };
     this.figure.patches({ field: "x" }, { field: "y" }, { ...outlines, fill_alpha: 0.12, line_width: 1.5 });
@@ -116,30 +122,50 @@ class Chart extends Plane {
     this.plot.addEventListener("dblclick", () => this.whole());
   }
 
+  _read(spec) {
+    const track = (one) => ({ ...one, t: numbers(one.t), n: numbers(one.n), e: numbers(one.e) });
+    this.truths = spec.truths.map(track);
+    this.fixes = spec.fixes.map(track);
+    this.tracks = spec.tracks.map((one) => ({
+      ...track(one), error: one.error.map(numbers), covariance: one.covariance.map(numbers),
+    }));
+  }
+
+  /** Show newer contents of the same map; all of it, where all was shown. */
+  grow(spec) {
+    const { x_range: x, y_range: y } = this.figure;
+    const all = this.all && [x.start, x.end, y.start, y.end].every((value, k) => value == this.all[k]);
+    this._read(spec);
+    for (const take of this.fresh) take();
+    if (all && !this.follows) this.whole();
+  }
+
   _denied() {
-    const { t, n, e } = this.truths[0];
     const inside = (at) => PAGE.windows.some(([start, end]) => at >= start && at < end);
-    const cut = (values) => values.map((value, k) => (inside(t[k]) ? value : NaN));
-    const renderer = this.line(-2, cut(e), cut(n), { line_width: 11, line_cap: "round", line_color: "#DDDDDD" });
+    const renderer = this.line(-2, () => {
+      const { t, n, e } = this.truths[0];
+      const cut = (values) => values.map((value, k) => (inside(t[k]) ? value : NaN));
+      return { x: cut(e), y: cut(n) };
+    }, { line_width: 11, line_cap: "round", line_color: "#DDDDDD" });
     this.themed.push(() => renderer.glyph.setv({ line_color: colours().denied }));
   }
 
-  _fixes({ n, e }) {
-    const source = this.source({ x: numbers(e), y: numbers(n) });
+  _fixes(k) {
+    const source = this.growing(() => ({ x: this.fixes[k].e, y: this.fixes[k].n }));
     const style = { source, size: 3, line_color: null };
     const renderer = this.figure.scatter({ field: "x" }, { field: "y" }, style);
     this.themed.push(() => renderer.glyph.setv({ fill_color: colours().fix }));
   }
 
-  _ends() {
-    for (const { n, e } of this.truths) {
-      const known = [...n.keys()].filter((k) => Number.isFinite(n[k]) && Number.isFinite(e[k]));
-      [[known[0], "circle"], [known[known.length - 1], "square"]].forEach(([k, marker]) => {
-        if (k === undefined) return;
-        const style = { source: this.source({ x: [e[k]], y: [n[k]] }), size: 9, marker, line_color: null };
-        const renderer = this.figure.scatter({ field: "x" }, { field: "y" }, style);
-        this.themed.push(() => renderer.glyph.setv({ fill_color: colourOf(-1) }));
+  _ends(own) {
+    for (const [marker, find] of [["circle", "findIndex"], ["square", "findLastIndex"]]) {
+      const source = this.growing(() => {
+        const { n, e } = this.truths[own];
+        const k = n[find]((north, at) => Number.isFinite(north) && Number.isFinite(e[at]));
+        return k < 0 ? { x: [], y: [] } : { x: [e[k]], y: [n[k]] };
       });
+      const renderer = this.figure.scatter({ field: "x" }, { field: "y" }, { source, size: 9, marker, line_color: null });
+      this.themed.push(() => renderer.glyph.setv({ fill_color: colourOf(-1) }));
     }
   }
 
@@ -186,6 +212,8 @@ class Chart extends Plane {
     const half = Math.max((east - west) / 2, (north - south) / 2, 5);
     const narrow = (width) => Math.max(0.55 * width, 0.1 * half, 5);
     this.fit((west + east) / 2, (south + north) / 2, narrow(east - west), narrow(north - south));
+    const { x_range: x, y_range: y } = this.figure;
+    this.all = [x.start, x.end, y.start, y.end];
   }
 
   /** The cursor, with room for errors and ellipses. */

@@ -8,15 +8,7 @@ const touches = matchMedia("(pointer: coarse)").matches;
 
 class Panel {
   constructor(spec, place) {
-    this.spec = spec;
-    this.lines = spec.lines.map((line) => ({
-      ...line, t: numbers(line.t), y: numbers(line.y),
-      band: line.band && { ...line.band, t: numbers(line.band.t), half: numbers(line.band.half) },
-    }));
-    this.dots = (spec.dots || []).map((one) => ({
-      ...one, t: numbers(one.t), y: one.y.map(numbers), raw: one.raw.map(numbers),
-      not_used: one.not_used.map((part) => ({ ...part, t: numbers(part.t), y: numbers(part.y) })),
-    }));
+    this._read(spec);
     this.element = make("figure", "panel");
     const head = make("figcaption");
     const name = spec.unit && !spec.gate && !this.dots.length ? `${spec.title} [${spec.unit}]` : spec.title;
@@ -31,7 +23,44 @@ class Panel {
     this.element.append(head, this.plot);
     place.append(this.element);
     this.inSight = false;
-    this.stale = false;
+    this.stale = false; // limits and who is shown
+    this.old = false; // numbers
+    this._heed();
+  }
+
+  _read(spec) {
+    this.spec = spec;
+    this.lines = spec.lines.map((line) => ({
+      ...line, t: numbers(line.t), y: numbers(line.y),
+      band: line.band && { ...line.band, t: numbers(line.band.t), half: numbers(line.band.half) },
+    }));
+    this.dots = (spec.dots || []).map((one) => ({
+      ...one, t: numbers(one.t), y: one.y.map(numbers), raw: one.raw.map(numbers),
+      not_used: one.not_used.map((part) => ({ ...part, t: numbers(part.t), y: numbers(part.y) })),
+    }));
+  }
+
+  /** What a plot consists of, but for its numbers. */
+  _parts() {
+    const lines = this.lines.map(({ of, name, dashed, band }) => [of, name, dashed, Boolean(band)]);
+    const dots = this.dots.map(({ of, axes, not_used }) => [of, axes, not_used.map(({ outcome }) => outcome)]);
+    return JSON.stringify([lines, dots, this._shaded().length, this.spec.gate, this.spec.limit]);
+  }
+
+  /** Show newer contents of the same panel, as soon as somebody looks. */
+  grow(spec) {
+    const before = this._parts();
+    this._read(spec);
+    if (!this.made) return;
+    if (this._parts() != before) {
+      this.made = this.made.then(() => {
+        this.view.remove();
+        return this._build();
+      });
+    } else {
+      this.old = true;
+      this.update();
+    }
   }
 
   async build() {
@@ -53,10 +82,12 @@ class Panel {
     this.figure.yaxes[0].ticker.desired_num_ticks = 5;
     this.parts = []; // [subject, renderer, whether it is a band]
     this.themed = []; // what has another colour in the dark
+    this.fresh = []; // what takes over newer numbers
     this._shade();
-    for (const line of this.lines) if (line.band) this._band(line);
-    for (const line of this.lines.toSorted((a, b) => (a.of < 0) - (b.of < 0))) this._line(line);
-    for (const one of this.dots) this._dots(one);
+    const order = [...this.lines.keys()];
+    for (const k of order) if (this.lines[k].band) this._band(k);
+    for (const k of order.sort((a, b) => (this.lines[a].of < 0) - (this.lines[b].of < 0))) this._line(k);
+    for (const k of this.dots.keys()) this._dots(k);
     if (!touches) gestures(this.figure, "width");
     this.theme();
     this.update();
@@ -64,21 +95,28 @@ class Panel {
       if (!this.updating) setStretch(range.start, range.end);
     });
     this.view = await Bokeh.Plotting.show(this.figure, this.plot);
-    this._heed();
     this.follow();
   }
 
+  /** When there was no fix or a fault: from, to, and which. */
+  _shaded() {
+    const { sensors } = this.spec;
+    const faults = PAGE.faults.filter(({ sensor }) => !sensors || sensors.includes(sensor));
+    return [...PAGE.windows.map(([start, end]) => [start, end, "denied"]),
+      ...faults.map(({ start, end }) => [start, end, "fault"])];
+  }
+
   _shade() {
-    const boxes = PAGE.windows.map(([left, right]) => [left, right, "denied"]);
-    const sensors = this.spec.sensors;
-    for (const fault of PAGE.faults)
-      if (!sensors || sensors.includes(fault.sensor)) boxes.push([fault.start, fault.end, "fault"]);
-    for (const [left, right, what] of boxes) {
+    this._shaded().forEach(([left, right, what], k) => {
       const box = new Bokeh.BoxAnnotation({ left, right, fill_alpha: what == "denied" ? 1 : 0.7, line_color: null });
       box.level = "image";
       this.figure.add_layout(box);
-      this.themed.push(() => box.setv({ fill_color: colours()[what] }));
-    }
+      this.themed.push(() => box.setv({ fill_color: colours()[this._shaded()[k][2]] }));
+      this.fresh.push(() => {
+        const [start, end] = this._shaded()[k];
+        box.setv({ left: start, right: end });
+      });
+    });
     if (this.spec.bounds) {
       const [bottom, top] = this.spec.bounds;
       const box = new Bokeh.BoxAnnotation({ bottom, top, fill_alpha: 0.85, line_color: null, level: "image" });
@@ -102,8 +140,19 @@ class Panel {
     });
   }
 
-  _line(line) {
-    const source = new Bokeh.ColumnDataSource({ data: { t: line.t, y: this.spec.wraps ? this._broken(line) : line.y } });
+  /** A source of what `columns` gives, now and whenever there are newer numbers. */
+  _source(columns) {
+    const source = new Bokeh.ColumnDataSource({ data: columns() });
+    this.fresh.push(() => (source.data = columns()));
+    return source;
+  }
+
+  _line(k) {
+    const source = this._source(() => {
+      const line = this.lines[k];
+      return { t: line.t, y: this.spec.wraps ? this._broken(line) : line.y };
+    });
+    const line = this.lines[k];
     this._add(line.of, this.figure.line({ field: "t" }, { field: "y" }, { source, ...stroke(line.of, line.dashed) }), ["line_color"]);
   }
 
@@ -114,33 +163,38 @@ class Panel {
     return y;
   }
 
-  _band(line) {
-    const { t, half } = line.band;
-    const about = (k) => (line.band.about === undefined ? line.y[k] : line.band.about);
-    const data = { t, low: half.map((h, k) => about(k) - h), high: half.map((h, k) => about(k) + h) };
-    const source = new Bokeh.ColumnDataSource({ data });
+  _band(own) {
+    const source = this._source(() => {
+      const { y, band: { t, half, about } } = this.lines[own];
+      const middle = (k) => about ?? y[k];
+      return { t, low: half.map((h, k) => middle(k) - h), high: half.map((h, k) => middle(k) + h) };
+    });
     const style = { source, fill_alpha: 0.16 };
     const renderer = this.figure.varea({ field: "t" }, { field: "low" }, { field: "high" }, style);
-    this._add(line.of, renderer, ["fill_color"], true);
+    this._add(this.lines[own].of, renderer, ["fill_color"], true);
   }
 
-  _dots(one) {
+  _dots(own) {
+    const one = this.dots[own];
     const limit = 0.97 * this.spec.limit;
     const held = (values) => values.map((y) => Math.min(Math.max(Number.isNaN(y) ? -limit : y, -limit), limit));
     const markers = ["circle", "square", "triangle"];
-    one.y.forEach((values, k) => {
-      const source = new Bokeh.ColumnDataSource({ data: { t: one.t, y: held(values) } });
+    one.y.forEach((_, k) => {
+      const source = this._source(() => ({ t: this.dots[own].t, y: held(this.dots[own].y[k]) }));
       const style = { source, size: 3, line_color: null, fill_alpha: 0.55, marker: markers[k % 3] };
       this._add(one.of, this.figure.scatter({ field: "t" }, { field: "y" }, style), ["fill_color"]);
     });
-    for (const part of one.not_used) {
-      const source = new Bokeh.ColumnDataSource({ data: { t: part.t, y: held(part.y) } });
+    one.not_used.forEach((part, k) => {
+      const source = this._source(() => {
+        const { t, y } = this.dots[own].not_used[k];
+        return { t, y: held(y) };
+      });
       const style = { source, size: 7, line_width: 1.6, marker: "x" };
       const renderer = this.figure.scatter({ field: "t" }, { field: "y" }, style);
       this.parts.push([one.of, renderer, false]);
       const { light, dark: lighter } = PAGE.outcomes[part.outcome];
       this.themed.push(() => renderer.glyph.setv({ line_color: dark() ? lighter : light }));
-    }
+    });
   }
 
   theme() {
@@ -158,6 +212,8 @@ class Panel {
     }
     this.stale = false;
     this.updating = true;
+    if (this.old) for (const take of this.fresh) take();
+    this.old = false;
     for (const [of, renderer, band] of this.parts) {
       const visible = !seen.hidden.has(of) && (!band || seen.bands);
       if (renderer.visible != visible) renderer.visible = visible;
@@ -239,6 +295,7 @@ class Panel {
   }
 
   _point(event) {
+    if (!this.view) return;
     const { left, width } = this.view.frame.bbox;
     const share = (event.clientX - this.plot.getBoundingClientRect().left - left) / width;
     if (share < 0 || share > 1) return hideTip();

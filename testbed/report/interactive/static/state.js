@@ -1,9 +1,13 @@
 // What is seen of the page, in one place: the stretch of time, the cursor, who is hidden. Whoever shows it listens.
 
-const letters = atob(PAGE.numbers);
-const bytes = new Uint8Array(letters.length);
-for (let k = 0; k < bytes.length; k++) bytes[k] = letters.charCodeAt(k);
-const NUMBERS = new Float32Array(bytes.buffer);
+let NUMBERS;
+function read(base64) {
+  const letters = atob(base64);
+  const bytes = new Uint8Array(letters.length);
+  for (let k = 0; k < bytes.length; k++) bytes[k] = letters.charCodeAt(k);
+  NUMBERS = new Float32Array(bytes.buffer);
+}
+read(PAGE.numbers);
 const numbers = ([start, count]) => NUMBERS.subarray(start, start + count);
 
 const seen = {
@@ -14,11 +18,11 @@ const seen = {
   bands: true,
   pans: false, // what dragging does: move, or zoom
 };
-const SHORTEST = Math.min(1, (PAGE.end - PAGE.start) / 4); // stretch of time [s]
+const shortest = () => Math.min(1, (PAGE.end - PAGE.start) / 4); // stretch of time [s]
 const FAR = 16; // times: who is off by so much more than the best is cut off, and named
 const NEAREST = 30; // pixels from a track that the cursor follows
 
-const listeners = { stretch: [], cursor: [], shown: [], theme: [] };
+const listeners = { stretch: [], cursor: [], shown: [], theme: [], grown: [] };
 const listen = (topic, does) => listeners[topic].push(does);
 const due = new Set();
 function tell(topic) {
@@ -37,7 +41,7 @@ function setCursor(t) {
 
 function setStretch(start, end) {
   const whole = PAGE.end - PAGE.start;
-  const width = Math.min(Math.max(end - start, SHORTEST), whole);
+  const width = Math.min(Math.max(end - start, shortest()), whole);
   const middle = (start + end) / 2;
   const from = Math.min(Math.max(middle - width / 2, PAGE.start), PAGE.end - width);
   if (Math.abs(from - seen.start) < 1e-9 * whole && Math.abs(from + width - seen.end) < 1e-9 * whole) return;
