@@ -1,4 +1,4 @@
-"""What receivers and the wind say against a federation whose filters refuse every fix."""
+"""What is said against filters that are too sure: by receivers and the wind, and by reports of another wind."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 from nav.aids import GnssAid
 from nav.aids.gnss import has_velocity
-from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Verdict
+from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Verdict, whiten
 from nav.error_model import MOTION, POS, VEL
 from nav.local_filter import LocalFilter
-from nav.samples import Array, GnssSample, Outcome, Sample, UpdateReport
+from nav.samples import Array, GnssSample, Outcome, Sample, UpdateReport, WindSample
 from nav.state import State
 
 REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
@@ -73,3 +73,46 @@ class Doubts:
         if monitor.contradicted:
             self.off[POS : POS + 3], self.off[VEL : VEL + 3] = nu, sample.v_n - state.v_n
         return verdict is Verdict.RECOVER and odds >= SURE
+
+
+class WindDoubt:
+    """Reports of a wind that a filter without fixes refuses, since it is sure of another: a front may have passed.
+
+    One report may be wrong itself. Until there is another, the motion is in doubt (`off`): with the wind the velocity
+    is wrong by as much, and so is the position, by that times the time since the wind changed, which may have been at
+    any time since it was last known to be right. Two in a row that agree with each other, by chi-square of two up to
+    ``limit``, are believed.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._right = -math.inf  # when the wind was last known to be what the filter takes it for
+        self._refused: tuple[WindSample, Array, Array] | None = None  # the latest, its variance (2,), its innovation
+
+    def right(self, t: float, told: bool = False) -> None:
+        """The wind of ``t`` [s] is known, by a fix or, ``told``, by a report: one refused before is forgotten."""
+        if told or t > self._right:
+            self._right, self._refused = max(self._right, t), None
+
+    def lasting(self, t: float) -> float:
+        """For how long [s] the wind may have been another."""
+        return max(t - self._right, 0.0) if math.isfinite(self._right) else 0.0
+
+    def refused(self, sample: WindSample, nu: Array, R: Array) -> bool:
+        """Whether a refused report is to be believed, of innovation ``nu`` and variances ``R``, each (2,)."""
+        before, self._refused = self._refused, (sample, R, nu)
+        if before is None:
+            return False
+        off = sample.wind_n - before[0].wind_n
+        return bool(whiten(off, np.diag(R + before[1]))[1] <= self._limit)
+
+    def off(self, t: float) -> Array:
+        """By how much the motion (9,) is off at ``t`` [s] if the latest report is right, zeros where nothing says so.
+
+        The position by the root of its second moment over all times when the wind may have changed.
+        """
+        off = np.zeros(MOTION)
+        if self._refused is not None:
+            change = -self._refused[2]
+            off[VEL : VEL + 2], off[POS : POS + 2] = change, change * self.lasting(t) / math.sqrt(3.0)
+        return off

@@ -20,6 +20,7 @@ from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Verdict
+from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import NO_SENSOR, LocalFilter
 from nav.motion import TurnDetector
@@ -50,6 +51,7 @@ from nav.samples import (
     Sample,
     Status,
     UpdateReport,
+    WindSample,
 )
 from nav.smoother import Smoother
 from nav.state import State
@@ -129,6 +131,7 @@ class Ins:
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
         self._winds = self._filter.wind_memory()
+        self._wind_doubt = WindDoubt(self._gate.threshold(2))
         self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
@@ -225,8 +228,28 @@ class Ins:
         for part, _ in aid.parts:
             measurement = self._filter.measure(self._reference, state, aid, part, sample)
             if measurement is not None:
-                reports.append(self._filter.fuse(self._reference, state, sample, part, measurement))
+                report = self._filter.fuse(self._reference, state, sample, part, measurement)
+                if isinstance(sample, WindSample):
+                    report = self._hear_of_wind(state, sample, aid, measurement.R, report)
+                reports.append(report)
         return reports
+
+    def _hear_of_wind(self, state: State, sample: WindSample, aid: Aid, R: Array, report: UpdateReport) -> UpdateReport:
+        """What becomes of a wind report, given what its gate made of it: see `WindDoubt`."""
+        self._wind_doubt.right(self._monitor.last_fused)
+        if report.outcome is not Outcome.OUTSIDE_GATE:
+            if report.weight > 0:
+                self._wind_doubt.right(sample.t - sample.age, told=True)
+            return report
+        aided = sample.t - self._monitor.last_fused <= RECENT_S
+        if aided or not self._wind_doubt.refused(sample, report.innovation, R):
+            return report
+        self._filter.reopen_wind(state, report.innovation, self._wind_doubt.lasting(sample.t))
+        self._wind_doubt.right(sample.t, told=True)
+        again = self._filter.measure(self._reference, state, aid, report.aid, sample)
+        assert again is not None  # as there was one
+        report = self._filter.fuse(self._reference, state, sample, report.aid, again)
+        return replace(report, reason="outside the gate, but as the report before: the wind was opened again")
 
     def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
         """The estimates at ``times`` [s], ascending, by all samples used so far; of those since the alignment.
@@ -331,7 +354,8 @@ class Ins:
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
-        return self._described(state, t, status, self._doubt)
+        self._wind_doubt.right(self._monitor.last_fused)
+        return self._described(state, t, status, self._doubt + self._wind_doubt.off(t))
 
     def _described(self, state: State, t: float, status: Status, doubt: Array) -> Estimate:
         """The estimate of a settled state, with a ``doubt`` (9,) of its motion."""

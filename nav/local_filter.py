@@ -17,7 +17,7 @@ from nav._jit import njit
 from nav.aids.airspeed import AirspeedAid, Silence
 from nav.aids.base import FUSED, OUTSIDE, Aid, Measurement, OperatingPoint, Ruling, aid_blocks, report_on
 from nav.detection import ChiSquareGate, Mask, WindMemory
-from nav.error_model import MOTION, VEL, ErrorModel, ImuModel, sensor_errors
+from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
@@ -117,6 +117,20 @@ class LocalFilter:
                 forget(state.P[self.row], where.start, self.model.sigma[where] ** 2)
         if "gust" in self.model.slices:
             state.x[self.row, self.model.slices["gust"]] = 0.0
+
+    def reopen_wind(self, state: State, change: Array, lasting_s: float) -> None:
+        """Let the wind have changed by ``change`` (2,) [m/s], at any time in the last ``lasting_s`` [s].
+
+        The velocity through the air is as well known as before: that over ground went along with the wind, and took the
+        position along since then.
+        """
+        P, wind = state.P[self.row], self.model.slices["wind"].start
+        for axis in range(2):
+            along = np.zeros(len(P))
+            along[wind + axis] = along[VEL + axis] = change[axis]
+            along[POS + axis] = 0.5 * lasting_s * change[axis]
+            P += np.outer(along, along)
+            P[POS + axis, POS + axis] += (lasting_s * change[axis]) ** 2 / 12.0
 
     def _noise(self, sensor: str, part: str) -> SageHusa | None:
         """What learns the variances of one part of a sensor's samples."""
