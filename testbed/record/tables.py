@@ -46,7 +46,7 @@ class Column:
     @property
     def row_bytes(self) -> int:
         """Size of one row."""
-        return self.dtype.itemsize * int(np.prod(self.shape, dtype=int))
+        return self.dtype.itemsize * math.prod(self.shape)
 
 
 Block: TypeAlias = dict[str, Data]
