@@ -9,13 +9,12 @@ import numpy as np
 
 from nav.aids import GnssAid
 from nav.aids.gnss import has_velocity
-from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Verdict, whiten
+from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Refusals, Verdict, whiten
 from nav.error_model import MOTION, POS, VEL
 from nav.local_filter import LocalFilter
 from nav.samples import Array, GnssSample, Outcome, Sample, UpdateReport, WindSample
 from nav.state import State
 
-REFUSAL_GAP_S = 10.0  # without a refused position for longer, the refusals begin anew
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 
 
@@ -39,24 +38,16 @@ class Doubts:
         self._with_air = next((filter_ for filter_ in filters if filter_.wind_memory() is not None), filters[0])
         self._winds = self._with_air.wind_memory()
         self.off = np.zeros(MOTION)
-        self._patience_s = patience_s
-        self._refused_since = self._last_refused = -math.inf  # positions, without one fused in between
+        self._refusals = Refusals(patience_s)  # of positions
 
     def fused(self) -> None:
         """A position was fused, or the filters gave in."""
-        self._last_refused = -math.inf
+        self._refusals.taken()
 
     def overruled(self, state: State, sample: Sample, nu: Array, report: UpdateReport) -> bool:
         """Whether to believe a fix against the filters, given its innovation ``nu`` (3,) and what became of it."""
-        lasting = report.weight == 0 and self._refused(sample.t)
+        lasting = report.weight == 0 and self._refusals.too_long(sample.t)
         return self._witnessed(state, sample, nu, report.outcome) or lasting
-
-    def _refused(self, t: float) -> bool:
-        """Whether every position was refused for so long that the filters must be wrong, this one at ``t`` [s] too."""
-        if t - self._last_refused > REFUSAL_GAP_S:
-            self._refused_since = t
-        self._last_refused = t
-        return t - self._refused_since >= self._patience_s
 
     def _witnessed(self, state: State, sample: Sample, nu: Array, outcome: Outcome) -> bool:
         """Whether the wind speaks for a fix that was refused, and that those before it agree with."""

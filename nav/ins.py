@@ -19,7 +19,7 @@ from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState
-from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Verdict
+from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.local_filter import NO_SENSOR, LocalFilter
@@ -65,6 +65,8 @@ RULINGS = {
     Verdict.RECOVER: Ruling(Outcome.FUSED, "outside the gate, but consistent for long: covariance reset", weight=1.0),
 }
 
+REOPENED = "outside the gate for long: its bias is as good as unknown"
+
 
 @dataclass(frozen=True)
 class InsConfig:
@@ -87,7 +89,7 @@ class InsConfig:
     outage_s: float = 10.0  # this long without a fused position is an outage
     probation_s: float = PROBATION_S  # fixes must agree with each other for this long after it
     recovery_s: float = RECOVERY_S  # after an outage, fixes that agree for this long overrule the filter
-    patience_s: float = 30.0  # and this long when they left the gate without an outage
+    patience_s: float = 30.0  # and this long when they left the gate without an outage; so long is a bias held as well
 
     alignment_s: float = 2.0  # shortest time over which the initial attitude is found
 
@@ -130,6 +132,7 @@ class Ins:
         self._monitor = GnssMonitor(
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
+        self._refusals = {name: Refusals(config.patience_s) for name in self._filter.aids if self._bias_of(name)}
         self._winds = self._filter.wind_memory()
         self._wind_doubt = WindDoubt(self._gate.threshold(2))
         self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
@@ -231,6 +234,8 @@ class Ins:
                 report = self._filter.fuse(self._reference, state, sample, part, measurement)
                 if isinstance(sample, WindSample):
                     report = self._hear_of_wind(state, sample, aid, measurement.R, report)
+                else:
+                    report = self._unless_lasting(state, sample, aid, report)
                 reports.append(report)
         return reports
 
@@ -241,8 +246,7 @@ class Ins:
             if report.weight > 0:
                 self._wind_doubt.right(sample.t - sample.age, told=True)
             return report
-        aided = sample.t - self._monitor.last_fused <= RECENT_S
-        if aided or not self._wind_doubt.refused(sample, report.innovation, R):
+        if self._aided(sample.t) or not self._wind_doubt.refused(sample, report.innovation, R):
             return report
         self._filter.reopen_wind(state, report.innovation, self._wind_doubt.lasting(sample.t))
         self._wind_doubt.right(sample.t, told=True)
@@ -250,6 +254,36 @@ class Ins:
         assert again is not None  # as there was one
         report = self._filter.fuse(self._reference, state, sample, report.aid, again)
         return replace(report, reason="outside the gate, but as the report before: the wind was opened again")
+
+    def _unless_lasting(self, state: State, sample: Sample, aid: Aid, report: UpdateReport) -> UpdateReport:
+        """The ``report`` on a part of a sample, or that of its fusion with the aid's bias open again.
+
+        That is one that was refused for ``patience_s`` while GNSS was not. What is refused by a filter that has nothing
+        else to go by stays so: its own sigma grows until it gives in.
+        """
+        refusals = self._refusals.get(sample.sensor)
+        if refusals is None or report.outcome is not Outcome.OUTSIDE_GATE:
+            if refusals is not None and report.weight:
+                refusals.taken()
+            return report
+        if not (refusals.too_long(sample.t) and self._aided(sample.t)):
+            return report
+        refusals.taken()
+        bias = self._bias_of(sample.sensor)
+        assert bias is not None
+        off = report.innovation**2 + np.diag(report.S)
+        forget(state.P[0], bias.start, np.maximum(self.model.sigma[bias] ** 2, off))
+        wide = self._filter.measure(self._reference, state, aid, report.aid, sample)
+        assert wide is not None
+        return replace(self._filter.fuse(self._reference, state, sample, report.aid, wide), reason=REOPENED)
+
+    def _bias_of(self, sensor: str) -> slice | None:
+        """Where the bias of a sensor lies, in the units and axes that it measures in; None where it is no state."""
+        return self.model.slices.get(f"{sensor}_bias")
+
+    def _aided(self, t: float) -> bool:
+        """Whether a position was fused of late."""
+        return self._gnss is not None and t - self._monitor.last_fused <= RECENT_S
 
     def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
         """The estimates at ``times`` [s], ascending, by all samples used so far; of those since the alignment.
@@ -347,8 +381,7 @@ class Ins:
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        aided = self._gnss is not None and t - self._monitor.last_fused <= RECENT_S
-        status = Status.ALIGNING if state is None else FUSED if aided else UNAIDED
+        status = Status.ALIGNING if state is None else FUSED if self._aided(t) else UNAIDED
         if t - last_bad <= BAD_SAMPLE_S:
             status |= Status.BAD_SAMPLE
         if state is None:

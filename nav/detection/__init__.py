@@ -9,7 +9,8 @@ Which one: `ChiSquare` sees a fault in one sample or not at all; `Eraim` is the 
 (`nav.detection.snapshot`); `Sprt` gathers evidence over samples, as Zhou et al. 2025 do (`nav.detection.sequential`,
 with what it remembers in `nav.detection.means`); `Glr` finds slow faults sooner and knows best when they end
 (`nav.detection.glr`). Both take innovations for white; `LongRunVariance` says how far that is true
-(`nav.detection.colour`). `GnssMonitor` decides on the fixes of a receiver (`nav.detection.gnss`).
+(`nav.detection.colour`). `GnssMonitor` decides on the fixes of a receiver (`nav.detection.gnss`), `Refusals` when
+anything has been refused for too long (`nav.detection.refusals`).
 
 Sources: Zhou et al. 2025 (SINS/GNSS/odometer, completely reset SPRT; "Eq" in this package), Cui et al. 2022 (ERAIM),
 Siegmund, Sequential Analysis (1985). Evidence is a logarithm of a likelihood ratio [nats].
@@ -20,6 +21,7 @@ from nav.detection.colour import LongRunVariance
 from nav.detection.glr import Glr, glr_false_alarm, glr_threshold
 from nav.detection.gnss import PROBATION_S, RECOVERY_S, GnssMonitor, Verdict
 from nav.detection.means import Mean, RunningMean, WindowMean, exponential, plain
+from nav.detection.refusals import Refusals
 from nav.detection.sequential import Evidence, Quadratic, Recursive, Reset, SampleTest, Sprt
 from nav.detection.snapshot import ChiSquare, ChiSquareGate, Eraim, Never, w_tests
 from nav.detection.witness import SURE, WindMemory
@@ -43,6 +45,7 @@ __all__ = [
     "Never",
     "Quadratic",
     "Recursive",
+    "Refusals",
     "Reset",
     "RunningMean",
     "SampleTest",
