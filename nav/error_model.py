@@ -78,13 +78,21 @@ PAPERS: Mapping[str, StateList] = {
 
 
 class Drive(IntEnum):
-    """How a block enters the motion: added to a rate or force, or scaling it; NONE for the errors of aids."""
+    """How a block enters the motion: added to a rate or force, scaling it, or crossing over from other axes (`CROSS`);
+    NONE for the errors of aids.
+    """
 
     NONE = -1
     GYRO = 0
     ACCEL = 1
     GYRO_SCALE = 2
     ACCEL_SCALE = 3
+    GYRO_CROSS = 4
+    ACCEL_CROSS = 5
+
+
+# What the axis of the first index feels of the second, in the order of the states of a cross block.
+CROSS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +125,8 @@ class ImuModel:
     """What the filter is told of the inertial sensors, each axis alike.
 
     A bias is a turn-on value that walks, plus, when its sigma is not zero, an in-run part that is first-order Markov.
-    Scale factor errors are states when their sigma is not zero.
+    Scale factor errors are states when their sigma is not zero, and so is what an axis feels of the others, as triads
+    do that are turned and not square (`CROSS`).
 
     Errors that come with motion and have no state are white noise beside that of rest: ``gyro_motion`` and
     ``accel_motion`` are the shares of the rate, and of the specific force less gravity, that go wrong over each
@@ -137,6 +146,8 @@ class ImuModel:
     accel_drift_correlation_s: float = 300.0
     gyro_scale_sigma: float = 0.0  # scale factor error [1]
     accel_scale_sigma: float = 0.0
+    gyro_cross_sigma: tuple[float, ...] = ()  # six, or none [rad]
+    accel_cross_sigma: tuple[float, ...] = ()
     gyro_motion: float = 0.0  # [1]
     accel_motion: float = 0.0  # [1]
     vibration: float = 0.0  # [1]
@@ -167,6 +178,10 @@ class ImuModel:
             blocks.append(Block("gyro_scale", 3, self.gyro_scale_sigma, drive=Drive.GYRO_SCALE))
         if self.accel_scale_sigma > 0:
             blocks.append(Block("accel_scale", 3, self.accel_scale_sigma, drive=Drive.ACCEL_SCALE))
+        if any(self.gyro_cross_sigma):
+            blocks.append(Block("gyro_cross", len(CROSS), self.gyro_cross_sigma, drive=Drive.GYRO_CROSS))
+        if any(self.accel_cross_sigma):
+            blocks.append(Block("accel_cross", len(CROSS), self.accel_cross_sigma, drive=Drive.ACCEL_CROSS))
         return blocks
 
 
@@ -218,14 +233,31 @@ class ErrorModel:
 
 @njit
 def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
-    """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values."""
+    """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values.
+
+    What crosses over from other axes is no error of one axis: `uncross` takes it off.
+    """
     for kind in range(len(errors)):
         for axis in range(3):
             errors[kind, axis] = 0.0
     for block in range(len(driven)):
         kind, start = driven[block, 0], driven[block, 1]
-        for axis in range(3):
-            errors[kind, axis] += x[start + axis]
+        if kind < len(errors):
+            for axis in range(3):
+                errors[kind, axis] += x[start + axis]
+
+
+@inlined
+def uncross(angle: Array, push: Array, imu: Array, driven: Indices) -> None:
+    """Take off increments, in place, what crosses over from other axes by the estimates ``imu``, to first order."""
+    for block in range(len(driven)):
+        kind, start = driven[block, 0], driven[block, 1]
+        if kind == Drive.GYRO_CROSS or kind == Drive.ACCEL_CROSS:
+            of = angle if kind == Drive.GYRO_CROSS else push
+            x, y, z = of[0], of[1], of[2]
+            of[0] -= imu[start] * y + imu[start + 1] * z
+            of[1] -= imu[start + 2] * x + imu[start + 3] * z
+            of[2] -= imu[start + 4] * x + imu[start + 5] * y
 
 
 @inlined
@@ -300,11 +332,14 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
 
     for block in range(len(driven)):
         kind, start = driven[block, 0], driven[block, 1]
-        row, sign = (PHI, 1.0) if kind == Drive.GYRO or kind == Drive.GYRO_SCALE else (VEL, -1.0)
-        term = max(0, kind - 1)  # plain biases share the integral of C_nb
-        for i in range(3):
-            for j in range(3):
-                FT[row + i, start + j] = sign * sums[term, i, j]
+        if kind == Drive.GYRO_CROSS or kind == Drive.ACCEL_CROSS:
+            _cross(FT, start, kind == Drive.GYRO_CROSS, sums, T)
+        else:
+            row, sign = (PHI, 1.0) if kind == Drive.GYRO or kind == Drive.GYRO_SCALE else (VEL, -1.0)
+            term = max(0, kind - 1)  # plain biases share the integral of C_nb
+            for i in range(3):
+                for j in range(3):
+                    FT[row + i, start + j] = sign * sums[term, i, j]
 
     for i in range(MOTION):
         for j in range(mixing):
@@ -315,6 +350,20 @@ def transition(Phi: Array, FT: Array, driven: Indices, v_n: Array, lat: float, h
             if half != 0.0:
                 for j in range(mixing):
                     Phi[i, j] += half * FT[k, j]
+
+
+@inlined
+def _cross(FT: Array, start: int, gyro: bool, sums: Array, T: float) -> None:
+    """Fill the columns of a cross block (`CROSS`): the mean axis of the one, times what the other felt over ``T``."""
+    row, term, sign = (PHI, 1, 1.0) if gyro else (VEL, 2, -1.0)
+    for c in range(6):
+        one = c // 2
+        other = (c % 2) if (c % 2) < one else (c % 2) + 1
+        felt = 0.0
+        for k in range(3):
+            felt += sums[0, k, other] * sums[term, k, other]
+        for i in range(3):
+            FT[row + i, start + c] = sign * sums[0, i, one] * felt / (T * T)
 
 
 @inlined

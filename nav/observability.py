@@ -134,7 +134,7 @@ def continuous(model: ErrorModel, q_nb: Array, v_n: Array, lla: Array, f_b: Arra
 def state_names(model: ErrorModel) -> list[str]:
     """One name for each state: block and axis."""
     axes = {name: ("north", "east", "down") for name in ("phi", "dv", "dp")}
-    axes |= {block.name: ("x", "y", "z") for block in model.blocks if block.drive is not Drive.NONE}
+    axes |= {block.name: ("x", "y", "z") for block in model.blocks if block.drive is not Drive.NONE and block.size == 3}
     numbers = tuple(str(k + 1) for k in range(max(block.size for block in model.blocks)))
     return [
         block.name if block.size == 1 else f"{block.name} {axes.get(block.name, numbers)[k]}"

@@ -12,7 +12,7 @@ import numpy as np
 from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, radii, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition
+from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition, uncross
 from nav.kalman import predict, update
 from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array
@@ -286,6 +286,7 @@ def propagate(
             for i in range(3):
                 angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
                 push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
+            uncross(angle, push, imu, driven)
             for i in range(4):
                 before[i] = q_nb[i]
             step(q_nb, v_n, lla, angle, push, T)

@@ -25,7 +25,7 @@ from nav.aids import (
 from nav.aids.magnetometer import FIELD_SIZE
 from nav.aids.terrain import Search
 from nav.earth import STANDARD_GRAVITY
-from nav.error_model import ImuModel
+from nav.error_model import CROSS, ImuModel
 from nav.point_mass import PointMass
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
@@ -64,11 +64,19 @@ def imu_model(
 
     With ``states`` "biases" scale factors do so too, and in-run instability (Gauss-Markov, sigma and tau) becomes a
     random walk of the same driving noise, q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two
-    cannot be told apart. With "full" both are states of their own (Cui et al. 2022, Eq 36).
+    cannot be told apart. With "full" both are states of their own (Cui et al. 2022, Eq 36), and with "matrix"
+    misalignment, a small turn of the triad, and axes y and z that lean, too: biases no longer walk for them, but begin
+    as unknown, as before something moves nobody can tell one from the other.
     """
-    full = states == "full"
+    full, matrix = states != "biases", states == "matrix"
     beside = replace(errors, gyro_in_run=0.0, accel_in_run=0.0, gyro_scale=0.0, accel_scale=0.0) if full else errors
+    if matrix:
+        square = dict.fromkeys(
+            ("gyro_misalignment", "gyro_nonorthogonality", "accel_misalignment", "accel_nonorthogonality"), 0.0
+        )
+        beside = replace(beside, **square)
     level = math.hypot(beside.accel_misalignment, beside.accel_nonorthogonality, beside.accel_scale)
+    at_first = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, beside.accel_scale)
     turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
     pull = beside.gyro_g_sensitivity * STANDARD_GRAVITY
     changes = math.sqrt(1 / MANOEUVRE_S)
@@ -81,7 +89,7 @@ def imu_model(
             beside.gyro_turn_on, beside.gyro_in_run, beside.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
         ),
         accel_bias_sigma=math.hypot(
-            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
+            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, at_first * STANDARD_GRAVITY
         ),
         gyro_bias_walk=math.hypot(
             beside.gyro_random_walk,
@@ -100,10 +108,17 @@ def imu_model(
         accel_drift_correlation_s=errors.accel_in_run_tau,
         gyro_scale_sigma=errors.gyro_scale if full else 0.0,
         accel_scale_sigma=errors.accel_scale if full else 0.0,
+        gyro_cross_sigma=_cross(errors.gyro_misalignment, errors.gyro_nonorthogonality) if matrix else (),
+        accel_cross_sigma=_cross(errors.accel_misalignment, errors.accel_nonorthogonality) if matrix else (),
         gyro_motion=errors.gyro_motion,
         accel_motion=errors.accel_motion,
         vibration=errors.vibration_share,
     )
+
+
+def _cross(misalignment: float, nonorthogonality: float) -> tuple[float, ...]:
+    """1-sigma of what an axis feels of the others (`nav.error_model.CROSS`): y and z lean, and all are turned."""
+    return tuple(math.hypot(misalignment, nonorthogonality if of < axis else 0.0) for axis, of in CROSS)
 
 
 def _drive(sigma: float, tau: float) -> float:

@@ -258,7 +258,7 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
         patience=Patience(section.isolate_after, section.isolate_s, section.readmit_after),
         recall_s=section.recall_s,
         cross_check=section.cross_check,
-        mounting_sigma=errors.accel_misalignment,
+        mounting_sigma=0.0 if section.states == "matrix" else errors.accel_misalignment,
         alignment_aids=tuple(aids.values()),
     )
 

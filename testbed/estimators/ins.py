@@ -130,7 +130,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
             imu_model(errors, rig.turn_rate(section.turn_degps), section.states, rig.usual),
             tuple(aids),
             tuple(idle),
-            mounting_sigma=errors.accel_misalignment,
+            mounting_sigma=0.0 if section.states == "matrix" else errors.accel_misalignment,
             scaling=scaling(section.engine),
             smooth=section.smooth,
             false_rejection=section.false_rejection,

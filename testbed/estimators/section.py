@@ -19,9 +19,13 @@ SEVERAL = frozenset({"body_velocity", "star_tracker", "position_fix", "rangefind
 ONE_EACH = frozenset({"gnss", "barometer", "magnetometer", "airspeed"})
 
 Engine: TypeAlias = Annotated[Literal["linear", "unscented"], Field(description="derivatives or sigma points")]
-ImuStates: TypeAlias = Literal["biases", "full"]
+ImuStates: TypeAlias = Literal["biases", "full", "matrix"]
 States: TypeAlias = Annotated[
-    ImuStates, Field(description="full: in-run instability and scale factors of the IMU too, as states")
+    ImuStates,
+    Field(
+        description="full: in-run instability and scale factors of the IMU too, as states; matrix: and what its axes"
+        " feel of each other, misaligned and not square"
+    ),
 ]
 TurnRate: TypeAlias = Annotated[
     float | None,

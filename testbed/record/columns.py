@@ -15,6 +15,7 @@ AXES: dict[str, tuple[str, ...]] = {
     "ned": ("north", "east", "down"),
     "body": ("forward", "right", "down"),
     "north_east": ("north", "east"),
+    "cross": ("xy", "xz", "yx", "yz", "zx", "zy"),
     "fix_part": ("position", "velocity"),
     "body_xy": ("x", "y"),
     "quaternion": ("w", "x", "y", "z"),
@@ -150,6 +151,8 @@ EXTRA = {
     "accel_drift": Variable("m/s^2", "estimated correlated part of the accelerometer bias", ("body",)),
     "gyro_scale": Variable("1", "estimated gyro scale factor error", ("body",)),
     "accel_scale": Variable("1", "estimated accelerometer scale factor error", ("body",)),
+    "gyro_cross": Variable("1", "estimated share that a gyro feels of the rates about other axes", ("cross",)),
+    "accel_cross": Variable("1", "estimated share that an accelerometer feels of other axes", ("cross",)),
     "gnss_position_error": Variable("m", "estimated correlated error of GNSS position", ("ned",)),
     "gnss_velocity_error": Variable("m/s", "estimated correlated error of GNSS velocity", ("ned",)),
     "gnss_latency": Variable(

@@ -75,6 +75,23 @@ def test_drift_and_scale_factors_are_states_when_asked_for() -> None:
         assert after > 0
 
 
+def test_misalignment_is_a_state_when_asked_for() -> None:
+    """A turn of the triad for every pair, beside it y and z that lean; no walk of a bias stands in for them."""
+    scenario = Scenario.load("loiter_gnss_outage", ['estimator.ins.states="matrix"'])
+    imu = scenario.sensors["imu"]
+    assert isinstance(imu, ImuConfig)
+    e, found = imu.errors(), told(scenario)
+    full = told(Scenario.load("loiter_gnss_outage", ['estimator.ins.states="full"'])).config.imu
+    both = math.hypot(e.gyro_misalignment, e.gyro_nonorthogonality)
+    turned = e.gyro_misalignment
+    assert found.config.imu.gyro_cross_sigma == pytest.approx((turned, turned, both, turned, both, both))
+    assert full.gyro_cross_sigma == ()
+    assert found.config.imu.gyro_bias_walk < full.gyro_bias_walk
+    assert found.config.imu.accel_bias_sigma == full.accel_bias_sigma
+    assert found.config.mounting_sigma == 0.0
+    assert {"gyro_cross", "accel_cross"} <= found.model.slices.keys()
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize("engine", ["linear", pytest.param("unscented", marks=pytest.mark.slow)])
 def test_scale_factors_are_found_in_flight(engine: str) -> None:

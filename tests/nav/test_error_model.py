@@ -1,11 +1,13 @@
 """Every block of the error model against differences of the non-linear strapdown, and its noise against fine steps."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from nav import error_model
 from nav.earth import position_difference_n, radii
-from nav.error_model import MOTION, PHI, POS, VEL, Block, Drive, ErrorModel, ImuModel, markov
+from nav.error_model import CROSS, MOTION, PHI, POS, VEL, Block, Drive, ErrorModel, ImuModel, markov
 from nav.kalman import predict
 from nav.rotation import dcm_from_quat, quat_from_euler, quat_from_rotvec, quat_multiply, rotvec_from_quat
 from nav.strapdown import step
@@ -14,6 +16,7 @@ FULL = ImuModel(1e-4, 1e-3, 1e-4, 0.05, 1e-6, 1e-5, 1e-5, 1e-3, 300.0, 300.0, 1e
 DT = 0.005
 STEP = {"phi": 1e-4, "dv": 1.0, "dp": 1000.0, "gyro_bias": 1e-3, "accel_bias": 0.1, "gyro_drift": 1e-3,
         "accel_drift": 0.1, "gyro_scale": 1e-2, "accel_scale": 1e-2}  # fmt: skip
+NO_CROSS = np.zeros((2, 3, 3))
 # What the differences cannot resolve, in rows phi, dv, dp and columns phi, dv, dp and later
 FLOOR = np.array([[1e-9, 1e-14, 1e-16], [1e-7, 1e-12, 1e-14], [1e-9, 1e-11, 1e-12]])
 
@@ -23,8 +26,11 @@ def nominal(lat_deg):
     return q, np.array([22.0, -17.0, 3.0]), np.array([np.radians(lat_deg), 0.2, 900.0])
 
 
-def propagate(state, errors, samples, sums=None):
-    """Strapdown through `samples` with `errors` (4, 3) taken out; optionally the integrals that `transition` needs."""
+def propagate(state, errors, samples, sums=None, cross=NO_CROSS):
+    """Strapdown through `samples` with `errors` (4, 3) and what axes feel of each other, `cross`, taken out.
+
+    Optionally `sums`, the integrals that `transition` needs.
+    """
     q, v, lla = (part.copy() for part in state)
     for k in range(samples):
         s = k * DT
@@ -32,6 +38,7 @@ def propagate(state, errors, samples, sums=None):
         force = np.array([1.0 + np.sin(2 * s), -0.5, -9.9 + s])
         angle = (omega - errors[0]) * DT / (1 + errors[2])
         push = (force - errors[1]) * DT / (1 + errors[3])
+        angle, push = angle - cross[0] @ angle, push - cross[1] @ push
         before = dcm_from_quat(q)
         step(q, v, lla, angle, push, DT)
         if sums is not None:
@@ -98,6 +105,24 @@ def test_transition_is_the_derivative_of_the_strapdown(lat_deg):
             if row == VEL + 2 and block.name == "dp":
                 tolerance += samples * DT * 9.8 * 0.0053 / 6.37e6
             np.testing.assert_allclose(a, b, atol=tolerance, rtol=0, err_msg=f"row {row}, {block.name}")
+
+
+def test_what_axes_feel_of_each_other_drives_the_motion_as_differences_say():
+    model = ErrorModel(dataclasses.replace(FULL, gyro_cross_sigma=(1e-3,) * 6, accel_cross_sigma=(2e-3,) * 6))
+    samples, state, sums, step_ = 10, nominal(48.0), np.zeros((3, 3, 3)), 1e-2
+    end = propagate(state, np.zeros((4, 3)), samples, sums)
+    Phi, FT = np.zeros((MOTION, model.mixing)), np.zeros((MOTION, model.mixing))
+    error_model.transition(Phi, FT, model.driven, end[1], end[2][0], end[2][2], sums, samples * DT)
+    for name, sensor, rows in (("gyro_cross", 0, slice(PHI, PHI + 3)), ("accel_cross", 1, slice(VEL, VEL + 3))):
+        for c, place in enumerate(CROSS):
+            results = []
+            for sign in (1, -1):
+                cross = np.zeros((2, 3, 3))
+                cross[sensor][place] = sign * step_
+                results.append(motion_error(propagate(state, np.zeros((4, 3)), samples, cross=cross), end))
+            expected = (results[0] - results[1])[rows] / (2 * step_)
+            found = Phi[rows, model.start(name) + c]
+            np.testing.assert_allclose(found, expected, atol=0.03 * np.abs(expected).max(), err_msg=f"{name} {place}")
 
 
 def test_markov_variance_is_stationary_and_its_estimate_decays():
