@@ -10,7 +10,7 @@ import typer
 from testbed import interrupts
 from testbed.commands.shared import EXIT_FAILED, RUNS, console, output_folder, remark
 from testbed.errors import UserError, printable
-from testbed.results import held, require_own
+from testbed.results import REPORT, held, require_own
 
 Estimators = Annotated[
     list[str] | None,
@@ -56,7 +56,7 @@ def denied(
     folder = out or RUNS / ("denied_quick" if quick else "denied")
     number = benchmark.RECORDED_DRAW if draw is None else draw
     plan = benchmark.Plan(table, entered, folder, number, draws or table.draws)
-    require_own(folder, [report.SUMMARY, report.DRAWS])
+    require_own(folder, [report.SUMMARY, report.DRAWS, REPORT])
     with (
         output_folder(folder),
         held(folder),
@@ -68,7 +68,7 @@ def denied(
         cells = report.save(result, claims)
     for shown in report.tables(result, cells, claims):
         console().print(shown)
-    print(printable(f"{folder / report.SUMMARY}, {report.DRAWS} and figures beside it"))
+    print(printable(f"{folder / report.SUMMARY}, {report.DRAWS}, {REPORT} and figures beside it"))
     if save:
         print(printable(str(saved.save(result, cells, claims))))
     for (lane, why), count in benchmark.ended(result).items():

@@ -24,7 +24,8 @@ import numpy as np
 
 from nav.samples import Array
 from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
-from testbed.report.page import Shown, png, render
+from testbed.report.campaign_page import contents
+from testbed.report.page import Shown, png, render, script_of
 from testbed.results import REPORT, write_result
 from testbed.score.accuracy import AXES
 from testbed.score.claims import student
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from testbed.many.campaign import CampaignResult, Combination, Outcome
 
+INTERACTIVE = ("errors", "nees")  # figures that the page has as plots to look around in
 TABLE, SUMMARY = "campaign.csv", "campaign.json"
 
 # The main metrics and how tables call them. All are errors: the worst is the largest, but for `BEST_LARGE`.
@@ -250,18 +252,22 @@ def save(result: CampaignResult) -> None:
     for name, (caption, figure) in figures(result).items():
         picture = png(figure)
         write_result(result.path / f"{name}.png", picture)
-        shown.append(Shown("Figures", caption, picture))
-    if shown:
+        if name not in INTERACTIVE:
+            shown.append(Shown("Largest errors", caption, picture))
+    if result.outcomes:
         write_result(result.path / REPORT, _page(result, shown).encode())
 
 
 def _page(result: CampaignResult, shown: Sequence[Shown]) -> str:
     """One page with tables and figures, which needs nothing else."""
     of_runs = len(result.outcomes) + len(result.failures)
+    interactive = contents(result)
     return render(
         "campaign.html",
         title=f"{result.combinations[0].scenario.title}: a campaign of {of_runs} runs",
         figures=shown,
+        contents=interactive,
+        script=script_of(interactive),
         tables=[(table.title, table.rows) for table in texts(result)],
         failures=[
             (f"{result.combinations[failure.combination]} seed {failure.seed}".strip(), failure.message)

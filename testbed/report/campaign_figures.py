@@ -49,9 +49,9 @@ def figures(result: CampaignResult) -> dict[str, Drawn]:
     """The campaign's figures by file name: error envelopes, NEES, one distribution per varied key."""
     if not result.outcomes:
         return {}
-    groups = list(_groups(result))
+    groups = list(groups_of(result))
     runs = max(len(group.outcomes) for group in groups)
-    shades = " Grey: no GNSS fix. Yellow: a fault of a sensor." if _outages(result) or _faults(result) else ""
+    shades = " Grey: no GNSS fix. Yellow: a fault of a sensor." if outages_of(result) or faults_of(result) else ""
     of_error = (
         "Full line: median; band: 5th to 95th percentile; dashed: 1 sigma as claimed, median."
         if len(groups) <= MOST_COLUMNS
@@ -92,24 +92,24 @@ def nees_bounds(runs: npt.ArrayLike) -> Array:
 
 def nees_mean(outcomes: Sequence[Outcome], estimator: str) -> tuple[Array, npt.NDArray[np.int64]]:
     """NEES per degree of freedom over time, mean over the runs that have one, and how many these are."""
-    nees = _stack(outcomes, f"{estimator}.nees")
+    nees = stacked(outcomes, f"{estimator}.nees")
     runs = np.isfinite(nees).sum(axis=0)
     return np.where(runs > 0, np.nansum(nees, axis=0) / np.maximum(runs, 1), np.nan), runs
 
 
-def _stack(outcomes: Sequence[Outcome], name: str) -> Array:
+def stacked(outcomes: Sequence[Outcome], name: str) -> Array:
     """One row per run, NaN after its end: a motion that ends by itself ends sooner in some gusts than in others."""
     rows = [outcome.history[name] for outcome in outcomes]
     longest = max(map(len, rows))
     return np.array([np.pad(row, (0, longest - len(row)), constant_values=np.nan) for row in rows])
 
 
-def _longest(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
+def longest_of(outcomes: Sequence[Outcome]) -> Mapping[str, Array]:
     """History of the run that lasted longest; all have the same times as far as they go."""
     return max((outcome.history for outcome in outcomes), key=lambda history: len(history["time"]))
 
 
-def _groups(result: CampaignResult) -> Iterator[Group]:
+def groups_of(result: CampaignResult) -> Iterator[Group]:
     """Every combination that has any outcomes."""
     import matplotlib
 
@@ -120,9 +120,9 @@ def _groups(result: CampaignResult) -> Iterator[Group]:
             yield Group(str(combination), scale(0.9 * i / max(len(result.combinations) - 1, 1)), own)
 
 
-def _outages(result: CampaignResult) -> list[tuple[float, float]]:
+def outages_of(result: CampaignResult) -> list[tuple[float, float]]:
     """Windows without a fix, when they are the same in all runs."""
-    longest = _longest(result.outcomes)
+    longest = longest_of(result.outcomes)
     time, outage = longest["time"], longest["outage"]
     if not all(np.array_equal(o.history["outage"], outage[: len(o.history["outage"])]) for o in result.outcomes):
         return []
@@ -131,7 +131,7 @@ def _outages(result: CampaignResult) -> list[tuple[float, float]]:
     return [(float(times[start]), float(times[end])) for start, end in edges.reshape(-1, 2)]
 
 
-def _faults(result: CampaignResult) -> list[tuple[float, float]]:
+def faults_of(result: CampaignResult) -> list[tuple[float, float]]:
     """Windows of faults, when they are the same in all combinations."""
     windows = [[fault.window for fault in combination.scenario.fault] for combination in result.combinations]
     return list(windows[0]) if all(own == windows[0] for own in windows) else []
@@ -151,8 +151,8 @@ def _panels(result: CampaignResult, columns: int = 1) -> Sheet:
 
 def _against_time(result: CampaignResult, drawn: Sheet, title: float) -> None:
     """Shade outages and faults, and explain everything in one legend."""
-    outages, faults = _outages(result), _faults(result)
-    end = float(_longest(result.outcomes)["time"][-1])
+    outages, faults = outages_of(result), faults_of(result)
+    end = float(longest_of(result.outcomes)["time"][-1])
     keys = style.keys_of(drawn.axes.flat)
     for ax in drawn.axes.flat:
         style.shade(ax, outages, style.SHADE, end)
@@ -185,16 +185,16 @@ def _errors(result: CampaignResult, groups: Sequence[Group]) -> Figure:
 
 def _envelope(ax: Axes, estimator: str, group: Group, colour: Any, apart: bool) -> None:
     """Errors of one estimator over the runs of one combination."""
-    error = _stack(group.outcomes, f"{estimator}.error")
+    error = stacked(group.outcomes, f"{estimator}.error")
     known = np.flatnonzero(np.isfinite(error).any(axis=0))
-    time, error = _longest(group.outcomes)["time"][known], error[:, known]
+    time, error = longest_of(group.outcomes)["time"][known], error[:, known]
     ax.set_yscale("log")
     if not len(known):
         return
     low, median, high = np.nanpercentile(error, (5, 50, 95), axis=0)
     ax.plot(time, median, color=colour, lw=1.4, label="median" if apart else group.label)
     if apart:
-        claimed = np.nanmedian(_stack(group.outcomes, f"{estimator}.sigma")[:, known], axis=0)
+        claimed = np.nanmedian(stacked(group.outcomes, f"{estimator}.sigma")[:, known], axis=0)
         ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0, label="5 – 95 %")
         ax.plot(time, claimed, color=style.GUIDE, lw=1.0, ls="--", label="claimed 1 sigma, median")
 
@@ -210,7 +210,7 @@ def _nees(result: CampaignResult, groups: Sequence[Group], runs: int) -> Figure:
             mean, _ = nees_mean(group.outcomes, estimator.name)
             colour = style.line_of(k)["color"] if len(groups) == 1 else group.colour
             told = {"color": colour, "label": group.label if len(groups) > 1 else None}
-            ax.plot(_longest(group.outcomes)["time"], mean, **told, **style.layer(rank, len(groups), 1.0))
+            ax.plot(longest_of(group.outcomes)["time"], mean, **told, **style.layer(rank, len(groups), 1.0))
         ax.set_ylabel(f"{'attitude' if estimator.attitude_only else 'position'} NEES / dof")
         style.logarithmic(ax, 0.1, 10.0)
     _against_time(result, drawn, 0.28)

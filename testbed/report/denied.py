@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nav.samples import Array
+from testbed.report import denied_page
 from testbed.report.denied_figure import figures
 from testbed.report.page import png
-from testbed.results import write_result
+from testbed.results import REPORT, write_result
 from testbed.score.claims import MEDIAN, NEARLY_ALL, RMS_OVER_BOUND, SHARE, Claim, Interval, Verdict
 
 if TYPE_CHECKING:
@@ -94,12 +95,18 @@ def _length(interval: Interval) -> Interval:
 
 
 def save(result: Result, claims: Mapping[str, Sequence[Claim]]) -> list[Cell]:
-    """Write `SUMMARY` (every cell and goal), `DRAWS` (a line for each draw of each cell) and figures; the cells."""
+    """Write `SUMMARY` (all cells and goals), `DRAWS` (a line a draw of each cell), figures and the page; the cells."""
     found, out = cells(result), result.plan.out
     write_result(out / SUMMARY, (json.dumps(_json(result, found, claims), indent=1) + "\n").encode())
     write_result(out / DRAWS, _csv(result).encode())
     for name, figure in figures(result).items():
         write_result(out / name, png(figure))
+    if result.outcomes:
+        goals = [GOAL_COLUMNS, *(row for row, _ in _goal_rows(claims))]
+        told = {"Goals: consumer IMU, walking wind": goals} if len(goals) > 1 else {}
+        for weather in result.plan.table.weathers:
+            told[_heading(result, weather)] = [COLUMNS, *_rows(result, found, weather.name)]
+        write_result(out / REPORT, denied_page.page(result, told).encode())
     return found
 
 

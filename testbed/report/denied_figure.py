@@ -41,7 +41,7 @@ def _figure(result: Result, estimator: str) -> Figure:
             ax = drawn.axes[row, column]
             ax.set_title(f"{aids.title}\n{weather.title}", loc="left", fontsize=8)
             for k, grade in enumerate(table.grades):
-                _curves(ax, own, (aids.name, grade.name, estimator), style.COLOURS[k])
+                _draw(ax, own, (aids.name, grade.name, estimator), style.COLOURS[k])
     for row in drawn.axes:
         row[0].set_ylabel("horizontal error [m]")
         limits = np.array([ax.dataLim.intervaly for ax in row])
@@ -69,17 +69,19 @@ def _keys(result: Result) -> dict[str, Line2D]:
     return {name: Line2D([], [], **look) for name, look in (colours | lines).items()}
 
 
-def _curves(ax: Axes, outcomes: Sequence[Outcome], lane: tuple[str, str, str], colour: str) -> None:
-    """One estimator in one case; what it has no estimate for is a gap."""
-    if not outcomes:
-        return
+def curves(outcomes: Sequence[Outcome], lane: tuple[str, str, str]) -> dict[str, tuple[Array, Array]]:
+    """Times [s] and horizontal errors [m] of one estimator in one case, by `LINES`; without an estimate, a gap."""
     k, since = outcomes[0].lanes.index(lane), outcomes[0].t > 0
     error = np.array([one.horizontal[k] for one in outcomes])[:, since]
     bound = np.array([one.bound[k] for one in outcomes])[:, since]
     error = np.where(np.isfinite(error), error, np.nan)
-    curves = (_rms(error), np.quantile(error, 0.95, axis=0, method="inverted_cdf"), _rms(bound))
-    for curve, line in zip(curves, LINES.values(), strict=True):
-        ax.plot(outcomes[0].t[since], curve, color=colour, **line)
+    found = (_rms(error), np.quantile(error, 0.95, axis=0, method="inverted_cdf"), _rms(bound))
+    return {name: (outcomes[0].t[since], values) for name, values in zip(LINES, found, strict=True)}
+
+
+def _draw(ax: Axes, outcomes: Sequence[Outcome], lane: tuple[str, str, str], colour: str) -> None:
+    for name, (t, values) in curves(outcomes, lane).items() if outcomes else ():
+        ax.plot(t, values, color=colour, **LINES[name])
 
 
 def _rms(values: Array) -> Array:

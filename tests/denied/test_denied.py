@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from worlds import browser
 
 import testbed.__main__ as cli
 from testbed import Scenario, run
@@ -25,6 +26,7 @@ from testbed.denied.table import AIDS, CIRCLES, FULL, GRADES, QUICK, WEATHERS, C
 from testbed.errors import UserError
 from testbed.interrupts import Interrupted
 from testbed.report import denied as report
+from testbed.results import REPORT
 from testbed.score import accuracy, bound
 from testbed.score.claims import Verdict
 
@@ -307,6 +309,25 @@ def test_the_figure_of_who_never_had_an_estimate_is_empty() -> None:
 
 
 # --- what is written
+
+
+@pytest.mark.ci
+@pytest.mark.skipif(browser.program() is None, reason="there is no Chromium on this machine to open a page in")
+def test_the_page_can_be_looked_around_in(tmp_path: Path) -> None:
+    result = dataclasses.replace(whole(3), plan=Plan(FULL, INS, tmp_path, 5, 3))
+    report.save(result, goals.claims(result))
+    with browser.opened() as tab:
+        tab.size(1200, 900)
+        tab.open(tmp_path / REPORT, "document.documentElement.dataset.state")
+        assert tab.run("page.panels.length") == len(WEATHERS) * len(AIDS)
+        tab.run("page.setCursor(60)")
+        tab.until("page.panels[0].view && page.panels[0].told.textContent.includes(' m')")
+        assert tab.run("page.panels[0].values()[0][1]").endswith(": RMS")
+        before = tab.run("page.panels[0].values().length")
+        tab.key("1")
+        tab.until(f"page.panels[0].values().length < {before}")
+        assert tab.run("document.querySelectorAll('#tables table').length") == 1 + len(WEATHERS)
+        assert tab.complaints == []
 
 
 @pytest.mark.ci

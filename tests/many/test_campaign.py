@@ -21,7 +21,7 @@ import pytest
 from distributed import LocalCluster
 from scipy.stats import chi2, ttest_1samp
 from typer.testing import CliRunner
-from worlds import synthetic_run
+from worlds import browser, synthetic_run
 
 import testbed
 from testbed import Scenario, run
@@ -37,7 +37,7 @@ from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
 from testbed.report import campaign_figures
-from testbed.results import MANIFEST
+from testbed.results import MANIFEST, REPORT
 from testbed.score import accuracy
 
 AT_REST = """
@@ -647,6 +647,26 @@ def test_figures_are_drawn(tmp_path: Path, values: list[str]) -> None:
     assert len(panels[0].get_lines()) == 1 + len(values)
 
 
+@pytest.mark.ci
+@pytest.mark.skipif(browser.program() is None, reason="there is no Chromium on this machine to open a page in")
+def test_the_page_can_be_looked_around_in(tmp_path: Path) -> None:
+    campaign_report.save(made_up_campaign(tmp_path, ["0", "5"], runs=5))
+    with browser.opened() as tab:
+        tab.size(1200, 4000)
+        tab.open(tmp_path / REPORT, "document.documentElement.dataset.state == 'whole'")
+        assert tab.run("page.panels.map((panel) => panel.spec.title.split(': ')[1])") == [
+            "horizontal error",
+            "position NEES / dof",
+        ]
+        assert tab.run("page.panels.every((panel) => panel.view)")
+        tab.run("page.setCursor(150)")
+        tab.until("page.panels[0].told.textContent.includes(' – ')")  # median and percentiles
+        assert tab.run("page.panels[0].values().length") == 4  # two combinations, each with its claim
+        tab.key("1")
+        tab.until("page.panels[0].values().length == 2")
+        assert tab.complaints == []
+
+
 def test_nothing_flown_draws_nothing(tmp_path: Path) -> None:
     result = made_up_campaign(tmp_path, [""], runs=0)
     campaign_report.save(result)
@@ -656,9 +676,9 @@ def test_nothing_flown_draws_nothing(tmp_path: Path) -> None:
 
 def test_outages_that_differ_between_runs_are_not_shaded(tmp_path: Path) -> None:
     result = made_up_campaign(tmp_path, [""], runs=2)
-    assert campaign_figures._outages(result) == [(100.0, 200.0)]
+    assert campaign_figures.outages_of(result) == [(100.0, 200.0)]
     result.outcomes[1].history["outage"][150:] = 1.0
-    assert campaign_figures._outages(result) == []
+    assert campaign_figures.outages_of(result) == []
 
 
 def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
@@ -668,7 +688,7 @@ def test_run_that_ends_early_hides_no_other(tmp_path: Path) -> None:
     mean, runs = campaign_figures.nees_mean(result.outcomes, "ins")
     assert (runs[149], runs[150], len(mean)) == (3, 2, 400)
     assert np.isfinite(mean[10:]).all()
-    assert campaign_figures._outages(result) == [(100.0, 200.0)]
+    assert campaign_figures.outages_of(result) == [(100.0, 200.0)]
     drawn = campaign_figures.figures(result)["errors"].figure
     assert drawn.axes[0].get_lines()[0].get_xdata()[-1] == 399.0
 

@@ -4,7 +4,8 @@ What is shown is plain data, made by `contents`. Bokeh's models are not made in 
 draw all figures; a page makes each plot when it comes into sight.
 """
 
-from testbed.report.interactive.contents import Shown, contents
+from testbed.report.interactive.arrays import Arrays
+from testbed.report.interactive.contents import Shown, contents, over_time
 from testbed.report.interactive.embed import script, styles
 
-__all__ = ["Shown", "contents", "script", "styles"]
+__all__ = ["Arrays", "Shown", "contents", "over_time", "script", "styles"]

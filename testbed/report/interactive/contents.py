@@ -18,6 +18,16 @@ from testbed.report.run import Run
 from testbed.score.accuracy import column
 
 
+def over_time(axis: str, reach: tuple[float, float], subjects: Sequence[str], band: str | None) -> dict[str, Any]:
+    """Contents of a page that shows no run, but ``subjects`` over an ``axis`` from and to the ends of its ``reach``.
+
+    ``band`` is what bands are called, if there are any. Chapters and numbers are to be added.
+    """
+    shown = {"axis": axis, "start": reach[0], "end": reach[1], "band": band, "reference": None, "map": None}
+    lists: dict[str, list[Any]] = {key: [] for key in ("windows", "faults", "events", "outcomes")}
+    return shown | lists | {"subjects": [looks(name, k) for k, name in enumerate(subjects)]}
+
+
 @dataclass(frozen=True, slots=True)
 class Shown:
     """A run on a page, and what it is called there: nothing where it is the only one."""
@@ -42,8 +52,10 @@ def contents(runs: Sequence[Shown]) -> dict[str, Any]:
     shown = {
         "start": start,
         "end": max(end, start + 1e-3),
-        "subjects": [_subject(subject) for subject in subjects],
+        "subjects": [looks(subject.name, subject.line) for subject in subjects],
         "reference": runs[0].run.reference,
+        "band": "±3 σ",
+        "axis": "time [s]",
         "windows": _windows(runs, end),
         "faults": _faults(runs, end),
         "events": _events(runs[0].run),
@@ -59,10 +71,11 @@ def outcomes() -> list[tuple[str, str, str]]:
     return [(OUTCOMES[one], colour, style.NOT_USED_ON_DARK[one]) for one, colour in style.NOT_USED.items()]
 
 
-def _subject(subject: Subject) -> dict[str, Any]:
-    colour, dash = style.line_of(subject.line).values()
-    dark = style.ON_DARK[subject.line % len(style.ON_DARK)]
-    return {"name": subject.name, "light": colour, "dark": dark, "dash": style.DASHES.index(dash)}
+def looks(name: str, line: int) -> dict[str, Any]:
+    """What the legend switches, and how its lines look, by its number among all that have lines."""
+    colour, dash = style.line_of(line).values()
+    dark = style.ON_DARK[line % len(style.ON_DARK)]
+    return {"name": name, "light": colour, "dark": dark, "dash": style.DASHES.index(dash)}
 
 
 def _windows(runs: Sequence[Shown], end: float) -> list[list[float]]:

@@ -40,12 +40,15 @@ function legend() {
   listen("shown", paint);
   listen("theme", paint);
   paint();
-  const bands = button("±3 σ", "show or hide what is claimed (key b)", () => {
-    seen.bands = !seen.bands;
-    tell("shown");
-  }, true);
-  listen("shown", () => bands.setAttribute("aria-pressed", seen.bands));
-  row.append(bands, key("truth", PAGE.reference));
+  if (PAGE.band) {
+    const bands = button(PAGE.band, "show or hide bands (key b)", () => {
+      seen.bands = !seen.bands;
+      tell("shown");
+    }, true);
+    listen("shown", () => bands.setAttribute("aria-pressed", seen.bands));
+    row.append(bands);
+  }
+  if (PAGE.reference) row.append(key("truth", PAGE.reference));
   if (PAGE.windows.length || PAGE.live) row.append(key("denied", "no GNSS fix"));
   if (PAGE.faults.length || PAGE.live) row.append(key("fault", "fault of a sensor"));
   return row;

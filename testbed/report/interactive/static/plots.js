@@ -32,12 +32,17 @@ class Panel {
     this.spec = spec;
     this.lines = spec.lines.map((line) => ({
       ...line, t: numbers(line.t), y: numbers(line.y),
-      band: line.band && { ...line.band, t: numbers(line.band.t), half: numbers(line.band.half) },
+      band: line.band && this._band_of(line.band),
     }));
     this.dots = (spec.dots || []).map((one) => ({
       ...one, t: numbers(one.t), y: one.y.map(numbers), raw: one.raw.map(numbers),
       not_used: one.not_used.map((part) => ({ ...part, t: numbers(part.t), y: numbers(part.y) })),
     }));
+  }
+
+  /** A band: so far to both sides of its line, or from low to high. */
+  _band_of({ t, half, low, high, about }) {
+    return half ? { t: numbers(t), half: numbers(half), about } : { t: numbers(t), low: numbers(low), high: numbers(high) };
   }
 
   /** What a plot consists of, but for its numbers. */
@@ -75,7 +80,7 @@ class Panel {
       height: 170, sizing_mode: "stretch_width", toolbar_location: null, tools: [], x_range: range,
       y_range: new Bokeh.Range1d({ start: 0, end: 1 }), y_axis_type: this.spec.log ? "log" : "linear",
       min_border_left: 58, min_border_right: 14, min_border_top: 4, min_border_bottom: 24, lod_threshold: null,
-      x_axis_label: this.spec.last ? "time [s]" : null,
+      x_axis_label: this.spec.last ? PAGE.axis : null,
     });
     this.figure.yaxis.formatter = this.spec.log ? POWERS() : TICKS();
     this.figure.xaxis.formatter = TICKS();
@@ -165,7 +170,8 @@ class Panel {
 
   _band(own) {
     const source = this._source(() => {
-      const { y, band: { t, half, about } } = this.lines[own];
+      const { y, band: { t, half, about, low, high } } = this.lines[own];
+      if (!half) return { t, low, high };
       const middle = (k) => about ?? y[k];
       return { t, low: half.map((h, k) => middle(k) - h), high: half.map((h, k) => middle(k) + h) };
     });
@@ -275,6 +281,11 @@ class Panel {
       if (y[k] > high) high = y[k];
       if (this.spec.log) values.push(y[k]);
     }
+    if (band && !band.half && seen.bands)
+      for (let k = after(band.t, from); k < band.t.length && band.t[k] <= seen.end; k++) {
+        if (band.high[k] > high) high = band.high[k];
+        if (band.low[k] < low) low = band.low[k];
+      }
     if (band && band.about !== undefined && seen.bands)
       for (let k = after(band.t, from); k < band.t.length && band.t[k] <= seen.end; k++) {
         if (band.half[k] > high) high = band.half[k];
@@ -310,8 +321,7 @@ class Panel {
       if (seen.hidden.has(of)) continue;
       const k = nearest(t, seen.cursor);
       const j = band && seen.bands ? nearest(band.t, seen.cursor) : -1;
-      const claimed = j < 0 || k < 0 ? "" : ` ± ${text(band.half[j])}`;
-      const value = k < 0 ? "–" : `${text(y[k])}${claimed} ${this.spec.unit}`;
+      const value = k < 0 ? "–" : `${text(y[k])}${j < 0 ? "" : this._reach(band, j)} ${this.spec.unit}`;
       found.push([colourOf(of), name ?? PAGE.subjects[of].name, value]);
     }
     for (const { of, axes, t, y, raw, refused } of this.dots) {
@@ -323,6 +333,10 @@ class Panel {
       found.push([colourOf(of), name, `${said}; ${(100 * refused).toFixed(2)} % not used`]);
     }
     return found;
+  }
+
+  _reach({ half, low, high }, k) {
+    return half ? ` ± ${text(half[k])}` : ` (${text(low[k])} – ${text(high[k])})`;
   }
 
   follow() {
@@ -344,7 +358,7 @@ class Panel {
 
 /** Of lines that lie on each other each shows beside those above it: the first is the widest, truth the thinnest. */
 function stroke(of, dashed = false) {
-  if (of < 0) return { line_width: 1.1, line_dash: dashed ? [6, 4] : "solid" };
+  if (of < 0 || dashed) return { line_width: 1.1, line_dash: dashed ? [6, 4] : "solid" };
   const below = PAGE.subjects.length - 1 - of;
   return { line_width: 1.4 + Math.min(1.2, 4 / PAGE.subjects.length) * below, line_dash: DASHES[PAGE.subjects[of].dash] };
 }
