@@ -147,6 +147,10 @@ rate_hz = 5
 """
 
 
+# What built-in estimators are told beyond their aids: all that is drawn for a run is a state then.
+TOLD = {"ins": {"states": "matrix"}}
+
+
 class Contestant(NamedTuple):
     """An estimator that takes part: its name in the table, and its ``kind`` in a scenario."""
 
@@ -179,7 +183,10 @@ class Case:
         aiding = [name for name, one in Scenario.parse(flown).sensors.items() if one.kind != "imu"]
         entered = [
             "[[estimator]]\n" + "".join(f"{key} = {json.dumps(value)}\n" for key, value in keys.items())
-            for keys in ({"name": one.name, "kind": one.kind, "aids": aiding} for one in self.contestants)
+            for keys in (
+                {"name": one.name, "kind": one.kind, "aids": aiding, **TOLD.get(one.kind, {})}
+                for one in self.contestants
+            )
         ]
         return "\n".join([flown.rstrip(), "", *entered])
 

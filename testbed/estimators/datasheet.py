@@ -71,10 +71,9 @@ def imu_model(
     full, matrix = states != "biases", states == "matrix"
     beside = replace(errors, gyro_in_run=0.0, accel_in_run=0.0, gyro_scale=0.0, accel_scale=0.0) if full else errors
     if matrix:
-        square = dict.fromkeys(
-            ("gyro_misalignment", "gyro_nonorthogonality", "accel_misalignment", "accel_nonorthogonality"), 0.0
+        beside = replace(
+            beside, gyro_misalignment=0.0, gyro_nonorthogonality=0.0, accel_misalignment=0.0, accel_nonorthogonality=0.0
         )
-        beside = replace(beside, **square)
     level = math.hypot(beside.accel_misalignment, beside.accel_nonorthogonality, beside.accel_scale)
     at_first = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, beside.accel_scale)
     turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
