@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from worlds import browser, synthetic_run
 from worlds.browser import Page
 from worlds.synthetic_run import Errors, circle, scenario
@@ -22,6 +23,8 @@ pytestmark = [
     pytest.mark.ci,
     pytest.mark.skipif(browser.program() is None, reason="there is no Chromium on this machine to open a page in"),
 ]
+PICTURES = Path(__file__).parent / "pictures"
+BLOCK = 5  # pixels of these whose mean is compared: fonts and edges differ from machine to machine
 WHOLE = "document.documentElement.dataset.state == 'whole'"
 PANEL = "page.panels[0]"
 
@@ -254,6 +257,30 @@ def test_paper_shows_every_plot_in_light_colours(opened: Page) -> None:
     opened.until(f"{PANEL}.figure.background_fill_color == '#16191D'")
     assert opened.run("document.querySelectorAll('img.paper').length") == 0
     assert opened.complaints == []
+
+
+@pytest.mark.parametrize("name", ["desktop", pytest.param("phone_dark", marks=pytest.mark.slow)])
+def test_it_looks_as_it_did(tab: Page, flight: Path, tmp_path: Path, name: str) -> None:
+    """Small pictures, compared block by block: what they tell is where and in which colours things are."""
+    phone = name == "phone_dark"
+    size = (390, 844) if phone else (1400, 1000)
+    tab.size(*size, touch=phone)
+    tab.dark(phone)
+    tab.open(flight, "document.documentElement.dataset.state")
+    tab.run("page.toggle(1)")
+    tab.run("document.getElementById('bar').scrollIntoView()")
+    tab.until("page.planes.every(({view}) => view) && page.panels.every(({inSight, view}) => !inSight || view)")
+    seen = tmp_path / f"{name}.png"
+    seen.write_bytes(tab.thumbnail(*size, 0.25))
+    told = f"look at {seen}, and copy it to {PICTURES} if it is as it should be"
+    assert (PICTURES / seen.name).exists(), told
+    before, now = (
+        np.asarray(Image.open(path).convert("RGB").reduce(BLOCK), float) for path in (PICTURES / seen.name, seen)
+    )
+    assert before.shape == now.shape, told
+    apart = np.abs(before - now).max(axis=2)
+    assert apart.mean() < 4, told
+    assert (apart > 30).mean() < 0.008, told
 
 
 def only_attitude() -> Any:
