@@ -7,29 +7,57 @@ import hashlib
 import logging
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
 # Of numba, before it is loaded: LLVM's last level adds an eighth to the time of compilation, and no speed.
 os.environ.setdefault("NUMBA_OPT", "2")
 
 import numba
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 @cache
-def _sources(folder: Path) -> str:
-    """A digest of name, time and size of every source in the package of ``folder`` and in this one."""
-    while (folder.parent / "__init__.py").exists():
-        folder = folder.parent
-    sources = {*folder.rglob("[!.]*.py"), *Path(__file__).parent.rglob("[!.]*.py")}
-    states = [(str(source), source.stat().st_mtime_ns, source.stat().st_size) for source in sorted(sources)]
-    return hashlib.sha256(repr(states).encode()).hexdigest()
+def _sources(name: str) -> str:
+    """A digest of all that the kernels of the module ``name`` may be made of, when its imports are done.
+
+    That is its file and the files of what it takes from its own package and from this one, and of what those take. A
+    constant does not tell where it comes from, so its value counts.
+    """
+    roots = {name.partition(".")[0], __name__.partition(".")[0]}
+    found, waiting = {name}, [name]
+    while waiting:
+        taker = waiting.pop()
+        for value in vars(sys.modules[taker]).values():
+            origin = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+            if not isinstance(origin, str) or origin in found or origin not in sys.modules:
+                continue
+            a_part = isinstance(value, ModuleType) and origin.startswith(f"{taker}.")  # loaded by whomever
+            if origin.partition(".")[0] in roots and not a_part:
+                found.add(origin)
+                waiting.append(origin)
+    states = []
+    for source in sorted(str(sys.modules[module].__file__) for module in found):
+        state = os.stat(source)
+        states.append((source, state.st_mtime_ns, state.st_size))
+    values = vars(sys.modules[name]).items()
+    constants = sorted((key, repr(value)) for key, value in values if _constant(value))
+    constants += sorted((key, repr(value.tolist())) for key, value in values if isinstance(value, np.ndarray))
+    return hashlib.sha256(repr((states, constants)).encode()).hexdigest()
+
+
+def _constant(value: object) -> bool:
+    if isinstance(value, tuple):
+        return all(map(_constant, value))
+    return isinstance(value, bool | int | float | complex | str | bytes)
 
 
 def _keep_for_now() -> None:
@@ -46,7 +74,7 @@ def _keep_for_now() -> None:
 
 
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
-    """Compile with an on-disk cache that is good while all sources are what they were.
+    """Compile with an on-disk cache that is good while all that it may be made of is what it was.
 
     Numba looks at a kernel's own file only, and not at those of the kernels that are part of it: after an update of one
     file the others would go on with what it was.
@@ -57,7 +85,7 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
         _keep_for_now()
         compiled = numba.njit(cache=True, **options)(function)
     index = compiled._cache._cache_file
-    index._source_stamp = index._source_stamp, _sources(Path(function.__code__.co_filename).parent)
+    index._source_stamp = index._source_stamp, _sources(function.__module__)
     return cast("Callable[P, R]", compiled)
 
 

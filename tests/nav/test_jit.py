@@ -1,4 +1,4 @@
-"""Cached kernels are good only while all sources that they may contain are what they were."""
+"""Cached kernels are good only while all that they may be made of is what it was."""
 
 import os
 import shutil
@@ -16,28 +16,53 @@ earth.radii(0.5)
 print(sum(earth.radii.stats.cache_hits.values()), sum(earth.radii.stats.cache_misses.values()))
 """
 
+KERNELS = {  # of a package of its own
+    "__init__": "",
+    "constants": "FACTOR = 2.0\nUNUSED = 5.0\n",
+    "inner": "from nav._jit import njit\nfrom mine.innermost import add\n@njit\ndef double(x):\n    return add(x, x)\n",
+    "innermost": "from nav._jit import njit\n@njit\ndef add(x, y):\n    return x + y\n",
+    "outer": (
+        "from mine import inner\nfrom mine.constants import FACTOR\nfrom nav._jit import njit\n"
+        "@njit\ndef scaled(x):\n    return FACTOR * inner.double(x)\n"
+    ),
+    "other": "from nav._jit import njit\n@njit\ndef nothing():\n    return 0\n",
+}
+CALL = """
+from mine.outer import scaled
+print(scaled(1.0), sum(scaled.stats.cache_hits.values()), sum(scaled.stats.cache_misses.values()))
+"""
+
 
 @pytest.mark.ci
-def test_a_change_of_any_source_compiles_anew(tmp_path):
-    """`radii` contains `radii_of` of its own file; a change of another file of `nav` may be one of what it contains."""
-    source = Path(nav.__file__).parent
-    package = tmp_path / "nav"
-    shutil.copytree(source, package, ignore=shutil.ignore_patterns("__pycache__"))
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+def test_kernels_are_good_while_all_that_they_are_made_of_is_what_it_was(tmp_path):
+    """`scaled` takes a constant from one file, a kernel from another, and that one its own from a third."""
+    package = tmp_path / "mine"
+    package.mkdir()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(nav.__file__).parents[1])])}
     environment.pop("NUMBA_CACHE_DIR", None)
 
-    def hits_and_misses():
-        run = subprocess.run(
-            [sys.executable, "-c", SCRIPT], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
-        )
+    def written(**changed):
+        for name, text in (KERNELS | changed).items():
+            file = package / f"{name}.py"
+            if not file.exists() or file.read_text() != text:
+                file.write_text(text)
+
+    def called():
+        run = subprocess.run([sys.executable, "-c", CALL], env=environment, capture_output=True, text=True, check=True)
         return run.stdout.split()
 
-    assert hits_and_misses() == ["0", "1"]
-    assert hits_and_misses() == ["1", "0"]
-    os.utime(package / "rotation.py", ns=(1, 1))
+    written()
+    assert called() == ["4.0", "0", "1"]
+    assert called() == ["4.0", "1", "0"]
+    written(other=KERNELS["other"] + "# nothing that it is made of\n")
     (package / ".#lock.py").symlink_to("nowhere")  # as editors leave them
-    assert hits_and_misses() == ["0", "1"]
-    assert hits_and_misses() == ["1", "0"]
+    assert called() == ["4.0", "1", "0"]
+    written(innermost=KERNELS["innermost"].replace("x + y", "x + y + 1"))
+    assert called() == ["6.0", "0", "1"]
+    assert called() == ["6.0", "1", "0"]
+    written(innermost=KERNELS["innermost"].replace("x + y", "x + y + 1"), constants="FACTOR = 3.0\nUNUSED = 5.0\n")
+    assert called() == ["9.0", "0", "1"]
+    assert called() == ["9.0", "1", "0"]
 
 
 @pytest.mark.ci
