@@ -92,14 +92,15 @@ GRADES: dict[str, dict[str, Any]] = {
         "hdop": 0.6,
         "vdop": 0.9,
     },
-    # u-blox NEO-M8 data sheet UBX-15031086: 2.5 m CEP, 2.1 m per axis, most of it the same for minutes; velocity 0.05
-    # m/s. It is late by 0.2 s, as recorded flights show against their inertial units, and not known to 0.1 s. Measured
-    # in 0.43 h of three recordings: one step of 7 m against the receiver's velocity, a dozen of 1.5 m (how long they
-    # last is assumed); steps of stamps that deviate by 5 to 36 ms; of a thousand fixes 3 missing. In two more: stated
+    # u-blox NEO-M8 data sheet UBX-15031086: 2.5 m CEP, 2.1 m per axis, most of it the same for minutes, velocity 0.05
+    # m/s; of what stays, half is left here: filters that reckon with more follow recorded receivers by 0.5 m less. It
+    # is late by 0.2 s, as recorded flights show against their inertial units, and not known to 0.1 s. Measured in 0.43
+    # h of three recordings: one step of 7 m against the receiver's velocity, a dozen of 1.5 m (how long they last is
+    # assumed); steps of stamps that deviate by 5 to 36 ms; of a thousand fixes 3 missing. In two more: stated
     # accuracies that fall from the first fixes on with a time constant of 11 s, or slower.
     "u-blox-m8": {
         "horizontal_white_m": 0.5,
-        "horizontal_correlated_m": 1.3,
+        "horizontal_correlated_m": 1.0,
         "vertical_white_m": 0.7,
         "vertical_correlated_m": 2.4,
         "correlation_time_s": 300.0,
