@@ -21,12 +21,13 @@ import json
 import socket
 import struct
 import time
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
 from nav.earth import position_difference_n
 from nav.rotation import euler_from_quat
-from nav.samples import AirspeedSample
+from nav.samples import AirspeedSample, Estimate
 from testbed.bridges.address import address, bound
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
@@ -46,6 +47,7 @@ class ArduPilot:
     """One ArduPilot that follows a run (`testbed.feeds.bridged.FarEnd`); ``answered`` counts steps."""
 
     name = "ArduPilot"
+    estimators: Collection[str] = ()
 
     def __init__(
         self, url: str = DEFAULT, *, flies: bool = False, connect_s: float = CONNECT_S, answer_s: float = ANSWER_S
@@ -74,6 +76,10 @@ class ArduPilot:
         for step in self._stepper.steps(turn):
             if not self.failure:
                 self._answer(step)
+
+    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+        """None: what it estimates is not heard."""
+        return iter(())
 
     def close(self) -> None:
         """Close the port."""

@@ -7,6 +7,9 @@ again and again, in real time, and the run waits at its beginning. So stamps are
 took; what else is sent depends on the run alone. What PX4 answers moves nothing here, unless it is to fly: then from
 when it is armed its outputs 1 to 4 are aileron, elevator, throttle and rudder, positive to the right, up, on, right.
 
+Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.told`). PX4's clock is that of
+the stamps it is sent, from the first of them on.
+
 * Samples are those of the scenario with all their errors; of several units of a kind, the first, but all receivers.
 * Answers to earlier steps are passed over; a later one, none within ``answer_s``, more than `MOST_BYTES` without the
   right one, or a closed connection ends it, and the run, with the reason.
@@ -23,14 +26,15 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from nav.earth import SEA_LEVEL_DENSITY, isa_temperature, pressure_altitude
-from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
+from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, MagnetometerSample
 from testbed.bridges.address import address, bound
+from testbed.bridges.listener import Listener
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
 from testbed.feeds.bridged import Surfaces
@@ -42,6 +46,7 @@ DEFAULT = "tcpin:127.0.0.1:4560"
 TRUTH_HZ = 50.0
 BOOT_HZ = 10.0  # of sensors other than the IMU, until PX4 answers
 CONNECT_S, BOOT_S, ANSWER_S = 120.0, 120.0, 10.0  # of wall time
+LAST_S = 0.2  # of wall time, that its last words may take
 MOST_BYTES = 100_000  # said within one step, of which an answer has some hundred
 READ = 65536
 ACCEL, GYRO, MAGNETOMETER, BAROMETER, DYNAMIC = 0x7, 0x38, 0x1C0, 0x1A00, 0x400  # fields_updated, each a whole group
@@ -62,6 +67,7 @@ class Px4:
         url: str = DEFAULT,
         *,
         flies: bool = False,
+        estimators: Mapping[str, str] | None = None,
         connect_s: float = CONNECT_S,
         boot_s: float = BOOT_S,
         answer_s: float = ANSWER_S,
@@ -70,10 +76,14 @@ class Px4:
         self.failure, self.answered, self.armed = "", 0, False
         self.flies = flies
         self.surfaces: Surfaces | None = None
+        self._ears = {name: Listener(where) for name, where in (estimators or {}).items()}
+        self.estimators: Collection[str] = tuple(self._ears)
         self._boot_s, self._answer_s = boot_s, answer_s
         self._stepper, self._encoder, self._reader = Stepper(), Encoder(), Reader()
         self._heard: deque[Message] = deque()
-        self._offset_us: int | None = None  # from the run's clock to PX4's
+        self._offset_us: int | None = None  # from the run's clock to the stamps
+        self._first_us = 0  # the first stamp
+        self._system = 0  # of PX4, as it answers
         self._fix: dict[str, GnssSample] = {}  # the last of each receiver
         self._order: list[str] = []  # of the aiding sensors, as the scenario has them
         self._truth_due = -math.inf
@@ -98,19 +108,33 @@ class Px4:
                 stamp = self._offset_us + microseconds(step.t)
                 if self._send(self._frames(step, stamp)):
                     self._await(stamp, step.t)
+        for one in self._ears.values():
+            one.listen(self._system)
+
+    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+        """What PX4 said over the whole run of its own motion."""
+        boot = (self._first_us - (self._offset_us or 0)) / 1e6
+        for name, one in self._ears.items():
+            one.listen(self._system, LAST_S)
+            for estimate in one.told.estimates(times, boot):
+                yield name, estimate
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connections."""
         self._socket.close()
+        for one in self._ears.values():
+            one.close()
 
     def _boot(self, step: Step) -> None:
         """Send the first step in real time, at `BOOT_HZ` with the other sensors, until there is an answer to any."""
         interval_us = max(1, microseconds(step.dt))
         stamp, until = interval_us, time.monotonic() + self._boot_s
+        self._first_us = stamp
         quiet, seldom = replace(step, arrived={}), max(1, round(1 / (BOOT_HZ * step.dt)))
         while self._send(self._frames(quiet if stamp // interval_us % seldom else step, stamp)):
             next_at = time.monotonic() + step.dt
-            if self._controls(next_at) is not None:
+            if (answer := self._controls(next_at)) is not None:
+                self._system = answer.system
                 self._offset_us = stamp + interval_us - microseconds(step.t)
                 return
             if self.failure:

@@ -186,7 +186,7 @@ def _connect(
     from testbed.loop.links import shown_estimator
     from testbed.mavlink import MavlinkPublisher, log_path
 
-    shown_estimator(scenario, estimator)
+    shown_estimator(scenario.estimator, estimator)
     for url in urls:
         path = log_path(url)
         if path is not None and path.resolve().parent == folder.resolve() and path.name in (RECORD, METRICS, REPORT):
@@ -202,6 +202,7 @@ def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None, flies: 
         return None
     from testbed.bridges.ardupilot import ArduPilot
     from testbed.bridges.px4 import Px4
+    from testbed.estimators.px4 import Px4Section
     from testbed.sensors.imu import ImuConfig
 
     if px4 is not None and ardupilot is not None:
@@ -210,7 +211,8 @@ def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None, flies: 
         raise UserError("--px4, --ardupilot: an autopilot lives on inertial samples: add [sensors.imu]")
     if px4 is not None:
         remark(f"waiting for PX4 on {px4}")
-        return Px4(px4, flies=flies)
+        theirs = {one.name: one.address for one in scenario.estimator if isinstance(one, Px4Section)}
+        return Px4(px4, flies=flies, estimators=theirs)
     assert ardupilot is not None
     remark(f"waiting for ArduPilot on {ardupilot}")
     return ArduPilot(ardupilot, flies=flies)

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from testbed import plugins
 from testbed.errors import UserError, choice, shown
-from testbed.estimators import ahrs, custom, federated, ins
+from testbed.estimators import ahrs, custom, federated, ins, px4
 from testbed.estimators.lane import Lane
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection
@@ -26,6 +26,7 @@ BUILT_IN: Mapping[str, Kind] = {
     "ins": Kind(ins.InsSection, ins.build),
     "federated": Kind(federated.FederatedSection, federated.build),
     "ahrs": Kind(ahrs.AhrsSection, ahrs.build),
+    "px4": Kind(px4.Px4Section, px4.build),
 }
 Build: TypeAlias = Callable[[Sequence[EstimatorSection], Rig], dict[str, Lane]]  # as `build`
 CUSTOM = Kind(custom.CustomSection, custom.build)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
+from nav.samples import Estimate
 from testbed.feeds.feed import Feed, Turn
 
 
@@ -23,15 +24,21 @@ class FarEnd(Protocol):
 
     ``name`` is what it is called. ``failure`` is why it no longer answers, empty as long as it does. ``flies`` says
     whether it is to move the aircraft; then ``surfaces`` are what it commands, None as long as it does not.
+    ``estimators`` are the names of those of the scenario that run in it.
     """
 
     name: str
     failure: str
     flies: bool
     surfaces: Surfaces | None
+    estimators: Collection[str]
 
     def follow(self, turn: Turn) -> None:
         """Tell it of a turn, and hear its answers; waits for them. Sets ``failure`` in place of raising anything."""
+        ...
+
+    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+        """What its estimators said over the whole run: names, and estimates at ``times`` [s]."""
         ...
 
     def close(self) -> None:

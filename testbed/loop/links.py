@@ -9,9 +9,9 @@ from typing import Protocol
 
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from testbed.errors import UserError
+from testbed.estimators.section import EstimatorSection
 from testbed.loop.requests import Request
 from testbed.motion.table import TruthBlock
-from testbed.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,9 @@ class Publisher(Protocol):
         ...
 
 
-def shown_estimator(scenario: Scenario, asked: str | None = None) -> str:
+def shown_estimator(estimators: Sequence[EstimatorSection], asked: str | None = None) -> str:
     """The estimator that links show: the one asked for, or the first. Raises UserError when there is none such."""
-    names = [one.name for one in scenario.estimator]
+    names = [one.name for one in estimators]
     if not names:
         raise UserError("the scenario has no [[estimator]], so a link has nothing to show: add one, or leave it out")
     if asked is None:

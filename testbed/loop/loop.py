@@ -19,6 +19,7 @@ from nav.samples import Estimate, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
+from testbed.estimators.section import EstimatorSection
 from testbed.feeds.bridged import FarEnd
 from testbed.feeds.build import located, open_feed
 from testbed.feeds.feed import Feed, Turn
@@ -97,7 +98,7 @@ def run(
         seed = scenario.seed if seed is None else seed
         if not 0 <= seed <= LARGEST_SEED:
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
-        shown = shown_estimator(scenario, shown) if links or shown is not None else None
+        shown = shown_estimator(_own(scenario, far_end), shown) if links or shown is not None else None
         setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
@@ -107,7 +108,10 @@ def run(
         director = Director(asking, replay, realtime, rate_hz, source is None and far_end is None)
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
-            rehearsal = scenario.model_copy(update={"duration_s": min(REHEARSAL_S, scenario.duration_s)})
+            own = _own(scenario, far_end)
+            rehearsal = scenario.model_copy(
+                update={"duration_s": min(REHEARSAL_S, scenario.duration_s), "estimator": own}
+            )
             _fly(rehearsal, Setup(seed, build=build), Director((), (), None, rate_hz))
         flown = None
         while flown is None:
@@ -190,7 +194,7 @@ class _Passage:
         self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), max(1, round(EVENTS_S * rate_hz)), publish)
         self.batch = round((BATCH_S if setup.far_end is None else PACED_S) * rate_hz)
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
-        self.lanes = setup.build(scenario.estimator, scenario.rig(setup.seed))
+        self.lanes = setup.build(_own(scenario, setup.far_end), scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
         self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead, setup.far_end)
         ending.callback(self.feed.close)
@@ -327,11 +331,14 @@ class _Passage:
     def look_back(self) -> None:
         """Record what estimators say of the whole run when they look back."""
         times = [tick / self.rate_hz for tick in range(0, self.tick, self.cadence.record)]
-        for section in self.scenario.estimator:
+        for section in _own(self.scenario, self.setup.far_end):
             _, *smoothed = section.recorded
             for name in smoothed:
                 for estimate in self.lanes[section.name].smoothed(times):
                     self.recorder.estimate(name, estimate)
+        if self.setup.far_end is not None:
+            for name, estimate in self.setup.far_end.estimates(times):
+                self.recorder.estimate(name, estimate)
 
     @property
     def _end(self) -> float:
@@ -345,6 +352,11 @@ class _Passage:
             seconds["missed_percent"] = 100 * pacer.missed / pacer.waits
             seconds["jitter_p99_s"] = pacer.jitter_s(0.99)
         return seconds
+
+
+def _own(scenario: Scenario, far_end: FarEnd | None) -> tuple[EstimatorSection, ...]:
+    """The estimators that do not run in the far end."""
+    return tuple(one for one in scenario.estimator if far_end is None or one.name not in far_end.estimators)
 
 
 class _Backlog:

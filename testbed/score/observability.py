@@ -92,7 +92,8 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     except UserError:  # `metrics.unscored` says so
         return {}
     found = {}
-    own = [section for section in scenario.estimator if section.kind in registry.BUILT_IN]  # others say nothing of it
+    said = registry.BUILT_IN.keys() - {"px4"}  # others say nothing of it
+    own = [section for section in scenario.estimator if section.kind in said]
     for name, running in registry.build(own, scenario.rig(scenario.seed)).items():
         way = _way(dataset, name) if name in accuracy.names(dataset) else None
         if way is None:

@@ -56,17 +56,77 @@ class Circle:
         return right, up, yaw, max(0.0, min(1.0, self._power + 0.1 * slow))
 
 
+class Voice:
+    """What PX4 says over its own MAVLink: truth, but `NORTH_M` too far north. Its clock begins with the first stamp.
+
+    With ``odd`` each message comes a turn late, the youngest first, among numbers that are none, others' and garbage,
+    and from 4 to 6 s nothing is said of the position.
+    """
+
+    NORTH_M, SIGMA_M = 3.0, 2.0
+
+    def __init__(self, odd: bool = False) -> None:
+        self.port, self.odd = free_port(socket.SOCK_DGRAM), odd
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._mav, self._other = (mav.MAVLink(None, srcSystem=own, srcComponent=1) for own in (1, 7))
+        self._begun: int | None = None
+        self._late: list[bytes] = []
+
+    @property
+    def url(self) -> str:
+        return f"udpin:127.0.0.1:{self.port}"
+
+    def close(self) -> None:
+        """It says no more."""
+        self._link.close()
+
+    def say(self, own: Any) -> None:
+        """Say what a HIL_STATE_QUATERNION says."""
+        self._begun = own.time_usec - 5000 if self._begun is None else self._begun
+        stamp = own.time_usec - 5000 - self._begun
+        q, velocity = own.attitude_quaternion, [value / 100 for value in (own.vx, own.vy, own.vz)]
+        lat = own.lat + round(self.NORTH_M / 6.371e6 * math.degrees(1) * 1e7)
+        covariance = [0.0] * 21
+        for k, sigma in zip((0, 6, 11, 15, 18, 20), [self.SIGMA_M] * 3 + [0.01] * 3, strict=True):
+            covariance[k] = sigma**2
+        place = mav.MAVLink_global_position_int_message(stamp // 1000, lat, own.lon, own.alt, 0, 1, 2, 3, 65535)
+        said = [
+            mav.MAVLink_attitude_quaternion_message(stamp // 1000, *q, 0, 0, 0),
+            mav.MAVLink_local_position_ned_message(stamp // 1000, 0, 0, 0, *velocity),
+            mav.MAVLink_odometry_message(
+                stamp, 1, 1, 0, 0, 0, q, *velocity, 0, 0, 0, covariance, [0.01] * 21, estimator_type=8
+            ),
+        ]
+        if not (self.odd and 4e6 < stamp < 6e6):
+            said.append(place)
+        frames = [bytes(message.pack(self._mav)) for message in said]
+        if self.odd:
+            none = [math.nan] * 4
+            frames.append(mav.MAVLink_attitude_quaternion_message(stamp // 1000, *none, 0, 0, 0).pack(self._mav))
+            frames.append(mav.MAVLink_local_position_ned_message(stamp // 1000, 0, 0, 0, *none[:3]).pack(self._mav))
+            frames.append(
+                mav.MAVLink_global_position_int_message(stamp // 1000, 0, 0, 0, 0, 0, 0, 0, 0).pack(self._other)
+            )
+            frames += [b"garbage\xfd\x09", mav.MAVLink_vfr_hud_message(1, 1, 1, 1, 1, 1).pack(self._mav), frames[0][:9]]
+            frames, self._late = self._late, frames[::-1]
+        for frame in frames:
+            self._link.sendto(frame, ("127.0.0.1", self.port))
+
+
 class Px4(threading.Thread):
     """PX4's side: connects, says hello, and answers each HIL_SENSOR from the ``boot``-th on.
 
     ``behaviour`` from the ``at``-th sensor on: "stall", "close", "late" (answers of the step before), "ahead" (of a
     later time), "talk" (never stops), "deaf" (says much, reads nothing); all the time: "double" (every answer twice),
-    "halves" (a byte at a time, garbage between). With a ``pilot`` it is armed from the ``at``-th sensor on.
+    "halves" (a byte at a time, garbage between). With a ``pilot`` it is armed from the ``at``-th sensor on. With a
+    ``voice`` it says what it believes of its own motion.
     """
 
-    def __init__(self, behaviour: str = "", at: int = 0, boot: int = 3, pilot: Circle | None = None) -> None:
+    def __init__(
+        self, behaviour: str = "", at: int = 0, boot: int = 3, pilot: Circle | None = None, voice: Voice | None = None
+    ) -> None:
         super().__init__(daemon=True)
-        self.pilot, self._state = pilot, None
+        self.pilot, self.voice, self._state = pilot, voice, None
         self.port = free_port(socket.SOCK_STREAM)
         self.behaviour, self.at, self.boot = behaviour, at, boot
         self.heard: list[Any] = []  # messages
@@ -93,6 +153,8 @@ class Px4(threading.Thread):
                     time.sleep(0.01)
             with contextlib.suppress(OSError):
                 self._serve(link)
+        if self.voice is not None:
+            self.voice.close()
 
     def _serve(self, link: socket.socket) -> None:
         hello = self._mav.heartbeat_encode(mav.MAV_TYPE_GENERIC, mav.MAV_AUTOPILOT_PX4, 0, 0, 0)
@@ -105,6 +167,8 @@ class Px4(threading.Thread):
                 self.heard.append(message)
                 if message.get_type() == "HIL_STATE_QUATERNION":
                     self._state = message
+                    if self.voice is not None:
+                        self.voice.say(message)
                 if message.get_type() != "HIL_SENSOR":
                     continue
                 self._sensor = message
