@@ -26,32 +26,42 @@ R = TypeVar("R")
 
 
 @cache
-def _sources(name: str) -> str:
-    """A digest of all that the kernels of the module ``name`` may be made of, when its imports are done.
-
-    That is its file and the files of what it takes from its own package and from this one, and of what those take. A
-    constant does not tell where it comes from, so its value counts.
-    """
+def _taken(name: str) -> frozenset[str]:
+    """The modules of its own package and of this one that the module ``name``, its imports done, has something from."""
     roots = {name.partition(".")[0], __name__.partition(".")[0]}
+    found = set()
+    for value in vars(sys.modules[name]).values():
+        origin = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
+        ours = isinstance(origin, str) and origin.partition(".")[0] in roots and origin in sys.modules
+        if ours and not (isinstance(value, ModuleType) and origin.startswith(f"{name}.")):  # a part, loaded by whomever
+            found.add(origin)
+    return frozenset(found)
+
+
+@cache
+def _state(name: str) -> tuple[str, int, int]:
+    """Path, time and size of the file of a module."""
+    source = str(sys.modules[name].__file__)
+    state = os.stat(source)
+    return source, state.st_mtime_ns, state.st_size
+
+
+@cache
+def _sources(name: str) -> str:
+    """A digest of all that the kernels of the module ``name`` may be made of.
+
+    That is its file, the files that it takes something from, and those that they do. A constant does not tell where it
+    comes from, so its value counts.
+    """
     found, waiting = {name}, [name]
     while waiting:
-        taker = waiting.pop()
-        for value in vars(sys.modules[taker]).values():
-            origin = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
-            if not isinstance(origin, str) or origin in found or origin not in sys.modules:
-                continue
-            a_part = isinstance(value, ModuleType) and origin.startswith(f"{taker}.")  # loaded by whomever
-            if origin.partition(".")[0] in roots and not a_part:
-                found.add(origin)
-                waiting.append(origin)
-    states = []
-    for source in sorted(str(sys.modules[module].__file__) for module in found):
-        state = os.stat(source)
-        states.append((source, state.st_mtime_ns, state.st_size))
+        new = _taken(waiting.pop()) - found
+        found |= new
+        waiting += new
     values = vars(sys.modules[name]).items()
     constants = sorted((key, repr(value)) for key, value in values if _constant(value))
     constants += sorted((key, repr(value.tolist())) for key, value in values if isinstance(value, np.ndarray))
-    return hashlib.sha256(repr((states, constants)).encode()).hexdigest()
+    return hashlib.sha256(repr((sorted(map(_state, found)), constants)).encode()).hexdigest()
 
 
 def _constant(value: object) -> bool:
