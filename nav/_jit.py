@@ -32,8 +32,9 @@ def _taken(name: str) -> frozenset[str]:
     found = set()
     for value in vars(sys.modules[name]).values():
         origin = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", None)
-        ours = isinstance(origin, str) and origin.partition(".")[0] in roots and origin in sys.modules
-        if ours and not (isinstance(value, ModuleType) and origin.startswith(f"{name}.")):  # a part, loaded by whomever
+        if not isinstance(origin, str) or origin.partition(".")[0] not in roots or origin not in sys.modules:
+            continue
+        if not (isinstance(value, ModuleType) and origin.startswith(f"{name}.")):  # a part, loaded by whomever
             found.add(origin)
     return frozenset(found)
 
