@@ -27,10 +27,12 @@ class Progress:
 class Publisher(Protocol):
     """Whoever watches a run: handed plain data every ``period_s`` of simulated time.
 
+    ``others_every`` says at which calls it looks at the estimators beside the shown one: the first and each so many.
     ``asks`` says whether it may ever ask for something; without, `requests` is not called.
     """
 
     period_s: float
+    others_every: int
     asks: bool
 
     def publish(
@@ -43,7 +45,7 @@ class Publisher(Protocol):
         reports: Sequence[UpdateReport],
     ) -> None:
         """One row of truth; the shown estimator's estimate and its reports since the last call; the newest sample of
-        each sensor; increments up to the row or beyond; the other estimators' estimates.
+        each sensor; increments up to the row or beyond; the other estimators' estimates, where they are looked at.
         """
         ...
 

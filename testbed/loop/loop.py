@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import heapq
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -169,15 +170,16 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
 
 @dataclass(frozen=True, slots=True)
 class _Cadence:
-    """At which ticks rows are recorded, looked at for events, and handed to links (0: never)."""
+    """At which ticks rows are recorded, looked at for events, handed to links, with the others beside (0: never)."""
 
     record: int
     events: int
     publish: int
+    others: int
 
-    def rows(self, tick: int, n: int) -> list[int]:
-        """The rows of the ``n`` from ``tick`` on at which anybody wants an estimate."""
-        every = (self.record, self.events, self.publish)
+    def rows(self, tick: int, n: int, shown: bool = True) -> list[int]:
+        """The rows of the ``n`` from ``tick`` on at which anybody wants an estimate, of the ``shown`` one or not."""
+        every = (self.record, self.events, self.publish if shown else self.others)
         return sorted(set().union(*(range(-tick % one, n, one) for one in every if one)))
 
 
@@ -191,7 +193,9 @@ class _Passage:
         self.rate_hz = rate_hz
         self.tick, self.ticks = 0, round(scenario.duration_s * rate_hz) + 1
         publish = max(1, round(min(link.period_s for link in setup.links) * rate_hz)) if setup.links else 0
-        self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), max(1, round(EVENTS_S * rate_hz)), publish)
+        others = publish * math.gcd(*(link.others_every for link in setup.links))
+        events = max(1, round(EVENTS_S * rate_hz))
+        self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), events, publish, others)
         self.batch = round((BATCH_S if setup.far_end is None else PACED_S) * rate_hz)
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
         self.lanes = setup.build(_own(scenario, setup.far_end), scenario.rig(setup.seed))
@@ -229,11 +233,14 @@ class _Passage:
         for own in turn.samples.values():
             self.latest.add(own)
         rows = self.cadence.rows(self.tick, len(block))
-        times = [float(block.t[k]) for k in rows]
-        tracked = {name: self._track(name, turn, times) for name in self.lanes}
+        fewer = self.cadence.rows(self.tick, len(block), shown=False)
+        wanted = {name: rows if name in (self.setup.shown, *turn.tracked) else fewer for name in self.lanes}
+        tracked = {name: self._track(name, turn, block.t[wanted[name]].tolist()) for name in self.lanes}
         self._record(turn)
-        for i, k in enumerate(rows):
-            self._hand_out(turn, tracked, i, k)
+        estimates = {name: dict(zip(wanted[name], tracked[name].estimates, strict=True)) for name in self.lanes}
+        for k in rows:
+            now = [(name, own[k]) for name, own in estimates.items() if k in own]
+            self._hand_out(turn, tracked, now, k)
         self.tick += len(block)
         t = float(block.t[-1])
         if self.director.pacer is not None:
@@ -271,11 +278,12 @@ class _Passage:
         for name, own in turn.samples.items():
             self.recorder.samples(name, own)
 
-    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], i: int, k: int) -> None:
-        """Row ``k`` of a turn, the ``i``-th at which estimates are wanted: events, record, links."""
+    def _hand_out(
+        self, turn: Turn, tracked: Mapping[str, Tracked], now: Sequence[tuple[str, Estimate]], k: int
+    ) -> None:
+        """Row ``k`` of a turn, with the estimates that are wanted ``now``: events, record, links."""
         t = float(turn.reference.t[k])
         self.arrived += self.latest.until(t)
-        now = [(name, one.estimates[i]) for name, one in tracked.items()]
         if (self.tick + k) % self.cadence.events == 0:
             self._look(t, float(turn.reference.leg[k]), now)
         if (self.tick + k) % self.cadence.record == 0:
@@ -284,7 +292,7 @@ class _Passage:
         shown = self.setup.shown
         if self.cadence.publish and (self.tick + k) % self.cadence.publish == 0 and shown is not None:
             due = self.backlog[shown].shown_until(t)
-            row, first = turn.reference.rows(k, k + 1), tracked[shown].estimates[i]
+            row, first = turn.reference.rows(k, k + 1), next(estimate for name, estimate in now if name == shown)
             others = [(name, estimate) for name, estimate in now if name != shown]
             for link in self.setup.links:
                 link.publish(row, first, self.latest.by_sensor, tracked[shown].increments, others, due)

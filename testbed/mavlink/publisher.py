@@ -23,7 +23,7 @@ from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
 from testbed.mavlink.parameters import Parameters
 from testbed.mavlink.signing import Signing
 from testbed.mavlink.snapshot import Point, Snapshot, known_point
-from testbed.mavlink.stream import BESIDE_VEHICLES, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
+from testbed.mavlink.stream import BESIDE_VEHICLES, OTHERS_HZ, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
 from testbed.motion.table import TruthBlock
 from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig
@@ -80,7 +80,6 @@ class MavlinkPublisher:
         self._streams = BESIDE_VEHICLES if vehicles else STREAMS
         self._schedule = Schedule(self._streams)
         self._encoder = Encoder()
-        self._calls = 0
         self._long_texts = 0
         self._vehicles = vehicles
         self._beside: list[Answers] = []  # truth and the other estimators, when they are vehicles
@@ -100,10 +99,13 @@ class MavlinkPublisher:
             else:
                 self._links.append(link)
         self.asks = bool(self._links)
+        # Stations may ask for other rates at any time, and a log is at the usual ones.
+        self.others_every = 1 if self._links or vehicles else PUBLISH_HZ // OTHERS_HZ
 
     def _begin(self) -> None:
         """Forget what was of a run, for another to begin."""
         self._t = -math.inf
+        self._calls = 0
         self._leg = -1.0
         self._home: Point | None = None
         self._health: object = None
@@ -131,7 +133,8 @@ class MavlinkPublisher:
         """Send what is due at the time of ``truth`` (one row).
 
         ``samples`` is the newest of each sensor, ``imu`` increments around now (those up to now are used), ``others``
-        the estimates shown beside this one, ``reports`` this estimator's updates since the last call.
+        the estimates shown beside this one, needed every `others_every` calls, ``reports`` this estimator's updates
+        since the last call.
         """
         t = float(truth.t[0])
         if t < self._t:

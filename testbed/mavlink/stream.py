@@ -13,6 +13,7 @@ from testbed.mavlink.encode import Fields
 from testbed.mavlink.snapshot import Snapshot
 
 PUBLISH_HZ = 25
+OTHERS_HZ = 5  # of the estimators beside the shown one
 
 _RAW = mav.MAV_DATA_STREAM_RAW_SENSORS
 _STATUS = mav.MAV_DATA_STREAM_EXTENDED_STATUS
@@ -59,8 +60,8 @@ STREAMS = (
     Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE),
     Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE),
     Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE),
-    Stream("AHRS2", 5, estimates.ahrs2, _ATTITUDE),
-    Stream("AHRS3", 5, estimates.ahrs3, _ATTITUDE),
+    Stream("AHRS2", OTHERS_HZ, estimates.ahrs2, _ATTITUDE),
+    Stream("AHRS3", OTHERS_HZ, estimates.ahrs3, _ATTITUDE),
     *(
         Stream("NAMED_VALUE_FLOAT", 1, partial(estimates.error, name), _REST)
         for name in (f"{kind}_{error}" for error in ("horiz", "down", "vel", "tilt", "head") for kind in ("err", "sig"))

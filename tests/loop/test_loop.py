@@ -222,6 +222,23 @@ def test_metrics_and_record_are_written(tmp_path: Path) -> None:
     assert result.metrics["ins.aligned_s"] < 5
 
 
+@pytest.mark.parametrize("every", [1, 5])
+def test_estimators_beside_the_shown_one_are_handed_over_as_often_as_they_are_looked_at(every: int) -> None:
+    class Sparse(Watcher):
+        others_every = every
+
+        def publish(self, truth, estimate, samples, imu, others, reports):  # type: ignore[no-untyped-def]
+            if len(self.rows) % every == 0:
+                assert [(name, one.t) for name, one in others] == [("b", estimate.t)]
+            super().publish(truth, estimate, samples, imu, others, reports)
+
+    estimators = "estimator=[{name='a', aids=['gnss']}, {name='b', aids=[]}]"
+    watcher = Sparse()
+    scenario = Scenario.load("u_turn", ["duration_s=3", estimators, "expect={}", "record.rate_hz=4"])
+    assert run(scenario, links=[watcher]).dataset.identical(run(scenario).dataset)
+    assert len(watcher.rows) == 76
+
+
 def test_gnss_denied_sample_says_so() -> None:
     watcher = Watcher()
     seen: list[GnssSample] = []

@@ -59,6 +59,7 @@ class Station:
     """A link that asks for what its script says, each as soon as it has been shown a row of that time or later."""
 
     asks = True
+    others_every = 1
 
     def __init__(self, script: Sequence[tuple[float, Request]], period_s: float = 0.04) -> None:
         self.script = list(script)

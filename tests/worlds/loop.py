@@ -16,6 +16,7 @@ class Watcher:
     """A link that keeps what it is handed."""
 
     period_s = 0.04
+    others_every = 1
     asks = False
 
     def __init__(self) -> None:
