@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import optimize, signal
 
 from nav._jit import njit
 from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density
@@ -208,6 +207,8 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     longest = max(moving, key=lambda p: p.end - p.start, default=None)
     if longest is None or longest.end - longest.start < LEAST_REST_S:
         return None
+    from scipy import signal  # takes long to load, and a run has no need of it; the same of the one below
+
     part = between(log, imu, longest)
     rate_hz = 1 / float(np.median(imu.dt[part]))
     force = imu.dv[part] / imu.dt[part, None]
@@ -301,7 +302,9 @@ def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
     def misfit(x: Array) -> Array:
         return np.asarray(np.sqrt((v[:, 0] - x[0]) ** 2 + (v[:, 1] - x[1]) ** 2 + v[:, 2] ** 2) - x[2] * air)
 
-    found = optimize.least_squares(misfit, [0.0, 0.0, 1.0], loss="soft_l1")
+    from scipy.optimize import least_squares
+
+    found = least_squares(misfit, [0.0, 0.0, 1.0], loss="soft_l1")
     jacobian = np.asarray(found.jac)
     information = jacobian.T @ jacobian
     variance = 2 * found.cost / flown.sum() * np.linalg.pinv(information)[2, 2]

@@ -298,7 +298,7 @@ def test_the_measurement_matrix_of_eq_35_would_see_the_misalignments() -> None:
     assert isinstance(aid, GnssAid)
     three = np.full(3, 1.0)
     fix = GnssSample(0.0, 0.0, 0.6, 1.9, 1000.0, np.zeros(3), three, three, FixType.FIX_3D, 9, 1.0, 1.0, "gps")
-    here = OperatingPoint(reference, state, state.x[0], (-1, -1), state.P[0])
+    here = OperatingPoint(reference, state, state.x[0], (-1, -1, -1), state.P[0])
     measured = [aid.measure(part, fix, here) for part, _ in aid.parts]
     H = np.vstack([one.H for one in measured if one is not None])
     printed = np.zeros_like(H)
