@@ -63,7 +63,7 @@ class _Timed:
     """A publisher, and the processor time that it takes."""
 
     def __init__(self, publisher: links.Publisher) -> None:
-        self.period_s, self.asks = publisher.period_s, publisher.asks
+        self.period_s, self.others_every, self.asks = publisher.period_s, publisher.others_every, publisher.asks
         self.seconds = 0.0
         self.publish = self._timed(publisher.publish)
         self.requests = self._timed(publisher.requests)
