@@ -304,13 +304,12 @@ class Federated:
         """What becomes of R in what ``monitor`` has just judged: its own policy, then the normalised weight."""
         if self.config.weighting == "none":
             return monitor.policy
-        t = monitor.judged
-        latest = [
-            max((w.suspicion for w in other.monitors.values() if t - w.judged <= RECENT_S), default=math.inf)
-            for other in self.locals
-            if other is not filter_
-        ]
-        suspicions = np.array([monitor.suspicion, *latest])
+        t, latest = monitor.judged, [monitor.suspicion]
+        for other in self.locals:
+            if other is not filter_:
+                recent = [w.suspicion for w in other.monitors.values() if t - w.judged <= RECENT_S]
+                latest.append(max(recent) if recent else math.inf)
+        suspicions = np.array(latest)
         N = float(self.config.normalise(suspicions, np.ones(len(suspicions)))[0])
         if N == 1.0:
             return monitor.policy

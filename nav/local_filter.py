@@ -15,7 +15,17 @@ import numpy as np
 from nav import unscented
 from nav._jit import njit
 from nav.aids.airspeed import AirspeedAid, Silence
-from nav.aids.base import FUSED, OUTSIDE, Aid, Measurement, OperatingPoint, Ruling, aid_blocks, report_on
+from nav.aids.base import (
+    FUSED,
+    OUTSIDE,
+    Aid,
+    AidAtPoints,
+    Measurement,
+    OperatingPoint,
+    Ruling,
+    aid_blocks,
+    report_on,
+)
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
@@ -58,6 +68,7 @@ class LocalFilter:
         self.policies: dict[str, Policy] = {}
         self.fadings: Mapping[str, Fading] = {}
         self.smoother: Smoother | None = None  # told of each update of a closed filter, if there is one
+        self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
         self._silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
@@ -156,6 +167,11 @@ class LocalFilter:
         starts = self._starts[aid.sensor]
         root = unscented.factor(state.P[self.row], CURVED)
         points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
+        if aid.sensor in self._at_points:
+            here = OperatingPoint(reference, state, state.x[self.row], starts, state.P[self.row])
+            found = self._at_points[aid.sensor].at_points(part, sample, here, points)
+            if found is not None:
+                return measurement._replace(at_points=found)
         at_points, there = np.empty((len(points.x), len(measurement.nu))), state.copy()
         for k, (q_nb, v_n, lla, x) in enumerate(zip(*points, strict=True)):
             there.q_nb[:], there.v_n[:], there.lla[:] = q_nb, v_n, lla
@@ -291,22 +307,30 @@ class LocalFilter:
 
         The weight is the mean factor on the information.
         """
-        if policy is None and noise is None and used.all():
-            self.absorb(reference, state, nu, measurement.H, measurement.R, math.inf, measurement.at_points)
+        H, R, at_points = measurement.H, measurement.R, measurement.at_points
+        whole = bool(used.all())
+        if policy is None and noise is None and whole:
+            self.absorb(reference, state, nu, H, R, math.inf, at_points)
             return FUSED
-        R = np.where(used, measurement.R, np.inf)
+        if not whole:
+            R = np.where(used, R, np.inf)
         if policy is not None and used.any():
-            R[used] = policy.adapt(nu[used], S[np.ix_(used, used)], measurement.R[used], t)
+            if whole:
+                R = policy.adapt(nu, S, R, t)
+            else:
+                R[used] = policy.adapt(nu[used], S[np.ix_(used, used)], measurement.R[used], t)
             used = np.isfinite(R)
             if not used.any():
                 return LEFT_OUT
         if noise is not None:
             noise.learn(nu, S - np.diag(measurement.R), R)
-        if used.any():
-            at_points = None if measurement.at_points is None else measurement.at_points[:, used]
-            self.absorb(reference, state, nu[used], measurement.H[used], R[used], math.inf, at_points)
+        if used.all():
+            self.absorb(reference, state, nu, H, R, math.inf, at_points)
+        elif used.any():
+            at_points = None if at_points is None else at_points[:, used]
+            self.absorb(reference, state, nu[used], H[used], R[used], math.inf, at_points)
         reported = measurement.R if measurement.reported is None else measurement.reported
-        weight = float(np.mean(reported / R))
+        weight = float((reported / R).sum()) / len(R)
         return Ruling(Outcome.FUSED if weight >= 1.0 else Outcome.WEAKENED, weight=weight)
 
 

@@ -64,6 +64,10 @@ class State:
         made.take(self)
         return made
 
+    def __deepcopy__(self, memo: object) -> State:
+        """A deep copy of views would be arrays each by itself."""
+        return self.copy()
+
 
 @njit
 def parts(

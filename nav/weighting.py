@@ -151,9 +151,22 @@ def normalised_weights(statistics: Array, thresholds: Array, lower: float = 0.2,
     R_j = R0_j / N_j: see `Weight`. The best sensor keeps its R, and a sensor that is alone is never weakened.
     """
     health = 1.0 - np.asarray(statistics, dtype=float) / thresholds
-    health = np.where(health > lower, health, 0.0)
-    best = health.max(axis=0)
-    return np.where(health < upper, health / np.where(best > 0.0, best, 1.0), 1.0)
+    if health.ndim == 1:
+        return _weights(health, lower, upper)
+    return np.column_stack([_weights(axis, lower, upper) for axis in health.T.copy()])
+
+
+@njit
+def _weights(health: Array, lower: float, upper: float) -> Array:
+    """`normalised_weights` of one axis, from how far each sensor (J,) is from an alarm."""
+    best = 0.0
+    for one in health:
+        if one > lower:
+            best = max(best, one)
+    weights = np.empty(len(health))
+    for j, one in enumerate(health):
+        weights[j] = 1.0 if one >= upper else one / best if one > lower else 0.0
+    return weights
 
 
 @dataclass
@@ -168,8 +181,9 @@ class Weight:
 
     def adapt(self, nu: Array, S: Array, R: Array, t: float) -> Array:
         """See `Policy`."""
-        N = np.broadcast_to(self.N, R.shape)
-        return np.where(N > 0.0, R / np.where(N > 0.0, N, 1.0), np.inf)
+        if isinstance(self.N, float):
+            return R / self.N if self.N > 0.0 else np.full_like(R, np.inf)
+        return np.where(self.N > 0.0, R / np.where(self.N > 0.0, self.N, 1.0), np.inf)
 
 
 @dataclass
@@ -217,26 +231,39 @@ class SageHusa:
         if self.ratio is None or not np.isfinite(used).any():
             return
         left, after = residual(nu, HPH, used)
-        taught = np.isfinite(left)
-        self._taken = self._taken + taught
-        d = (1.0 - self.b) / (1.0 - self.b ** (self._taken + 1.0))
-        latest = left**2 * (self.ratio * self._R / used) + np.diag(after)
-        learned = np.clip((1.0 - d) * self.ratio + d * latest / self._R, R_FLOOR, R_CEILING)
-        self.ratio = np.where(taught, learned, self.ratio)
+        _teach(self.ratio, self._taken, left, after, self._R, used, self.b)
 
 
+@njit
+def _teach(ratio: Array, taken: Array, left: Array, after: Array, R: Array, used: Array, b: float) -> None:
+    """Put a `residual` into what is learned, ``ratio`` (m,) and ``taken`` (m,), in place: see `SageHusa.learn`."""
+    for i in range(len(ratio)):
+        if math.isfinite(left[i]):
+            taken[i] += 1.0
+            d = (1.0 - b) / (1.0 - b ** (taken[i] + 1.0))
+            latest = left[i] ** 2 * (ratio[i] * R[i] / used[i]) + after[i, i]
+            ratio[i] = min(max((1.0 - d) * ratio[i] + d * latest / R[i], R_FLOOR), R_CEILING)
+
+
+@njit
 def residual(nu: Array, HPH: Array, R: Array) -> tuple[Array, Array]:
     """(z - h(x+) (m,), H P+ H' (m, m)) that an update with variances ``R`` (m,) leaves, of a linear measurement.
 
     With S = H P H' + diag(R): R S^-1 nu and R - R S^-1 R. An axis of infinite variance is NaN in the first.
     """
-    kept = np.isfinite(R)
-    rows = np.ix_(kept, kept)
-    left, after = np.full(len(R), np.nan), np.zeros_like(HPH)
-    if kept.any():
-        gain = R[kept, None] * np.linalg.inv(HPH[rows] + np.diag(R[kept]))
-        left[kept] = gain @ nu[kept]
-        after[rows] = np.diag(R[kept]) - gain * R[kept]
+    m, kept = len(R), np.flatnonzero(np.isfinite(R))
+    left, after = np.full(m, math.nan), np.zeros((m, m))
+    S = np.empty((len(kept), len(kept)))
+    for a, i in enumerate(kept):
+        for c, j in enumerate(kept):
+            S[a, c] = HPH[i, j]
+        S[a, a] += R[i]
+    inverse, _ = invert(S)
+    for a, i in enumerate(kept):
+        left[i] = 0.0
+        for c, j in enumerate(kept):
+            left[i] += R[i] * inverse[a, c] * nu[j]
+            after[i, j] = (R[i] if i == j else 0.0) - R[i] * inverse[a, c] * R[j]
     return left, after
 
 
@@ -302,8 +329,21 @@ class Fading:
         self._taken.append(nu)
         if len(self._taken) > self.window:
             self._taken.popleft()
-        rows = np.array(self._taken)
-        distances = np.sum(rows * np.linalg.solve(S, rows.T).T, axis=1)
-        if not distances[-1] > self.alpha * len(nu):
-            return 1.0
-        return max(1.0, float(distances.mean()) / len(nu))
+        last, mean = _distances(np.array(self._taken), S)
+        return max(1.0, mean / len(nu)) if last > self.alpha * len(nu) else 1.0
+
+
+@njit
+def _distances(rows: Array, S: Array) -> tuple[float, float]:
+    """Squared distance nu' S^-1 nu of the last of ``rows`` (N, m), and the mean of all; NaN if S is not positive."""
+    inverse, definite = invert(S)
+    if not definite:
+        return math.nan, math.nan
+    total = last = 0.0
+    for nu in rows:
+        last = 0.0
+        for i in range(len(nu)):
+            for j in range(len(nu)):
+                last += nu[i] * inverse[i, j] * nu[j]
+        total += last
+    return last, total / len(rows)

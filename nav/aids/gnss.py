@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Measurement, OperatingPoint, position_problem, put_skew
 from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
-from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov
+from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross, dcm_from_quat, quat_rotate
 from nav.samples import Array, GnssSample, Sample
+
+if TYPE_CHECKING:
+    from nav.unscented import Points
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 
@@ -119,6 +123,20 @@ class GnssAid:
                 R = R + (self.latency_sigma * acceleration) ** 2
             nu += lag * acceleration
         return Measurement(nu, H, R, unknown)
+
+    def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
+        """See `AidAtPoints`."""
+        assert isinstance(sample, GnssSample)
+        q_nb, v_n, lla, x = points
+        if at.starts[2] >= 0 or self.velocity_lag:
+            return None
+        if part == "gnss_position":
+            return _positions(q_nb, lla, x, self.arm, at.starts[0], sample.lat, sample.lon, sample.h)
+        if part == "gnss_course":
+            return _courses(q_nb, v_n, x, at.starts[3], at.starts[4], sample.v_n)
+        return _velocities(
+            q_nb, v_n, lla, x, at.state.rates[0], at.reference.driven, self.arm, at.starts[1], sample.v_n
+        )  # fmt: skip
 
     def _course(self, sample: GnssSample, at: OperatingPoint) -> Measurement | None:
         assert self.course is not None
@@ -258,3 +276,38 @@ def gnss_course(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int, antenna
             if start >= 0:
                 H[0, start], H[0, start + 1] = -air_e / air2, air_n / air2
     return np.array([wrap_longitude(math.atan2(antenna_v_n[1], antenna_v_n[0]) - predicted)]), H
+
+
+@njit
+def _positions(
+    q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float, lon: float, h: float
+) -> Array:
+    """Innovations (N, 3) of `gnss_position` at N points."""
+    nu = np.empty((len(x), 3))
+    for k in range(len(x)):
+        nu[k] = gnss_position(q_nb[k], lla[k], x[k], arm_b, gnss_position_error, lat, lon, h)[0]
+    return nu
+
+
+@njit
+def _velocities(
+    q_nb: Array, v_n: Array, lla: Array, x: Array, omega_measured_b: Array, driven: Indices, arm_b: Array,
+    gnss_velocity_error: int, antenna_v_n: Array,
+) -> Array:  # fmt: skip
+    """Innovations (N, 3) of `gnss_velocity` at N points."""
+    nu, errors = np.empty((len(x), 3)), np.empty((4, 3))
+    for k in range(len(x)):
+        sensor_errors(errors, x[k], driven)
+        nu[k] = gnss_velocity(
+            q_nb[k], v_n[k], lla[k], x[k], omega_measured_b, errors, driven, arm_b, gnss_velocity_error, antenna_v_n
+        )[0]
+    return nu
+
+
+@njit
+def _courses(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int, antenna_v_n: Array) -> Array:
+    """Innovations (N, 1) of `gnss_course` at N points."""
+    nu = np.empty((len(x), 1))
+    for k in range(len(x)):
+        nu[k] = gnss_course(q_nb[k], v_n[k], x[k], wind, gust, antenna_v_n)[0]
+    return nu

@@ -24,7 +24,7 @@ from nav.rotation import quat_from_euler
 from nav.samples import Array
 from testbed.papers import Job, Paper, flights, scenario
 from testbed.papers.draws import world
-from testbed.papers.flights import Sensed, Track
+from testbed.papers.flights import Flight, Sensed, Track
 from testbed.report.style import COLOURS
 from testbed.results import write_result
 from testbed.scenario import Scenario
@@ -88,21 +88,25 @@ def drive(seed: int, series: bool = False) -> Draw:
     chosen = scenario("cheng2020", keys)
     sensed = Sensed.of(chosen, seed)
     moving = Moving.of(sensed)
-    tracks = {name: _track(chosen, seed, name, sensed, DURATION_S) for name in (IMPROVED, TOLD)}
+    before, after, learned = np.arange(0.0, NOISIER_S), np.arange(NOISIER_S, DURATION_S + 0.5), NOISIER_S + LEARNED_S
+    noisier, _ = sensed.with_faults(scenario("cheng2020", (*keys, f"fault=[{NOISIER}]")), seed)
+    tracks, worse = {}, []
+    for name in (IMPROVED, TOLD):
+        flight = Flight(flights.lanes(chosen, seed)[name], sensed)
+        flight.on(before)
+        other = flight.fork(noisier)
+        flight.on(after)
+        other.on(after[after <= learned])
+        tracks[name] = flight.track()
+        worse.append(other.track())
     others = {UNGATED: FIRST_TURN_S} | ({NO_COURSE: DURATION_S} if series else {})
     tracks |= {name: _track(chosen, seed, name, sensed, duration) for name, duration in others.items()}
-    noisier, _ = sensed.with_faults(scenario("cheng2020", (*keys, f"fault=[{NOISIER}]")), seed)
-    wrong = {
-        "10 times too small": _told(sensed, 1 / WRONG),
-        "10 times too large": _told(sensed, WRONG),
-        "too small by 4 from 350 s on": noisier,
-    }
-    pairs = {how: [_track(chosen, seed, name, one, NOISIER_S + LEARNED_S) for name in (IMPROVED, TOLD)]
-             for how, one in wrong.items()}  # fmt: skip
-    last = pairs["too small by 4 from 350 s on"][0]
+    wrong = {"10 times too small": _told(sensed, 1 / WRONG), "10 times too large": _told(sensed, WRONG)}
+    pairs = {how: [_track(chosen, seed, name, one, learned) for name in (IMPROVED, TOLD)]
+             for how, one in wrong.items()} | {"too small by 4 from 350 s on": worse}  # fmt: skip
     return Draw(
         {name: moving.judged(track) for name, track in tracks.items()},
-        {aid: abs(1 / float(last.looks(aid).weight[-1]) / 4 - 1) for aid in ("gnss_position", "gnss_velocity")},
+        {aid: abs(1 / float(worse[0].looks(aid).weight[-1]) / 4 - 1) for aid in ("gnss_position", "gnss_velocity")},
         {how: np.array([_rms_of(track) for track in pair]).T for how, pair in pairs.items()},
         _straight(seed, here.start),
         _series(tracks, moving) if series else {},
@@ -111,7 +115,7 @@ def drive(seed: int, series: bool = False) -> Draw:
 
 def _track(chosen: Scenario, seed: int, name: str, sensed: Sensed, duration: int) -> Track:
     t = np.arange(0.0, duration + 0.5)
-    return flights.track(flights.lanes(chosen, seed)[name], sensed.until(float(duration)), t)
+    return flights.track(flights.lanes(chosen, seed)[name], sensed, t)
 
 
 def _told(sensed: Sensed, factor: float) -> Sensed:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,9 +47,9 @@ class Sensed:
             },
         )
 
-    def until(self, t: float) -> Sensed:
-        """The samples up to ``t`` [s]."""
-        return Sensed(self.truth, {name: _until(samples, t) for name, samples in self.samples.items()})
+    def between(self, start: float, end: float) -> Sensed:
+        """What arrived after ``start`` and up to ``end`` [s]."""
+        return Sensed(self.truth, {name: _between(one, start, end) for name, one in self.samples.items()})
 
     def with_faults(self, chosen: Scenario, seed: int) -> tuple[Sensed, list[FaultTruth]]:
         """The same with a scenario's faults, and what they are."""
@@ -56,11 +58,12 @@ class Sensed:
         return Sensed(self.truth, found), faults.truth
 
 
-def _until(samples: Any, t: float) -> Any:
+def _between(samples: Any, start: float, end: float) -> Any:
+    start, end = start + accuracy.SAME_TIME_S, end + accuracy.SAME_TIME_S
     if isinstance(samples, ImuSamples):
-        rows = int(np.searchsorted(samples.t, t + accuracy.SAME_TIME_S))
-        return ImuSamples(samples.t[:rows], samples.dt[:rows], samples.dtheta[:rows], samples.dv[:rows])
-    return [sample for sample in samples if sample.t <= t]
+        rows = slice(*np.searchsorted(samples.t, (start, end)))
+        return ImuSamples(samples.t[rows], samples.dt[rows], samples.dtheta[rows], samples.dv[rows])
+    return [sample for sample in samples if start < sample.t_arrival <= end]
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,13 +154,43 @@ def lanes(chosen: Scenario, seed: int) -> dict[str, Lane]:
     return registry.build(chosen.estimator, chosen.rig(seed))
 
 
+class Flight:
+    """An estimator on its way over a flight, begun with what is handed over, if anything is."""
+
+    def __init__(self, lane: Lane, sensed: Sensed) -> None:
+        if lane.handover is not None:
+            lane.start(handed_over(lane.handover, sensed.truth))
+        self._lane, self._sensed = lane, sensed
+        self._now, self._t = -math.inf, np.empty(0)
+        self._reports: list[UpdateReport] = []
+        self._estimates: list[Estimate] = []
+
+    def on(self, t: Array) -> None:
+        """Fly on, with estimates at ``t`` (N,) [s], to the last of them."""
+        now = self._sensed.between(self._now, float(t[-1]))
+        handed = [sample for name in self._lane.sensors for sample in now.samples[name]]
+        reports, estimates = self._lane.horizon.track(self._lane.increments(now.samples)[0], handed, t.tolist())
+        self._now, self._t = float(t[-1]), np.append(self._t, t)
+        self._reports += reports
+        self._estimates += estimates
+
+    def fork(self, sensed: Sensed) -> Flight:
+        """The same up to now, on the way over another flight that was alike so far."""
+        fork = copy(self)
+        fork._lane, fork._sensed = deepcopy(self._lane), sensed
+        fork._reports, fork._estimates = self._reports.copy(), self._estimates.copy()
+        return fork
+
+    def track(self) -> Track:
+        """What came of it so far."""
+        return _errors(self._estimates, self._reports, self._sensed.truth, self._t)
+
+
 def track(lane: Lane, sensed: Sensed, t: Array) -> Track:
-    """An estimator over a whole flight, begun with what is handed over, if anything is; at times ``t`` (N,) [s]."""
-    if lane.handover is not None:
-        lane.start(handed_over(lane.handover, sensed.truth))
-    handed = [sample for name in lane.sensors for sample in sensed.samples[name]]
-    reports, estimates = lane.horizon.track(lane.increments(sensed.samples)[0], handed, t.tolist())
-    return _errors(estimates, reports, sensed.truth, t)
+    """An estimator over a whole flight; at times ``t`` (N,) [s]."""
+    flight = Flight(lane, sensed)
+    flight.on(t)
+    return flight.track()
 
 
 def _errors(

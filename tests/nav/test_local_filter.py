@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from worlds.ins import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
 
-from nav.aids import AirspeedAid, BarometerAid, GnssAid
+from nav.aids import AirspeedAid, BarometerAid, Course, GnssAid
 from nav.aids.base import aid_blocks
 from nav.alignment import InitialState
 from nav.detection import ChiSquare, ChiSquareGate, Decision, Event, Glr
@@ -16,6 +16,7 @@ from nav.ins import Ins, InsConfig
 from nav.local_filter import LocalFilter
 from nav.monitor import Change, Monitor, Patience
 from nav.samples import Outcome
+from nav.unscented import Scaling
 
 
 class Scripted:
@@ -161,3 +162,26 @@ def test_a_watch_passes_on_what_its_detector_says():
     decision, change = watch.judge(np.array([3.4]), np.eye(1), 1.0)
     assert decision.alarm
     assert change is Change.ISOLATED
+
+
+def test_innovations_at_all_points_at_once_are_those_one_by_one():
+    """Position, velocity and course behind a lever arm, to the last bit."""
+    truth = flight(30)
+    rng = np.random.default_rng(5)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    fixes = gnss(truth, rng, 5.0)
+    covariance = np.diag(np.repeat([0.1, 0.5, 3.0], 3) ** 2)
+
+    def flown(at_once):
+        aid = GnssAid(arm_b=(0.5, -0.2, 0.1), position_error_sigma=(1.0, 1.0, 1.0), course=Course())
+        ins = Ins(InsConfig(CONSUMER, (aid,), scaling=Scaling()), lambda *_: FIELD_N)
+        if not at_once:
+            ins._filter._at_points.clear()
+        ins.start(InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0], covariance))
+        estimates, reports = feed(FusionHorizon(ins), increments, [f for f in fixes if f.t < 10])
+        assert {r.aid for r in reports} == {"gnss_position", "gnss_velocity", "gnss_course"}
+        return estimates[10]
+
+    once, each = flown(True), flown(False)
+    for one, other in ((once.v_n, each.v_n), (once.q_nb, each.q_nb), (once.covariance, each.covariance)):
+        np.testing.assert_array_equal(one, other)

@@ -143,7 +143,7 @@ def test_a_wrong_fix_moves_the_robust_filter_by_less_than_a_sigma() -> None:
 
 def test_samples_are_cut_where_the_flight_ends() -> None:
     chosen = flight.placed("zhu2020", 1, "duration_s=320", "expect={}")
-    sensed = flight.until(Sensed.of(chosen, 1), 100.0)
+    sensed = Sensed.of(chosen, 1).between(-np.inf, 100.0)
     assert sensed.samples["imu"].t[-1] == pytest.approx(100.0)
     assert max(sample.t for sample in sensed.samples["ast"]) <= 100.0
 

@@ -20,7 +20,7 @@ from testbed.estimators.federated import FederatedSection
 from testbed.estimators.lane import Lane
 from testbed.papers import flights, scenario
 from testbed.papers.draws import world
-from testbed.papers.flights import KnownFaults, Sensed, Track
+from testbed.papers.flights import Flight, KnownFaults, Sensed, Track
 from testbed.papers.misprints import weights_by_sum
 from testbed.papers.zhou2025.replays import RAMP, STEP, clairvoyant
 from testbed.scenario import Scenario
@@ -66,14 +66,18 @@ def fly(seed: int, series: bool = False) -> dict[str, dict[str, Flown]]:
     chosen = scenario("zhou2025", keys)
     healthy = Sensed.of(chosen, seed)
     t = np.arange(0, chosen.duration_s + 0.5 / RECORD_HZ, 1 / RECORD_HZ)
-    found = {}
-    for case, names in FLOWN.items():
-        sensed, faults = healthy, list[FaultTruth]()
-        if case != HEALTHY:
-            sensed, faults = healthy.with_faults(scenario("zhou2025", (*keys, *CASES[case])), seed)
-        found[case] = {
-            name: _flown(flights.track(built(chosen, seed, name), sensed, t), faults, series) for name in names
-        }
+    found: dict[str, dict[str, Flown]] = {case: {} for case in FLOWN}
+    faulty = {case: healthy.with_faults(scenario("zhou2025", (*keys, *CASES[case])), seed) for case in CASES}
+    for name in FLOWN[HEALTHY]:
+        found[HEALTHY][name] = _flown(flights.track(built(chosen, seed, name), healthy, t), [], series)
+    for name in FLOWN[STEEP]:  # all of them; both cases are alike until their ramps begin
+        flight = Flight(built(chosen, seed, name), faulty[STEEP][0])
+        flight.on(t[t < RAMP[0]])
+        for case in (case for case in CASES if name in FLOWN[case]):
+            sensed, faults = faulty[case]
+            fork = flight.fork(sensed)
+            fork.on(t[t >= RAMP[0]])
+            found[case][name] = _flown(fork.track(), faults, series)
     return found
 
 
@@ -95,12 +99,12 @@ def built(chosen: Scenario, seed: int, name: str) -> Lane:
 
 
 def _flown(track: Track, faults: Sequence[FaultTruth], series: bool) -> Flown:
+    looks = track.by_sensor
     scores = {
-        fault.name: score.detection
-        for fault, score in zip(faults, detection.score_faults(faults, track.by_sensor), strict=True)
+        fault.name: score.detection for fault, score in zip(faults, detection.score_faults(faults, looks), strict=True)
     }
     step, ramp = scores.get("hard_north"), scores.get("soft_north")
-    gnss = track.by_sensor["gnss"]
+    gnss = looks["gnss"]
     error = track.position[:, :2]
     return Flown(
         rmse=np.sqrt(np.mean(error**2, axis=0)),

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from nav.detection import chi_square_threshold
 from nav.federated import Federated
 from nav.fusion import Weigh, weights_by_covariance
-from nav.samples import Array, ImuSamples
+from nav.samples import Array
 from nav.weighting import inflation
 from testbed.estimators import federated
 from testbed.estimators.lane import Lane
@@ -125,7 +125,6 @@ def others(chosen: Scenario, seed: int) -> dict[str, Lane]:
 def navigate(chosen: Scenario, seed: int, lanes: Mapping[str, Lane], end_s: float) -> dict[str, Flown]:
     """Each estimator up to ``end_s``, all of them on the same samples and from the same start."""
     sensed, _ = Sensed.of(chosen, seed).with_faults(chosen, seed)
-    sensed = until(sensed, end_s)
     outliers = OUTLIERS[end_s > OUTLIERS] if chosen.fault else np.empty(0)
     regular = np.arange(EVERY_S, end_s + 0.5, EVERY_S)
     t = np.unique(np.concatenate([regular, outliers, outliers - 1 / RATE_HZ]))
@@ -137,18 +136,6 @@ def navigate(chosen: Scenario, seed: int, lanes: Mapping[str, Lane], end_s: floa
         step = np.abs(error[at] - error[at - 1]) / track.sigma[at]
         found[name] = Flown(regular, error[often], step)
     return found
-
-
-def until(sensed: Sensed, end_s: float) -> Sensed:
-    """Samples up to ``end_s`` [s]; truth goes on."""
-
-    def cut(samples: Any) -> Any:
-        if isinstance(samples, ImuSamples):
-            stop = int(np.searchsorted(samples.t, end_s + 1e-6))
-            return ImuSamples(samples.t[:stop], samples.dt[:stop], samples.dtheta[:stop], samples.dv[:stop])
-        return [sample for sample in samples if sample.t_arrival <= end_s]
-
-    return Sensed(sensed.truth, {name: cut(samples) for name, samples in sensed.samples.items()})
 
 
 def weights(lane: Lane) -> dict[str, float]:
