@@ -49,6 +49,7 @@ ALONE = {
     "--realtime": (r"[-+]?(\d*\.?\d*(e[-+]?\d+)?|nan|inf)", "1"),
     "--px4": (r"\w+:.*", "tcpin:127.0.0.1:4560"),
     "--ardupilot": (r"\w+:.*", "udpin:127.0.0.1:9002"),
+    "--gps-input": (r"\w+:.*", "udpin:127.0.0.1:14551"),
 }
 
 app = typer.Typer(

@@ -179,6 +179,7 @@ print("slow:", sorted({"matplotlib", "scipy.signal", "scipy.stats", "scipy.spati
         (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-identity", "apm"], "choose from px4, ardupilot"),
         (["run", "u_turn", "--mavlink", "udpout:127.0.0.1:99999"], "testbed: udpout:127.0.0.1:99999: no port number"),
         (["run", "u_turn", "--mavlink-readonly"], "testbed: --mavlink-readonly: there is no link: add --mavlink URL"),
+        (["run", "u_turn", "--gps-input"], "testbed: --gps-input: is for ArduPilot: add --ardupilot"),
         (["run", "u_turn", "--bogus"], "No such option"),
         (["run"], "Missing argument"),
         (["check", "u_turn", "uturn"], "testbed: uturn: no such file"),

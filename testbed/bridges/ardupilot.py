@@ -4,8 +4,9 @@ ArduPilot sends a packet of servo outputs per frame over UDP and waits for one l
 sample of the first IMU, when the packet of the next frame has come, and until then the run waits. What is ours in it:
 ``imu`` (gyro and accel_body, with all errors of the scenario), and ``airspeed`` where there is a sensor. ``position``
 (from the first place, NED), ``velocity`` and ``attitude`` are truth: of these ArduPilot makes GNSS, magnetometer and
-barometer of its own. What the servos say moves nothing here, unless ArduPilot is to fly: then from its first throttle
-above `STARTED_US` on channels 1 to 4 are aileron, elevator, throttle and rudder, a packet old when they move.
+barometer of its own; our fixes can go to its MAVLink beside (`testbed.bridges.gps_input`). What the servos say moves
+nothing here, unless ArduPilot is to fly: then from its first throttle above `STARTED_US` on channels 1 to 4 are
+aileron, elevator, throttle and rudder, a packet old when they move.
 
 A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
 earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
@@ -21,7 +22,7 @@ import json
 import socket
 import struct
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -29,9 +30,10 @@ from nav.earth import position_difference_n
 from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, Estimate
 from testbed.bridges.address import address, bound
+from testbed.bridges.gps_input import GpsInput
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
-from testbed.feeds.bridged import Surfaces
+from testbed.feeds.bridged import OURS, THEIRS, Surfaces
 from testbed.feeds.feed import Turn
 
 DEFAULT = "udpin:127.0.0.1:9002"
@@ -50,11 +52,27 @@ class ArduPilot:
     estimators: Collection[str] = ()
 
     def __init__(
-        self, url: str = DEFAULT, *, flies: bool = False, connect_s: float = CONNECT_S, answer_s: float = ANSWER_S
+        self,
+        url: str = DEFAULT,
+        *,
+        flies: bool = False,
+        fixes: GpsInput | None = None,
+        connect_s: float = CONNECT_S,
+        answer_s: float = ANSWER_S,
     ) -> None:
-        """Wait for ArduPilot's first packet. Raises UserError when the address is none, is taken, or nobody comes."""
+        """Wait for ArduPilot's first packet; ``fixes`` are sent there, and closed at the end.
+
+        Raises UserError when the address is none, is taken, or nobody comes.
+        """
         self.failure, self.answered = "", 0
-        self.flies = flies
+        self.flies, self._fixes = flies, fixes
+        self.sensors: Mapping[str, str] = {
+            "imu": OURS,
+            "airspeed": OURS,
+            "gnss": OURS if fixes is not None else THEIRS,
+            "magnetometer": THEIRS,
+            "barometer": THEIRS,
+        }
         self.surfaces: Surfaces | None = None
         self._started = False
         self._answer_s = answer_s
@@ -68,7 +86,7 @@ class ArduPilot:
         self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
         self._next = self._heard(time.monotonic() + connect_s)
         if self._next is None:
-            self._socket.close()
+            self.close()
             raise UserError(f"{url}: no ArduPilot has called within {connect_s:g} s: start it with --model JSON")
 
     def follow(self, turn: Turn) -> None:
@@ -82,8 +100,10 @@ class ArduPilot:
         return iter(())
 
     def close(self) -> None:
-        """Close the port."""
+        """Close the port, and the link for fixes."""
         self._socket.close()
+        if self._fixes is not None:
+            self._fixes.close()
 
     def _answer(self, step: Step) -> None:
         frame, self._next = self._next, None
@@ -93,6 +113,9 @@ class ArduPilot:
             self.failure = self.failure or f"ArduPilot has sent no frame for {self._answer_s:g} s at {step.t:.3f} s"
             return
         self._take(self._servos)
+        if self._fixes is not None:
+            self._fixes.tell(step)
+            self.failure = self.failure or self._fixes.failure
         self._frame, self._line = frame, self.line(step)
         self._reply()
         self.answered += 1

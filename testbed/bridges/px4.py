@@ -37,7 +37,7 @@ from testbed.bridges.address import address, bound
 from testbed.bridges.listener import Listener
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
-from testbed.feeds.bridged import Surfaces
+from testbed.feeds.bridged import OURS, Surfaces
 from testbed.feeds.feed import Turn
 from testbed.mavlink.encode import Encoder, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.receive import Message, Reader
@@ -61,6 +61,7 @@ class Px4:
     """
 
     name = "PX4"
+    sensors: Mapping[str, str] = dict.fromkeys(("imu", "gnss", "magnetometer", "barometer", "airspeed"), OURS)
 
     def __init__(
         self,

@@ -28,6 +28,7 @@ from testbed.errors import UserError
 from testbed.results import METRICS, RECORD, REPORT, require_own
 
 if TYPE_CHECKING:
+    from testbed.bridges.gps_input import GpsInput
     from testbed.feeds.bridged import FarEnd
     from testbed.loop.links import Publisher
     from testbed.loop.loop import RunResult
@@ -63,6 +64,12 @@ Px4Address = Annotated[
 ArduPilotAddress = Annotated[
     str | None, typer.Option("--ardupilot", metavar="[URL]", help="Let ArduPilot follow it; it calls udpin:HOST:PORT.")
 ]
+GpsInputAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--gps-input", metavar="[URL]", help="With --ardupilot: send our fixes to its MAVLink there, as GPS_INPUT."
+    ),
+]
 Pilot = Annotated[
     bool, typer.Option("--pilot", help="With --px4 or --ardupilot: let it fly, in place of the plan, once it is armed.")
 ]
@@ -86,6 +93,7 @@ def run(
     estimator: Shown = None,
     px4: Px4Address = None,
     ardupilot: ArduPilotAddress = None,
+    gps_input: GpsInputAddress = None,
     pilot: Pilot = False,
     realtime: Realtime = None,
     report: Report = True,
@@ -123,7 +131,7 @@ def run(
             readonly=mavlink_readonly,
             key=mavlink_key,
         )
-        far_end = _far_end(loaded, px4, ardupilot, pilot)
+        far_end = _far_end(loaded, px4, ardupilot, gps_input, pilot)
         result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
         conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
@@ -194,14 +202,16 @@ def _connect(
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
 
-def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None, flies: bool) -> FarEnd | None:
+def _far_end(
+    scenario: Scenario, px4: str | None, ardupilot: str | None, gps_input: str | None, flies: bool
+) -> FarEnd | None:
     """The autopilot that is to follow the run, once it is there; None when there is to be none."""
+    if gps_input is not None and ardupilot is None:
+        raise UserError("--gps-input: is for ArduPilot: add --ardupilot, or leave it out")
     if px4 is None and ardupilot is None:
         if flies:
             raise UserError("--pilot: there is no autopilot: add --px4 or --ardupilot, or leave it out")
         return None
-    from testbed.bridges.ardupilot import ArduPilot
-    from testbed.bridges.px4 import Px4
     from testbed.estimators.px4 import Px4Section
     from testbed.sensors.imu import ImuConfig
 
@@ -210,12 +220,28 @@ def _far_end(scenario: Scenario, px4: str | None, ardupilot: str | None, flies: 
     if not any(isinstance(section, ImuConfig) for section in scenario.sensors.values()):
         raise UserError("--px4, --ardupilot: an autopilot lives on inertial samples: add [sensors.imu]")
     if px4 is not None:
+        from testbed.bridges.px4 import Px4
+
         remark(f"waiting for PX4 on {px4}")
         theirs = {one.name: one.address for one in scenario.estimator if isinstance(one, Px4Section)}
         return Px4(px4, flies=flies, estimators=theirs)
     assert ardupilot is not None
+    from testbed.bridges.ardupilot import ArduPilot
+
+    fixes = None if gps_input is None else _fixes(scenario, gps_input)
     remark(f"waiting for ArduPilot on {ardupilot}")
-    return ArduPilot(ardupilot, flies=flies)
+    return ArduPilot(ardupilot, flies=flies, fixes=fixes)
+
+
+def _fixes(scenario: Scenario, url: str) -> GpsInput:
+    """Where the fixes of the scenario's receivers go."""
+    from testbed.bridges.gps_input import GpsInput
+    from testbed.sensors.gnss import GnssConfig
+
+    receivers = [name for name, section in scenario.sensors.items() if isinstance(section, GnssConfig)]
+    if not receivers:
+        raise UserError("--gps-input: the scenario has no receiver whose fixes could be sent: add [sensors.gnss]")
+    return GpsInput(url, receivers, scenario.date)
 
 
 def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: Any) -> RunResult:

@@ -9,7 +9,6 @@ Sources: LogStructure.h of AP_Logger, AP_GPS, AP_InertialSensor, AP_Compass, AP_
 
 from __future__ import annotations
 
-import datetime as dt
 import struct
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -22,6 +21,7 @@ from nav.samples import Array
 from testbed.exports.stream import Bytes, Rows, Stamps, in_order, stamps
 from testbed.exports.view import Columns, View, carried, fixed
 from testbed.score.accuracy import euler
+from testbed.sensors.gnss import GPS_EPOCH, LEAP_S, WEEK_S
 
 if TYPE_CHECKING:
     import xarray
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 HEAD = b"\xa3\x95"
 FIRST_NUMBER = 128  # of messages; FMT has it
 GAUSS, FREEZING = 1e-4, 273.15  # [T], [K]
-GPS_EPOCH, LEAP_S, WEEK_S = dt.datetime(1980, 1, 6, tzinfo=dt.UTC), 18, 604_800
 NONE, FIX_3D = 1, 3  # fixes, as ArduPilot counts them
 
 # Letters of a format: how the number is stored, and by what it is multiplied first.

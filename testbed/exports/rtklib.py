@@ -13,11 +13,11 @@ import numpy as np
 
 from testbed.exports.track import TRUTH, Track, tracks
 from testbed.exports.view import View
+from testbed.sensors.gnss import LEAP_S
 
 if TYPE_CHECKING:
     import xarray
 
-LEAP_S = 18  # GPS time is so far ahead of UTC
 FIX, SINGLE = 1, 5
 HEAD = """% program   : navigation-testbed
 % inp file  : {title}: {name}

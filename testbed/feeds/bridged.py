@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 from nav.samples import Estimate
 from testbed.feeds.feed import Feed, Turn
+
+OURS, THEIRS = "ours", "theirs"  # whose samples of a kind of sensor a far end has
 
 
 class Surfaces(NamedTuple):
@@ -24,7 +27,8 @@ class FarEnd(Protocol):
 
     ``name`` is what it is called. ``failure`` is why it no longer answers, empty as long as it does. ``flies`` says
     whether it is to move the aircraft; then ``surfaces`` are what it commands, None as long as it does not.
-    ``estimators`` are the names of those of the scenario that run in it.
+    ``estimators`` are the names of those of the scenario that run in it. ``sensors`` says of each kind whether it is
+    told ours, where the scenario has one, or makes its own.
     """
 
     name: str
@@ -32,6 +36,7 @@ class FarEnd(Protocol):
     flies: bool
     surfaces: Surfaces | None
     estimators: Collection[str]
+    sensors: Mapping[str, str]
 
     def follow(self, turn: Turn) -> None:
         """Tell it of a turn, and hear its answers; waits for them. Sets ``failure`` in place of raising anything."""
@@ -46,14 +51,25 @@ class FarEnd(Protocol):
         ...
 
 
+def told_of(far_end: FarEnd) -> str:
+    """What a record says of a far end: an object of JSON, with the names of `FarEnd`'s own fields."""
+    one = far_end
+    return json.dumps({"name": one.name, "flies": one.flies, "failure": one.failure, "sensors": dict(one.sensors)})
+
+
 class Bridged:
     """A feed that a far end follows (`testbed.feeds.feed.Feed`); it ends when that no longer answers."""
 
     def __init__(self, feed: Feed, far_end: FarEnd) -> None:
-        self.rate_hz, self.source, self.origin = feed.rate_hz, feed.source, feed.origin
+        self.rate_hz, self.source = feed.rate_hz, feed.source
         self.faults, self.receptions = feed.faults, feed.receptions
         self._feed, self._far_end = feed, far_end
         self._last: Turn | None = None
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """That of the feed, and who follows it."""
+        return self._feed.origin | {"far_end": told_of(self._far_end)}
 
     @property
     def motion_s(self) -> float:

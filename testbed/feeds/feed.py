@@ -30,14 +30,18 @@ class Turn(NamedTuple):
 
 class Feed(Protocol):
     """A source of turns. ``faults``, ``receptions`` (by receiver) and ``source`` are what requests act on
-    (`testbed.loop.requests`); ``origin`` is what a record says of a reference that is no truth, by attribute.
+    (`testbed.loop.requests`).
     """
 
     rate_hz: float
     faults: Faults
     receptions: dict[str, Reception]
     source: MotionSource
-    origin: dict[str, str]
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What a record says, by attribute, of a reference that is no truth and of a far end."""
+        ...
 
     @property
     def motion_s(self) -> float:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
-from testbed.feeds.bridged import FarEnd
+from testbed.feeds.bridged import FarEnd, told_of
 from testbed.feeds.feed import Turn, join
 from testbed.feeds.simulated import Simulated
 from testbed.motion.table import MotionSource, TruthBlock
@@ -37,13 +37,18 @@ class Piloted:
 
     def __init__(self, simulated: Simulated, source: Movable, far_end: FarEnd, imu_hz: float) -> None:
         self.rate_hz, self.source = simulated.rate_hz, simulated.source
-        self.faults, self.receptions, self.origin = simulated.faults, simulated.receptions, simulated.origin
+        self.faults, self.receptions = simulated.faults, simulated.receptions
         self.motion_s = 0.0
         self._simulated, self._movable, self._far_end = simulated, source, far_end
         self._every = max(1, round(self.rate_hz / imu_hz))  # ticks from sample to sample
         self._tick = 0
         self._events: list[tuple[float, str, str]] = []
         self._taken_over = False
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """Who flies."""
+        return self._simulated.origin | {"far_end": told_of(self._far_end)}
 
     @property
     def failure(self) -> str:

@@ -332,6 +332,7 @@ class _Passage:
             remarks.append(unflown)
         remarks += [f"{name} has ended: {self.lanes[name].failure}" for name in self.lanes if name in self.ended]
         self.director.conclude(end)
+        self.recorder.attributes |= self.feed.origin  # with why a far end failed
         if self.director.pacer is not None and self.director.pacer.missed:
             remarks.append(str(self.director.pacer))
         return remarks

@@ -7,6 +7,7 @@ late. Of an uncertain latency the stamp is off by one draw of a run, and velocit
 
 from __future__ import annotations
 
+import datetime
 import math
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -26,6 +27,8 @@ from testbed.sensors.grades import with_grade
 from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
 
+GPS_EPOCH, WEEK_S = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC), 604_800  # of GPS time
+LEAP_S = 18  # that GPS time is ahead of UTC, since 2017
 NO_FIX_DOP = 99.99  # what receivers report when they have none
 REPORTED_AT_LEAST = 1e-3  # accuracy is reported in whole millimetres, never as none at all [m], [m/s]
 SATELLITES_SIGMA = 1.0  # how the number in view comes and goes

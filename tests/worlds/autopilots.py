@@ -278,3 +278,27 @@ class ArduPilot(threading.Thread):
             link.sendto(b"", there)
         for _ in range(again):
             link.sendto(packet, there)
+
+
+class Ear:
+    """ArduPilot's MAVLink: keeps the GPS_INPUT that it is sent at `url`."""
+
+    def __init__(self) -> None:
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._link.bind(("127.0.0.1", 0))
+        self._link.setblocking(False)
+        self.url = f"udpout:127.0.0.1:{self._link.getsockname()[1]}"
+
+    def speak(self, port: int) -> None:
+        """A heartbeat to somebody who listens."""
+        own = mav.MAVLink(None, srcSystem=1, srcComponent=1)
+        said = own.heartbeat_encode(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 0, 0, 0)
+        self._link.sendto(said.pack(own), ("127.0.0.1", port))
+
+    def heard(self) -> list[Any]:
+        """What it was sent, by pymavlink's own parser; it hears no more."""
+        parser, messages = mav.MAVLink(None), []
+        with self._link, contextlib.suppress(BlockingIOError):
+            while True:
+                messages += parser.parse_buffer(self._link.recv(4096)) or []
+        return messages
