@@ -33,8 +33,8 @@ from testbed.bridges.address import address, bound
 from testbed.bridges.gps_input import GpsInput
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
-from testbed.feeds.bridged import OURS, THEIRS, Surfaces
-from testbed.feeds.feed import Turn
+from testbed.feeds.bridged import OURS, THEIRS
+from testbed.feeds.feed import Surfaces, Turn
 
 DEFAULT = "udpin:127.0.0.1:9002"
 CONNECT_S, ANSWER_S = 120.0, 10.0  # of wall time

@@ -37,8 +37,8 @@ from testbed.bridges.address import address, bound
 from testbed.bridges.listener import Listener
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
-from testbed.feeds.bridged import OURS, Surfaces
-from testbed.feeds.feed import Turn
+from testbed.feeds.bridged import OURS
+from testbed.feeds.feed import Surfaces, Turn
 from testbed.mavlink.encode import Encoder, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.receive import Message, Reader
 

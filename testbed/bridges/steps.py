@@ -10,8 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from nav.samples import Array, Sample
-from testbed.feeds.bridged import Surfaces
-from testbed.feeds.feed import Turn
+from testbed.feeds.feed import Surfaces, Turn
 from testbed.motion.table import TruthBlock
 
 S = TypeVar("S", bound=Sample)

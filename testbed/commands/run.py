@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -104,18 +104,11 @@ def run(
     A record is run again with everything that was asked of it, bit for bit; --seed and --set make another run of it,
     of which the same is asked at the same times.
     """
-    from testbed.feeds.build import located
-    from testbed.scenario import Scenario
-
     if realtime is not None and not (math.isfinite(realtime) and realtime > 0):
         raise UserError(f"--realtime {realtime:g}: the factor must be above 0, such as 1 for wall-clock time")
-    replay: Sequence[tuple[float, Recorded]] = ()
-    if scenario.endswith(".nc"):
-        loaded, folder, recorded_seed, replay = _again(Path(scenario), overrides or [])
-        seed = recorded_seed if seed is None else seed
-    else:
-        loaded, folder = Scenario.load(scenario, overrides or ()), RUNS / Path(scenario).stem
-    loaded = located(loaded)
+    loaded, folder, seed, replay, flown = _flight(scenario, overrides or [], seed, anew=pilot)
+    if flown is not None and (px4 or ardupilot or gps_input):
+        raise UserError(f"{scenario}: {flown.name} flew it: add --pilot to have it flown anew, or let nobody follow")
     folder = out or folder
     if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
@@ -131,15 +124,39 @@ def run(
             readonly=mavlink_readonly,
             key=mavlink_key,
         )
-        far_end = _far_end(loaded, px4, ardupilot, gps_input, pilot)
+        far_end = flown or _far_end(loaded, px4, ardupilot, gps_input, pilot)
         result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
         conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
 
 
-def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, int, list[tuple[float, Recorded]]]:
-    """Scenario, folder, seed and requests for running a record again."""
+class _Flight(NamedTuple):
+    """What is to be run: scenario, folder of its results, seed if not the scenario's; what was asked, and who flew."""
+
+    scenario: Scenario
+    folder: Path
+    seed: int | None
+    replay: Sequence[tuple[float, Recorded]] = ()
+    flown: FarEnd | None = None
+
+
+def _flight(name: str, overrides: Sequence[str], seed: int | None, *, anew: bool) -> _Flight:
+    """A scenario, or a record; ``anew``: whoever flew that is not to do so again."""
+    from testbed.feeds.build import located
+    from testbed.scenario import Scenario
+
+    if name.endswith(".nc"):
+        found = _again(Path(name), overrides, anew)
+        found = found if seed is None else found._replace(seed=seed)
+    else:
+        found = _Flight(Scenario.load(name, overrides), RUNS / Path(name).stem, seed)
+    return found._replace(scenario=located(found.scenario))
+
+
+def _again(run_file: Path, overrides: Sequence[str], anew: bool) -> _Flight:
+    """A record that is to be run again."""
+    from testbed.feeds.played import played
     from testbed.loop import director
     from testbed.record import format1
     from testbed.record.reader import load, scenario_of
@@ -153,6 +170,7 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
     try:
         scenario = scenario_of(dataset, overrides)
+        flown = None if anew else played(dataset)
     except UserError as error:
         raise UserError(f"{run_file}: {error}") from None
     other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
@@ -161,9 +179,10 @@ def _again(run_file: Path, overrides: Sequence[str]) -> tuple[Scenario, Path, in
     if said["format"] == format1.FORMAT:
         remark(f"{run_file}: is of format {said['format']!r}: {format1.CHANGED}")
     if not said["complete"]:
-        remark(f"{run_file}: ends early; the rerun goes on to the scenario's end")
+        ends = "goes on to the scenario's end" if flown is None else "ends where its commands do"
+        remark(f"{run_file}: ends early; the rerun {ends}")
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
-    return scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario)
+    return _Flight(scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario), flown)
 
 
 def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) -> None:

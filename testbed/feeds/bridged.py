@@ -5,21 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from nav.samples import Estimate
-from testbed.feeds.feed import Feed, Turn
+from testbed.feeds.feed import Feed, Surfaces, Turn
 
 OURS, THEIRS = "ours", "theirs"  # whose samples of a kind of sensor a far end has
-
-
-class Surfaces(NamedTuple):
-    """What moves an aircraft: shares of travel (-1 to 1) with the signs of recorded controls, and throttle (0 to 1)."""
-
-    aileron: float
-    elevator: float
-    rudder: float
-    throttle: float
 
 
 class FarEnd(Protocol):

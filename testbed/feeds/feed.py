@@ -16,16 +16,34 @@ from testbed.sensors.faults import Faults
 from testbed.sensors.gnss import Reception
 
 
+class Surfaces(NamedTuple):
+    """What moves an aircraft: shares of travel (-1 to 1) with the signs of recorded controls, and throttle (0 to 1)."""
+
+    aileron: float
+    elevator: float
+    rudder: float
+    throttle: float
+
+
+class Steered(NamedTuple):
+    """What a far end commands from ``t`` [s] on, None as long as it leaves the plan to be flown."""
+
+    t: float
+    surfaces: Surfaces | None
+
+
 class Turn(NamedTuple):
     """What came of some ticks: the reference, increments by IMU, and the samples by aiding sensor.
 
     ``tracked`` is what those estimators made of it that the motion itself follows; the others run in the loop.
+    ``steered`` is what a far end commanded that is to fly, at each of its steps.
     """
 
     reference: TruthBlock
     imu: Mapping[str, ImuSamples]
     samples: Mapping[str, Sequence[Sample]]
     tracked: Mapping[str, Tracked] = {}
+    steered: Sequence[Steered] = ()
 
 
 class Feed(Protocol):
@@ -97,6 +115,7 @@ def join(turns: Sequence[Turn]) -> Turn:
             )
             for name in first.tracked
         },
+        [one for turn in turns for one in turn.steered],
     )
 
 

@@ -12,11 +12,17 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from testbed.feeds.bridged import FarEnd, told_of
-from testbed.feeds.feed import Turn, join
+from testbed.feeds.feed import Steered, Turn, join
 from testbed.feeds.simulated import Simulated
 from testbed.motion.table import MotionSource, TruthBlock
 
+TAKES_OVER = "{} flies from here on"
 NEVER_FLOWN = "the plan was flown to the end: {} never took over"
+
+
+def is_step(turn: Turn) -> bool:
+    """Whether a sample of the first IMU came of it; the loop may ask for less than the ticks from one to the next."""
+    return len(next(iter(turn.imu.values()), ())) > 0
 
 
 @runtime_checkable
@@ -66,21 +72,24 @@ class Piloted:
             if not len(block):
                 break
             turn = Turn(block, *self._simulated.sense(block))
-            turns.append(turn)
             done += len(block)
             self._tick += len(block)
             self._far_end.follow(turn)
-            self._obey(float(block.t[-1]))
+            turns.append(turn._replace(steered=self._obey(turn)))
         return join(turns) if turns else Turn(TruthBlock.empty(self._tick, 0), {}, {})
 
-    def _obey(self, t: float) -> None:
+    def _obey(self, turn: Turn) -> Sequence[Steered]:
+        """Let it move the surfaces; what it commands, where the turn was a step to it."""
+        t, surfaces = float(turn.reference.t[-1]), self._far_end.surfaces
         if self._far_end.failure:
             self._movable.give_up(self._far_end.failure)
-        elif self._far_end.surfaces is not None:
-            self._movable.move(*self._far_end.surfaces)
+            return ()
+        if surfaces is not None:
+            self._movable.move(*surfaces)
             if not self._taken_over:
-                self._events.append((t, "info", f"{self._far_end.name} flies from here on"))
+                self._events.append((t, "info", TAKES_OVER.format(self._far_end.name)))
             self._taken_over = True
+        return (Steered(t, surfaces),) if is_step(turn) else ()
 
     def activity(self) -> str:
         """What the motion is doing."""

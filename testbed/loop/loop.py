@@ -277,6 +277,7 @@ class _Passage:
             self.recorder.imu(name, increments)
         for name, own in turn.samples.items():
             self.recorder.samples(name, own)
+        self.recorder.steered(turn.steered)
 
     def _hand_out(
         self, turn: Turn, tracked: Mapping[str, Tracked], now: Sequence[tuple[str, Estimate]], k: int

@@ -237,6 +237,19 @@ FAULT = {
     "unit": Variable("", "unit of size", dtype="S16"),
 }
 
+STEERED = {
+    "surfaces": Variable(
+        "1",
+        "what a far end commands from now on: shares of travel with the signs of controls, throttle 0 to 1",
+        ("surface",),
+    ),
+    "flies": Variable(
+        "1",
+        "whether that moves the aircraft: 0 as long as the plan is flown, -1 where nothing was written",
+        dtype="i1",
+    ),
+}
+
 REQUEST = {
     "tick": Variable("1", "number of the first row that it had to do with", dtype="<i8"),
     "kind": Variable("", "what was asked", dtype="S8"),

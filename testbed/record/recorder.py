@@ -133,6 +133,11 @@ class Recorder:
         if faults:
             self._table("faults", tables.pack_faults).objects.extend(faults)
 
+    def steered(self, steps: Sequence[tuple[float, Sequence[float] | None]]) -> None:
+        """Take what a far end commanded that is to fly: time and surfaces, None where it did not, of each step."""
+        if steps:
+            self._table("far_end", tables.pack_steered).objects.extend(steps)
+
     def request(self, t: float, tick: int, kind: str, content: str) -> None:
         """Note what somebody asked of the run, at once if there is a file: a run that is killed can be repeated."""
         self._table("requests", tables.pack_requests).objects.append((t, tick, kind, content))

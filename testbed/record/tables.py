@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from nav.samples import Estimate, Sample, UpdateReport
-from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, Variable, extra_state
+from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
 
 if TYPE_CHECKING:
     from testbed.sensors.faults import FaultTruth
@@ -215,6 +215,17 @@ def pack_faults(faults: Sequence[FaultTruth]) -> tuple[Block, dict[str, Variable
         text = variable.dtype.startswith("S")
         block[name] = _text([getattr(f, name) for f in faults], variable.dtype) if text else _scalars(faults, name)
     return block, FAULT
+
+
+def pack_steered(steps: Sequence[tuple[float, Sequence[float] | None]]) -> tuple[Block, dict[str, Variable]]:
+    """Steps of a far end that is to fly: time, and the surfaces that it commands, None while it does not."""
+    unknown = (math.nan,) * 4
+    block: Block = {
+        "time": np.array([t for t, _ in steps]),
+        "surfaces": np.array([unknown if surfaces is None else surfaces for _, surfaces in steps]),
+        "flies": np.array([surfaces is not None for _, surfaces in steps], STEERED["flies"].dtype),
+    }
+    return block, STEERED
 
 
 def pack_requests(requests: Sequence[tuple[float, int, str, str]]) -> tuple[Block, dict[str, Variable]]:
