@@ -505,11 +505,12 @@ def record_format() -> str:
 
 
 def export_formats() -> str:
-    """What a record can be turned into."""
+    """What a record can be turned into, and a scenario."""
+    from testbed.bridges.files import FILES
     from testbed.exports import FORMATS
 
     rows = []
-    for one in FORMATS.values():
+    for one in (*FORMATS.values(), *FILES.values()):
         extra = f" (extra `{one.extra}`)" if one.extra else ""
         rows.append((f"`{one.name}`", one.holds + extra, one.readers))
     return _table(("format", "what is in it", "who reads it"), rows)

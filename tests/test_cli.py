@@ -192,6 +192,8 @@ print("slow:", sorted({"matplotlib", "scipy.signal", "scipy.stats", "scipy.spati
         (["report", "."], "testbed: .: is a folder"),
         (["export", "none.nc", "--format", "csv"], "testbed: none.nc: no such file"),
         (["export", "none.nc", "--format", "xls"], 'there is no format "xls"'),
+        (["export", "u_turn", "--format", "kml"], "testbed: u_turn: no such file"),
+        (["export", "kinematic_u_flight", "--format", "wpl"], "there is no plan that an autopilot could fly"),
         (["campaign", "u_turn", "--runs", "0"], "--runs"),
         (["campaign", "u_turn", "--runs", "2", "--vary", "seed"], "testbed: --vary seed: give it as key=a,b,c"),
         (["campaign", "u_turn", "--runs", "2", "--set", "sed=3"], "(--set sed=3): sed: unknown key"),

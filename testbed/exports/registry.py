@@ -108,7 +108,7 @@ def export(run_file: Path, format: str, out: Path | None = None, force: bool = F
     except UserError as error:
         raise UserError(f"{run_file}: {error}") from None
     if isinstance(content, bytes):
-        _write_one(target, content, force)
+        write_one(target, content, force)
     else:
         _write_many(target, content, force)
     return target
@@ -120,7 +120,8 @@ def _content(module: object, one: Format, tree: xarray.DataTree) -> bytes:
     return content
 
 
-def _write_one(path: Path, content: bytes, force: bool) -> None:
+def write_one(path: Path, content: bytes, force: bool) -> None:
+    """Write one file whole, or not at all. Raises UserError when it can't be, or is somebody else's."""
     with held(path.parent):
         require_own(path.parent, [path.name], force)
         if (path.parent / MANIFEST).exists():  # beside the record, or a folder of results

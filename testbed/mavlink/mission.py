@@ -14,27 +14,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from nav.earth import position_difference_n
+from nav.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
+from nav.samples import Array
 from testbed.mavlink.encode import latitude_e7, longitude_e7
 from testbed.motion import guidance, legs, paths
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.scenario import Scenario
-from testbed.sensors.gnss import displaced
 
 _MOST_SEGMENTS = 1000  # of one leg; where a longer one ends makes no difference on a map
 
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One mission item: command, its first four parameters, place [rad, m above the ellipsoid]."""
+    """One mission item: command, its first four parameters, place [rad, m above the ellipsoid].
+
+    ``speed`` is the true airspeed [m/s] on the way there, NaN where there is none to fly at.
+    """
 
     command: int
     params: tuple[float, float, float, float]
     lat: float
     lon: float
     h: float
+    speed: float = math.nan
 
 
 def items(scenario: Scenario, home_first: bool) -> list[Item]:
@@ -49,6 +53,7 @@ def items(scenario: Scenario, home_first: bool) -> list[Item]:
         math.radians(start.lat_deg),
         math.radians(start.lon_deg),
         float(start.alt_m),
+        truth.start.airspeed_mps if isinstance(truth, FlightTruth) else math.nan,
     )
     legs = _flown(scenario.plan, truth) if isinstance(truth, FlightTruth) else _driven(truth, scenario.duration_s)
     return [home, *legs] if home_first and legs else legs
@@ -108,7 +113,7 @@ def _leg(leg: legs.Leg, here: _Here) -> Item:
     """The item of a leg that begins ``here``; moves on to where it ends."""
     place = getattr(leg, "to", None) or getattr(leg, "centre", None)
     lat0, lon0 = (math.radians(place.lat_deg), math.radians(place.lon_deg)) if place else (here.lat, here.lon)
-    north, east, _ = position_difference_n(here.lat, here.lon, here.h, lat0, lon0, here.h).tolist()
+    north, east, here.course = _seen(here, lat0, lon0)
     to_h = getattr(leg, "to_m", None) or getattr(leg, "alt_m", None) or here.h
     to_speed = getattr(leg, "to_mps", None) or getattr(leg, "airspeed_mps", None) or here.speed
     length = math.inf
@@ -128,13 +133,34 @@ def _leg(leg: legs.Leg, here: _Here) -> Item:
         north, east, here.course, length = _along(segment, north, east, here.course, to_speed, length)
         if length <= 0.0 or count >= _MOST_SEGMENTS:
             break
-    here.lat, here.lon, here.h = displaced(lat0, lon0, to_h, np.array([north, east, 0.0]))
-    here.speed = to_speed
+    here.lat, here.lon, here.course = _back(north, east, here.course, (lat0, lon0, to_h))
+    here.h, here.speed = to_h, to_speed
     item = _item(leg, here)
     if centre is not None and item.command in (mav.MAV_CMD_NAV_LOITER_TURNS, mav.MAV_CMD_NAV_LOITER_TIME):
-        lat, lon, _ = displaced(lat0, lon0, to_h, np.array([*centre, 0.0]))
+        lat, lon, _ = _back(*centre, here.course, (lat0, lon0, to_h))
         item = replace(item, lat=lat, lon=lon)
     return item
+
+
+def _seen(here: _Here, lat0: float, lon0: float) -> tuple[float, float, float]:
+    """Where it is in the plane that touches the Earth at a place [rad]: north, east [m], and course [rad] there."""
+    C_ne = dcm_en(lat0, lon0).T
+    away = ecef_from_geodetic(here.lat, here.lon, here.h) - ecef_from_geodetic(lat0, lon0, here.h)
+    north, east, _ = (C_ne @ away).tolist()
+    return north, east, _turned(here.course, C_ne @ dcm_en(here.lat, here.lon))
+
+
+def _back(north: float, east: float, course: float, origin: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Latitude, longitude and course [rad] of what is there in the plane that touches the Earth at the ``origin``."""
+    C_en = dcm_en(*origin[:2])
+    lat, lon, _ = geodetic_from_ecef(ecef_from_geodetic(*origin) + C_en @ np.array([north, east, 0.0]))
+    return lat, lon, _turned(course, dcm_en(lat, lon).T @ C_en)
+
+
+def _turned(course: float, C: Array) -> float:
+    """A course in the axes that ``C`` (3, 3) takes north, east, down to: meridians are not parallel."""
+    north, east, _ = (C @ np.array([math.cos(course), math.sin(course), 0.0])).tolist()
+    return math.atan2(east, north)
 
 
 def _along(
@@ -167,13 +193,13 @@ def _along(
 
 def _item(leg: legs.Leg, end: _Here) -> Item:
     """The item of a leg that ends there."""
-    place = end.lat, end.lon, end.h
+    place = end.lat, end.lon, end.h, end.speed
     match leg:
         case legs.Climb() | legs.Descend():
             way = 1.0 if isinstance(leg, legs.Climb) else 2.0
             return Item(mav.MAV_CMD_NAV_CONTINUE_AND_CHANGE_ALT, (way, 0.0, 0.0, 0.0), *place)
         case legs.Airspeed():
-            return Item(mav.MAV_CMD_DO_CHANGE_SPEED, (0.0, leg.to_mps, -1.0, 0.0), 0.0, 0.0, end.h)
+            return Item(mav.MAV_CMD_DO_CHANGE_SPEED, (0.0, leg.to_mps, -1.0, 0.0), 0.0, 0.0, end.h, end.speed)
         case legs.Loiter() | legs.Racetrack() | legs.FigureEight():
             radius = leg.radius_m if leg.direction == "right" else -leg.radius_m
             rounds = leg.laps if isinstance(leg, legs.Racetrack) else leg.turns
