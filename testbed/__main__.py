@@ -208,14 +208,18 @@ def campaign(
     ] = 0,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="An existing Dask cluster.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder; runs/<scenario>_campaign.")] = None,
+    save: Annotated[bool, typer.Option("--save", help="Write how [expect] is kept into the documentation.")] = False,
 ) -> None:
     """Fly a scenario with many seeds."""
     from testbed.many import campaign as campaigns
     from testbed.many import progress
     from testbed.report import campaign as campaign_report
+    from testbed.report import expected
 
-    varied = parse_vary(vary or [])
     folder = out or campaigns.usual_folder(scenario, draw)
+    plan = campaigns.Plan(scenario, runs, folder, parse_vary(vary or []), overrides or (), draw)
+    if save:
+        expected.require_shipped(plan)
     require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
     with (
         output_folder(folder),
@@ -223,7 +227,6 @@ def campaign(
         interrupts.leaving(lambda: f"what is finished is in {folder}; the same command carries on"),
         progress.shown(console(stderr=True), scenario) as tell,
     ):
-        plan = campaigns.Plan(scenario, runs, folder, varied, overrides or (), draw)
         result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)))
     for table in campaign_report.tables(result):
         console().print(table)
@@ -231,6 +234,8 @@ def campaign(
     for failure in result.failures:
         case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()
         remark(f"{case}: {failure.message}")
+    if save:
+        print(printable(str(expected.save(plan, result))))
     if result.failures:
         raise typer.Exit(EXIT_FAILED)
 

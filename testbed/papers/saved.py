@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,6 +10,7 @@ from testbed.data import data_dir, docs_dir, write_file
 from testbed.errors import UserError
 from testbed.papers import COLUMNS, RESULTS, Records, counted, find, parted, row, stored
 from testbed.papers.draws import Draws
+from testbed.report import markdown
 
 TABLE = "papers-table.md"
 
@@ -51,10 +52,5 @@ def page(found: Mapping[str, Records], draws: Draws) -> str:
     ]
     for title, records in found.items():
         for heading, own in parted(title, records):
-            lines += ["", f"## {heading}", "", _line(COLUMNS), _line(["---"] * len(COLUMNS))]
-            lines += [_line(row(record)) for record in own]
+            lines += ["", f"## {heading}", "", *markdown.table(COLUMNS, map(row, own))]
     return "\n".join(lines) + "\n"
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

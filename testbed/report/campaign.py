@@ -25,6 +25,7 @@ import numpy as np
 from nav.samples import Array
 from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
 from testbed.report.campaign_page import contents
+from testbed.report.expected import COLUMNS, Kept, kept
 from testbed.report.page import Shown, png, render, script_of
 from testbed.results import REPORT, write_result
 from testbed.score.accuracy import AXES
@@ -155,10 +156,11 @@ class Statistics:
     consistency: Sequence[Consistency]
     means: Sequence[Mean] = ()
     efficiencies: Sequence[Efficiency] = ()
+    expected: Sequence[Kept] = ()
 
 
 def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Statistics:
-    """Spread, mean errors, efficiency and consistency of every estimator, one combination after the other."""
+    """Spread, mean errors, efficiency and consistency of every estimator, and [expect], by combination."""
     spreads: list[Spread] = []
     consistency: list[Consistency] = []
     means: list[Mean] = []
@@ -170,7 +172,7 @@ def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome])
             consistency.append(_consistency(i, estimator, own))
             means += _means(i, estimator, own)
             efficiencies += _efficiencies(i, estimator, own)
-    return Statistics(spreads, consistency, means, efficiencies)
+    return Statistics(spreads, consistency, means, efficiencies, list(kept(combinations, outcomes)))
 
 
 def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Spread]:
@@ -289,10 +291,12 @@ def _csv(result: CampaignResult) -> str:
 
 def _json(result: CampaignResult) -> dict[str, Any]:
     def plain(rows: Iterable[Any]) -> list[dict[str, Any]]:
-        return [
-            {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in asdict(row).items()}
-            for row in rows
-        ]
+        return [{key: finite(value) for key, value in asdict(row).items()} for row in rows]
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return [finite(one) for one in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
 
     return {
         "combinations": [dict(combination.values) for combination in result.combinations],
@@ -302,6 +306,7 @@ def _json(result: CampaignResult) -> dict[str, Any]:
         "consistency": plain(result.statistics.consistency),
         "means": plain(result.statistics.means),
         "efficiencies": plain(result.statistics.efficiencies),
+        "expected": plain(result.statistics.expected),
         "failures": plain(result.failures),
     }
 
@@ -350,6 +355,7 @@ def texts(result: CampaignResult) -> list[Text]:
         Text("Consistency over the runs", consistency, 1 + len(keys)),
         *_efficiency(result, keys),
         *_mean_errors(result, keys),
+        *_expected(result, keys),
     ]
 
 
@@ -378,6 +384,16 @@ def _mean_errors(result: CampaignResult, keys: Sequence[str]) -> Iterator[Text]:
         yield Text("Mean errors over the runs", rows, 2 + len(keys))
 
 
+def _expected(result: CampaignResult, keys: Sequence[str]) -> Iterator[Text]:
+    """How [expect] is kept; nothing where there is none."""
+    rows = [[COLUMNS[0], *keys, *COLUMNS[1:]]]
+    for one in result.statistics.expected:
+        metric, *numbers = one.row
+        rows.append([metric, *result.combinations[one.combination].values.values(), *numbers])
+    if len(rows) > 1:
+        yield Text("[expect] over the runs", rows, 1 + len(keys))
+
+
 def tables(result: CampaignResult) -> list[Table]:
     """The same for a console. Where it is narrow, names are folded and numbers are not."""
     from rich import box
@@ -386,7 +402,7 @@ def tables(result: CampaignResult) -> list[Table]:
 
     made = []
     for text in texts(result):
-        table = Table(title=text.title, box=box.SIMPLE, title_justify="left")
+        table = Table(title=escape(text.title), box=box.SIMPLE, title_justify="left")
         head, *rows = text.rows
         grouped = any(not row[0] for row in rows)  # names stand in the first row of each group
         for k, name in enumerate(head):

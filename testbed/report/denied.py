@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nav.samples import Array
-from testbed.report import denied_page
+from testbed.report import denied_page, markdown
 from testbed.report.denied_figure import figures
 from testbed.report.page import png
 from testbed.results import REPORT, write_result
@@ -231,14 +231,9 @@ def page(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[Cl
         "",
         "## Goals: consumer IMU, walking wind",
         "",
-        *_markdown(GOAL_COLUMNS, (row for row, _ in _goal_rows(claims))),
+        *markdown.table(GOAL_COLUMNS, (row for row, _ in _goal_rows(claims))),
     ]
     for weather in plan.table.weathers:
         lines += ["", f"## {_heading(result, weather)}", ""]
-        lines += _markdown(COLUMNS, _rows(result, found, weather.name))
+        lines += markdown.table(COLUMNS, _rows(result, found, weather.name))
     return "\n".join(lines) + "\n"
-
-
-def _markdown(head: Sequence[str], rows: Iterator[tuple[str, ...]]) -> Iterator[str]:
-    for cells_ in (head, ["---"] * len(head), *rows):
-        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells_) + " |"

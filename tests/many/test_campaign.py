@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from distributed import LocalCluster
-from scipy.stats import chi2, ttest_1samp
+from scipy.stats import binomtest, chi2, ttest_1samp
 from typer.testing import CliRunner
 from worlds import browser, synthetic_run
 
@@ -36,8 +37,9 @@ from testbed.many.campaign import Combination, Failure, Outcome, Plan, Progress,
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
 from testbed.report import campaign as campaign_report
-from testbed.report import campaign_figures
+from testbed.report import campaign_figures, expected
 from testbed.results import MANIFEST, REPORT
+from testbed.scenario.schema import Bounds
 from testbed.score import accuracy
 
 AT_REST = """
@@ -547,7 +549,12 @@ def made_up(combination: int, seed: int, rng: np.random.Generator, claim: float 
 
 def made_up_campaign(tmp_path: Path, values: list[str], runs: int = 30) -> campaigns.CampaignResult:
     estimator = SimpleNamespace(name="ins", attitude_only=False)
-    scenario: Any = SimpleNamespace(title="Made up", estimator=[estimator], fault=())
+    expect = {
+        "ins.position_horizontal_rms_m": Bounds(min=4.0, max=20.0),
+        "ins.recovery_s": Bounds(max=100.0),
+        "ins.nothing_of_the_kind": Bounds(min=1.0),
+    }
+    scenario: Any = SimpleNamespace(title="Made up", estimator=[estimator], fault=(), expect=expect)
     combinations = [Combination({"wind": value} if value else {}, scenario) for value in values]
     rng = np.random.default_rng(2)
     outcomes = [made_up(i, seed, rng, 1.0 + i) for i in range(len(values)) for seed in range(runs)]
@@ -597,6 +604,52 @@ def test_mean_errors_and_efficiency_have_intervals(tmp_path: Path) -> None:
     assert alone.efficiency == pytest.approx(1.2)
     titles = [text.title for text in campaign_report.texts(result)]
     assert "Horizontal error in outages against the bound" in titles
+
+
+def test_how_many_runs_keep_what_is_expected(tmp_path: Path) -> None:
+    """Of 30 runs the error of run k is k, run 4 has no recovery."""
+    result = made_up_campaign(tmp_path, ["0"])
+    least, largest, recovery, nothing = result.statistics.expected
+    clopper = binomtest(26, 30).proportion_ci(0.95)
+    assert least.share == pytest.approx((26 / 30, clopper.low, clopper.high))
+    assert (least.at_least, least.bound, least.most[0]) == (True, 4.0, 1.0)
+    assert (largest.share[0], largest.median[0], largest.most[0]) == (21 / 30, 14.0, 28.0)
+    assert math.isinf(largest.most[2])  # 95 % of all runs: thirty can't tell
+    assert recovery.share[0] == 29 / 30
+    assert nothing.share[0] == 0.0
+    assert largest.row[:2] == ("ins.position_horizontal_rms_m", "≤ 20")
+    titles = [text.title for text in campaign_report.texts(result)]
+    assert titles[-1] == "[expect] over the runs"
+    campaign_report.save(result)
+    kept = json.loads((tmp_path / campaign_report.SUMMARY).read_text())["expected"]
+    assert kept[1]["most"][2] is None
+    assert "[expect] over the runs" in (tmp_path / REPORT).read_text("utf-8")
+
+
+def test_the_manual_has_a_section_for_each_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(expected, "docs_dir", lambda: tmp_path)
+    result = replace(made_up_campaign(tmp_path, ["0"]), failures=())
+    for name, runs in (("u_turn", 30), ("jammer_zone", 31), ("u_turn", 32)):
+        plan = Plan(name, runs, tmp_path, draw=7)
+        expected.require_shipped(plan)
+        path = expected.save(plan, result)
+    page = path.read_text("utf-8")
+    assert [line for line in page.splitlines() if line.startswith("## ")] == ["## jammer_zone", "## u_turn"]
+    assert "`testbed campaign u_turn --runs 32 --draw 7 --save`" in page
+    assert "--runs 30" not in page
+    assert page.count("| ins.recovery_s | ≤ 100 |") == 2
+    assert page.startswith(expected.HEAD)
+    with pytest.raises(UserError, match="1 runs failed"):
+        expected.save(plan, made_up_campaign(tmp_path, ["0"]))
+
+
+@pytest.mark.parametrize("plan", [
+    Plan("mine.toml", 2, Path("x")), Plan("u_turn", 2, Path("x"), {"seed": ["1"]}),
+    Plan("u_turn", 2, Path("x"), overrides=["duration_s=70"]),
+])  # fmt: skip
+def test_the_manual_is_of_shipped_scenarios(plan: Plan) -> None:
+    with pytest.raises(UserError, match="shipped scenarios"):
+        expected.require_shipped(plan)
 
 
 @pytest.mark.ci

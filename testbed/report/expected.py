@@ -1,0 +1,121 @@
+"""How the runs of a campaign keep the scenario's [expect], and the manual's page on that of the shipped scenarios."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from nav.samples import Array
+from testbed.data import data_dir, docs_dir, write_file
+from testbed.errors import UserError
+from testbed.report import markdown
+from testbed.score.claims import HARDLY_ANY, MEDIAN, NEARLY_ALL, SHARE, Interval
+
+if TYPE_CHECKING:
+    from testbed.many.campaign import CampaignResult, Combination, Outcome, Plan
+
+PAGE = "expected.md"
+COLUMNS = ("metric", "bound", "kept by", "median", "95 % of runs")
+HEAD = """# What the shipped scenarios promise
+
+Each line is a bound of a scenario's `[expect]`, over seeds that nobody looked at before: the share of runs that keep
+it, the median, and what 95 % of the runs keep, each with the interval that holds it with 95 % confidence (order
+statistics, and Clopper and Pearson's for the share; an end that so few runs can't tell is infinite).
+[Many seeds](regression.md) says how to fly them again.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """One bound of [expect] over the runs of one combination.
+
+    ``share`` is that of the runs which keep it; ``most`` is what 95 % of them do not exceed, or, ``at_least``, do not
+    stay below. A run that lacks the metric keeps nothing.
+    """
+
+    combination: int
+    metric: str
+    bound: float
+    at_least: bool
+    share: Interval
+    median: Interval
+    most: Interval
+    runs: int
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """Under `COLUMNS`."""
+        sign = "≥" if self.at_least else "≤"
+        share = Interval(*(100 * one for one in self.share))
+        return self.metric, f"{sign} {self.bound:g}", f"{share} %", f"{self.median}", f"{sign} {self.most}"
+
+
+def kept(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Iterator[Kept]:
+    """Every bound, one combination after the other."""
+    for i, combination in enumerate(combinations):
+        own = [outcome.metrics for outcome in outcomes if outcome.combination == i]
+        for metric, bounds in combination.scenario.expect.items() if own else ():
+            for bound, at_least in ((bounds.min, True), (bounds.max, False)):
+                if bound is not None:
+                    missing = -math.inf if at_least else math.inf
+                    values = np.array([metrics.get(metric, missing) for metrics in own])
+                    yield _kept(i, metric, bound, at_least, np.where(np.isnan(values), missing, values))
+
+
+def _kept(combination: int, metric: str, bound: float, at_least: bool, values: Array) -> Kept:
+    holds = values >= bound if at_least else values <= bound
+    most = (HARDLY_ANY if at_least else NEARLY_ALL).of(values)
+    return Kept(
+        combination, metric, bound, at_least, SHARE.of(holds.astype(float)), MEDIAN.of(values), most, len(values)
+    )  # fmt: skip
+
+
+# --- the manual
+
+
+def require_shipped(plan: Plan) -> None:
+    """Raises UserError unless it is a shipped scenario as it is, and this a checkout."""
+    docs_dir()
+    if (
+        plan.vary
+        or plan.overrides
+        or str(plan.scenario) not in {one.stem for one in data_dir("scenarios").glob("*.toml")}
+    ):
+        raise UserError(
+            f"--save {plan.scenario}: is for shipped scenarios by name as they are, without --set and --vary"
+        )
+
+
+def save(plan: Plan, result: CampaignResult) -> Path:
+    """Put the scenario's section into the manual's page, in place of the one that it has; the page's file.
+
+    Raises UserError when a run failed.
+    """
+    if result.failures:
+        raise UserError(f"{result.path}: {len(result.failures)} runs failed, so that nothing was saved")
+    path = docs_dir() / PAGE
+    sections = dict(_sections(path.read_text("utf-8"))) if path.exists() else {}
+    sections[str(plan.scenario)] = _section(plan, result)
+    text = "\n".join([HEAD, *(f"## {name}\n\n{sections[name]}" for name in sorted(sections))])
+    write_file(path, text.encode())
+    return path
+
+
+def _sections(page: str) -> Iterator[tuple[str, str]]:
+    """(scenario, text) of the sections of a page."""
+    for section in page.split("\n## ")[1:]:
+        name, _, text = section.partition("\n")
+        yield name, text.strip("\n") + "\n"
+
+
+def _section(plan: Plan, result: CampaignResult) -> str:
+    today = datetime.now(UTC).date()
+    lines = [f"`testbed campaign {plan.scenario} --runs {plan.runs} --draw {plan.draw} --save`, {today}.", ""]
+    lines += markdown.table(COLUMNS, (one.row for one in result.statistics.expected))
+    return "\n".join(lines) + "\n"
