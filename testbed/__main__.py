@@ -275,7 +275,7 @@ def papers(
         for table in library.tables(found[name].title, own):
             console().print(table)
     print(library.counted(records))
-    print(printable(f"{out / library.RESULTS} and figures beside it"))
+    print(printable(f"{saved.show(out)}, {library.RESULTS} and figures beside it"))
     if save:
         print(printable(str(saved.save(out))))
     if any(claim.verdict is Verdict.MISSED for own in claims.values() for claim in own if claim.paper):

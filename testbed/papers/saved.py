@@ -11,6 +11,7 @@ from testbed.errors import UserError
 from testbed.papers import COLUMNS, RESULTS, Records, counted, find, parted, row, stored
 from testbed.papers.draws import Draws
 from testbed.report import markdown
+from testbed.results import REPORT, write_result
 
 TABLE = "papers-table.md"
 
@@ -39,6 +40,22 @@ def save(folder: Path) -> Path:
         for figure in paper.figures:
             write_file(data_dir("scenarios") / "papers" / figure, (folder / figure).read_bytes())
     return path
+
+
+def show(folder: Path) -> Path:
+    """Write the page on what that ``folder`` has of the papers; its file."""
+    from testbed.papers import page as pages  # pages take a while to import
+    from testbed.report.page import Shown
+
+    draws, found = stored(folder / RESULTS) or (Draws(0), {})
+    papers = find(list(found))
+    pictures = [
+        Shown("Figures", paper.title, (folder / figure).read_bytes())
+        for paper in papers.values() for figure in paper.figures if (folder / figure).exists()
+    ]  # fmt: skip
+    text = pages.page({paper.title: found[name] for name, paper in papers.items()}, draws, pictures)
+    write_result(folder / REPORT, text.encode())
+    return folder / REPORT
 
 
 def page(found: Mapping[str, Records], draws: Draws) -> str:

@@ -256,6 +256,7 @@ class Claim:
             "interval": [_finite(found.low), _finite(found.high)],
             "as text": str(found),
             "bound": f"{'≥' if self.at_least else '≤'} {self.bound:.3g}",
+            "limit": self.bound,
             "best possible": None if best is None else _finite(best.value),
             "verdict": self.verdict.value,
             "why": self.why,
