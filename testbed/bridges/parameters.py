@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from testbed.errors import UserError
 from testbed.motion import aircraft
+from testbed.motion.guidance import beginning
 from testbed.motion.legs import FigureEight, Loiter, Racetrack
 from testbed.motion.sections import FlightTruth
 from testbed.scenario import Scenario
@@ -70,7 +71,8 @@ def _facts(scenario: Scenario) -> Facts:
     if not isinstance(truth, FlightTruth):
         raise UserError('there is no aircraft that an autopilot could fly: truth.source must be "flight"')
     envelope, start = aircraft.load(truth.aircraft), truth.start
-    speed, h = start.airspeed_mps, start.alt_m
+    begun = beginning(start, envelope)
+    speed, h = begun.airspeed_mps, begun.alt_m
     sections = scenario.sensors.values()
     receivers = [one for one in sections if isinstance(one, GnssConfig)]
     imus = [one for one in sections if isinstance(one, ImuConfig)]

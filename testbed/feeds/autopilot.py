@@ -20,7 +20,8 @@ What comes from where (`testbed.scenario.FeedbackConfig`), every `FRAME_HZ`, at 
 
   A constant error of acceleration da makes the climb wrong by 2 zeta da / omega: 0.1 m/s for 3 mg.
 
-A run begins in the air, so somebody else has taken off: the loops are closed on truth until the estimators are aligned.
+A run begins in the air, so somebody else has taken off, or it takes off on truth, as its launcher is no matter of
+navigation: the loops are closed on truth until the aircraft is launched and the estimators are aligned.
 Then the loop closes, which is an event, and stays closed. Dead reckoning takes over place, height and climb, and sets
 its altimeter. Nothing is fed back that had not arrived. Numbers that can't be flown on (NaN, or beyond all bounds)
 never reach the aircraft: for `HOLD_S` it flies on the last good ones, then the run ends with the reason.
@@ -95,6 +96,11 @@ class Steered(MotionSource, Protocol):
 
     def feed_back(self, state: Feedback | None) -> None:
         """Close guidance and inner loops on ``state`` until the next call; None is truth."""
+        ...
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether it has not been launched yet."""
         ...
 
     def true_feedback(self) -> Feedback:
@@ -199,7 +205,7 @@ class Autopilot:
         """Close the loops on what is known at ``t``, once there is something to be known."""
         if self._air is not None:
             self._air.advance(t)
-        if not self.closed and self._ready(t, estimates):
+        if not self.closed and not self._source.on_ground and self._ready(t, estimates):
             self.closed = True
             self.events.append((t, "info", f"the autopilot flies on {self._names()} from here on"))
             if self._reckons and self._air is not None:

@@ -1,7 +1,8 @@
 """A feed that is flown from outside: a far end hears each inertial sample, and what it commands moves the surfaces.
 
-A run begins in the air, so the plan is flown until the far end takes over, which is an event. Then neither plan nor
-inner loops have a say. What it answers to a sample moves the aircraft from that sample's time on.
+A run that begins in the air flies the plan until the far end takes over, which is an event. Then neither plan nor
+inner loops have a say. What it answers to a sample moves the aircraft from that sample's time on. A run that begins on
+the ground stays there until the far end has taken over and its throttle is up.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from testbed.motion.table import MotionSource, TruthBlock
 
 TAKES_OVER = "{} flies from here on"
 NEVER_FLOWN = "the plan was flown to the end: {} never took over"
+NEVER_LAUNCHED = "the aircraft was on the ground to the end: {} was never armed with its throttle up"
 
 
 def is_step(turn: Turn) -> bool:
@@ -28,6 +30,15 @@ def is_step(turn: Turn) -> bool:
 @runtime_checkable
 class Movable(MotionSource, Protocol):
     """A motion whose surfaces can be moved: `testbed.motion.flight.Flight`."""
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether it has not been launched yet."""
+        ...
+
+    def wait(self) -> None:
+        """Take off when who moves it wants to, and not before."""
+        ...
 
     def move(self, aileron: float, elevator: float, rudder: float, throttle: float) -> None:
         """Let these fly from now on."""
@@ -50,6 +61,7 @@ class Piloted:
         self._tick = 0
         self._events: list[tuple[float, str, str]] = []
         self._taken_over = False
+        source.wait()
 
     @property
     def origin(self) -> dict[str, str]:
@@ -102,7 +114,9 @@ class Piloted:
         return taken
 
     def remark(self) -> str:
-        """That nobody took over, if so."""
+        """That nobody took over, or took off, if so."""
+        if self._movable.on_ground:
+            return NEVER_LAUNCHED.format(self._far_end.name)
         return "" if self._taken_over else NEVER_FLOWN.format(self._far_end.name)
 
     def close(self) -> None:

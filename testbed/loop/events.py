@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 from nav.samples import Estimate, GnssSample, Sample, Status, UpdateReport
 from testbed.motion.logged import LogTruth
+from testbed.motion.table import ON_GROUND, OUTSIDE
 from testbed.scenario import Scenario
 from testbed.sensors.faults import FaultTruth
 from testbed.sensors.imu import ImuConfig
@@ -33,7 +34,7 @@ class EventWatch:
     aligned: dict[str, bool] = field(default_factory=dict)
     refusals: dict[tuple[str, str], int] = field(default_factory=dict)  # in a row
     unsound: dict[tuple[str, str], float] = field(default_factory=dict)  # when last reported
-    leg: float = -2.0
+    leg: float = OUTSIDE
     t: float = -math.inf
 
     @classmethod
@@ -93,6 +94,8 @@ class EventWatch:
 
     def row(self, t: float, leg: float, plan: Sequence[str]) -> None:
         """The run has come to ``t``: a leg may have begun, a sensor be overdue, a fault begin or end."""
+        if self.leg == ON_GROUND and leg != ON_GROUND:
+            self.emit(t, "info", "launch")
         if leg != self.leg and 0 <= leg < len(plan):
             self.emit(t, "info", f"leg {int(leg) + 1}/{len(plan)} {plan[int(leg)]}")
         self.leg = leg
@@ -110,11 +113,12 @@ class EventWatch:
 def legs_unflown(scenario: Scenario, leg: float) -> str:
     """Which legs of the plan a run that ends in leg ``leg``, counted from 0, never came to; empty when none."""
     names = [one.leg.replace("_", " ") for one in scenario.plan]
-    missed = [f"{number}/{len(names)} {name}" for number, name in enumerate(names, 1) if number > leg + 1]
+    missed = [f"{number}/{len(names)} {name}" for number, name in enumerate(names, 1) if number > max(leg, OUTSIDE) + 1]
     if not missed:
         return ""
     what = f"leg {missed[0]} was" if len(missed) == 1 else f"legs {', '.join(missed)} were"
-    return f"{what} never flown: the run ended in leg {leg + 1:.0f} {names[int(leg)]}"
+    where = f"in leg {leg + 1:.0f} {names[int(leg)]}" if leg >= 0 else "before the first"
+    return f"{what} never flown: the run ended {where}"
 
 
 def plan_flown(scenario: Scenario, end: float) -> tuple[str, str]:

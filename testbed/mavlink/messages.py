@@ -25,6 +25,7 @@ from nav.samples import (
 from testbed.mavlink.encode import Fields, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.identity import Identity
 from testbed.mavlink.snapshot import Snapshot, floats, root
+from testbed.motion.table import CLIMBING_OUT
 
 # The vehicle
 
@@ -111,9 +112,11 @@ def extended_sys_state(s: Snapshot) -> Fields:
 
 
 def current_item(s: Snapshot) -> int:
-    """The mission item being flown: that of the leg; the last one when the plan is flown."""
+    """The mission item being flown: that of the leg; the first before it, the last one when the plan is flown."""
     leg = float(s.truth.leg[0])
     first = int(s.identity.home_first)
+    if leg <= CLIMBING_OUT:
+        return first
     return first + (int(leg) if 0 <= leg < s.legs else max(0, s.legs - 1))
 
 
@@ -121,6 +124,8 @@ def mission_current(s: Snapshot) -> Fields:
     """The leg being flown, as an item of the mission."""
     if not s.legs:
         state = mav.MISSION_STATE_NO_MISSION
+    elif s.truth.leg[0] <= CLIMBING_OUT:
+        state = mav.MISSION_STATE_NOT_STARTED
     else:
         state = mav.MISSION_STATE_ACTIVE if s.truth.leg[0] >= 0 else mav.MISSION_STATE_COMPLETE
     return {

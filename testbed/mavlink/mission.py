@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 from nav.earth import dcm_en, ecef_from_geodetic, geodetic_from_ecef
 from nav.samples import Array
 from testbed.mavlink.encode import latitude_e7, longitude_e7
-from testbed.motion import guidance, legs, paths
+from testbed.motion import aircraft, guidance, legs, paths
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
@@ -53,10 +53,15 @@ def items(scenario: Scenario, home_first: bool) -> list[Item]:
         math.radians(start.lat_deg),
         math.radians(start.lon_deg),
         float(start.alt_m),
-        truth.start.airspeed_mps if isinstance(truth, FlightTruth) else math.nan,
+        _begun(truth)[0].speed if isinstance(truth, FlightTruth) else math.nan,
     )
     legs = _flown(scenario.plan, truth) if isinstance(truth, FlightTruth) else _driven(truth, scenario.duration_s)
     return [home, *legs] if home_first and legs else legs
+
+
+def take_off(scenario: Scenario) -> Item | None:
+    """From the ground to where the plan begins; None where it begins in the air."""
+    return _begun(scenario.truth)[1] if isinstance(scenario.truth, FlightTruth) else None
 
 
 def fields(mission: Sequence[Item], number: int, current: int, home_h: float) -> dict[str, float]:
@@ -98,15 +103,24 @@ class _Here:
 
 
 def _flown(plan: Sequence[legs.Leg], truth: FlightTruth) -> list[Item]:
-    start = truth.start
+    here, _ = _begun(truth)
+    return [_leg(leg, here) for leg in plan]
+
+
+def _begun(truth: FlightTruth) -> tuple[_Here, Item | None]:
+    """Where the plan begins, and the take-off that leads there, if there is one."""
+    start, envelope = truth.start, aircraft.load(truth.aircraft)
     here = _Here(
         math.radians(start.lat_deg),
         math.radians(start.lon_deg),
         start.alt_m,
         math.radians(start.heading_deg),
-        start.airspeed_mps,
+        guidance.beginning(start, envelope).airspeed_mps,
     )
-    return [_leg(leg, here) for leg in plan]
+    if envelope.launch is None or not start.on_ground:
+        return here, None
+    led = _leg(guidance.climb_out(start, envelope), here)
+    return here, replace(led, command=mav.MAV_CMD_NAV_TAKEOFF, params=(envelope.launch.pitch_deg, 0.0, 0.0, 0.0))
 
 
 def _leg(leg: legs.Leg, here: _Here) -> Item:

@@ -1,9 +1,9 @@
 """The plan of a scenario as a file that ground stations read: QGroundControl's .plan, and plain text (QGC WPL 110).
 
-Both hold what PX4 and ArduPlane understand alike: waypoints where legs lead, circles that last a time about their
-centre, changes of airspeed, and at the end a circle for good. Circuits and eights become circles, turns are counted by
-their time. Heights are absolute, above the ellipsoid in the place of the sea's level, as autopilots are told them here;
-airspeeds are equivalent ones, which autopilots fly by.
+Both hold what PX4 and ArduPlane understand alike: a take-off from the ground, waypoints where legs lead, circles that
+last a time about their centre, changes of airspeed, and at the end a circle for good. Circuits and eights become
+circles, turns are counted by their time. Heights are absolute, above the ellipsoid in the place of the sea's level, as
+autopilots are told them here; airspeeds are equivalent ones, which autopilots fly by.
 
 Sources: QGroundControl's Plan File Format (version 1 of the file, 2 of mission, fence and rally points);
 https://mavlink.io/en/file_formats/; mavlink_mission.cpp of PX4-Autopilot 1.16 for the commands that it takes.
@@ -45,6 +45,8 @@ def content(scenario: Scenario, form: str) -> bytes:
         raise UserError('there is no plan that an autopilot could fly: truth.source must be "flight"')
     home, *items = mission.items(scenario, home_first=True)
     orders = list(_orders(home, items))
+    if (first := mission.take_off(scenario)) is not None:
+        orders.insert(0, Order(first.command, first.params, _place(first)))
     return _plan(home, orders) if form == "plan" else _wpl(home, orders)
 
 

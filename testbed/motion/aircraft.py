@@ -94,6 +94,19 @@ class Current(Section):
     servo_running_a: float = Field(ge=0, le=100)
 
 
+class Launch(Section):
+    """The launcher that it takes off from: how high over ground it rests there, and how it is let go.
+
+    It lies nose up by ``pitch_deg``, and is pushed straight along its nose, over ``length_m``, to the true ground speed
+    ``speed_mps``.
+    """
+
+    height_m: float = Field(gt=1, le=20)
+    pitch_deg: float = Field(ge=0, le=45)
+    length_m: float = Field(gt=0, le=100)
+    speed_mps: float = Field(gt=0, le=100)
+
+
 class Envelope(Section):
     """What one aircraft can do. SI and radians at every method; airspeeds given to them are true ones."""
 
@@ -105,6 +118,7 @@ class Envelope(Section):
     descent: DescentFit
     usual: Usual
     current: Current
+    launch: Launch | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

@@ -7,9 +7,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Protocol
 
+from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from testbed.motion.aircraft import GRAVITY, LEAST_CLIMB, Envelope
 from testbed.motion.legs import CLIMB_RATE, Airspeed, Climb, Descend, FigureEight, Leg, Loiter, Racetrack, Straight
 from testbed.motion.paths import Arc, Feedback, Line, Motion, TangentPlane, abeam, turn_radius, wrap
+from testbed.motion.sections import Start
 
 GENTLE_BANK = math.radians(10.0)  # adds 1.5 % to the load, allowed at any airspeed
 BANK_RESERVE = math.radians(6.0)  # kept back for tracking when a plan is checked
@@ -23,31 +25,60 @@ ON_PATH = 30.0  # the next leg begins on the path of the one before when it was 
 class Beginning(Protocol):
     """Where a plan begins."""
 
+    @property
+    def alt_m(self) -> float:
+        """Height above the ellipsoid [m]."""
+        ...
+
+    @property
+    def airspeed_mps(self) -> float:
+        """True airspeed [m/s]."""
+        ...
+
+
+class ClimbedOut(NamedTuple):
+    """Where a plan begins after a take-off: `Beginning`."""
+
     alt_m: float
     airspeed_mps: float
 
 
+def beginning(start: Start, envelope: Envelope) -> Beginning:
+    """Where a plan begins: at the start; after a take-off the aircraft's floor over ground, at its usual airspeed."""
+    if not start.on_ground:
+        return start
+    alt = start.alt_m + envelope.altitude.floor_m
+    return ClimbedOut(alt, envelope.usual.airspeed_mps * math.sqrt(SEA_LEVEL_DENSITY / isa_density(alt)))
+
+
+def climb_out(start: Start, envelope: Envelope) -> Climb:
+    """The leg from the launcher to where the plan begins, along the heading of the start."""
+    end = beginning(start, envelope)
+    rate = envelope.climb_limit(end.airspeed_mps, end.alt_m)
+    return Climb(leg="climb", to_m=end.alt_m, rate_mps=rate, airspeed_mps=end.airspeed_mps)
+
+
 def plan_mistakes(
-    plan: Sequence[Leg], start: Beginning, envelope: Envelope, wind_mps: float = 0.0
+    plan: Sequence[Leg], start: Beginning, envelope: Envelope, wind_mps: float = 0.0, ground_m: float = 0.0
 ) -> list[tuple[str, str]]:
-    """What of a plan the aircraft can't fly: key and reason.
+    """What of a plan the aircraft can't fly over ground at ``ground_m``: key and reason.
 
     All that no aircraft of this envelope could fly at any time; where there is nothing of that, the first that it
     can't fly when altitude and airspeed are followed through the plan. Radii are checked with the wind behind: bank
     atan((V + W)^2 / (g R)) against the limit at the leg's airspeed.
     """
-    start_alt = _altitude_mistake("truth.start.alt_m", start.alt_m, envelope)
-    never = [*start_alt, *(found for index, leg in enumerate(plan) for found in _leg_mistakes(index, leg, envelope))]
+    never = list(_altitude_mistake("truth.start.alt_m", start.alt_m, envelope, ground_m))
+    never += [found for index, leg in enumerate(plan) for found in _leg_mistakes(index, leg, envelope, ground_m)]
     return never or list(itertools.islice(_followed(plan, start, envelope, wind_mps), 1))
 
 
-def _leg_mistakes(index: int, leg: Leg, envelope: Envelope) -> Iterator[tuple[str, str]]:
+def _leg_mistakes(index: int, leg: Leg, envelope: Envelope, ground: float) -> Iterator[tuple[str, str]]:
     """What of a leg can't be flown at any altitude and airspeed."""
     stall, fastest = envelope.airspeed.stall_mps, envelope.airspeed.max_mps
     slowest, tightest = envelope.min_airspeed(0.0), envelope.max_bank
     for key in ("to_m", "alt_m"):
         if (altitude := getattr(leg, key, None)) is not None:
-            yield from _altitude_mistake(f"plan[{index}].{key}", altitude, envelope)
+            yield from _altitude_mistake(f"plan[{index}].{key}", altitude, envelope, ground)
     for key in ("to_mps", "airspeed_mps"):
         speed = getattr(leg, key, None)
         if speed is not None and speed < slowest:
@@ -63,10 +94,10 @@ def _leg_mistakes(index: int, leg: Leg, envelope: Envelope) -> Iterator[tuple[st
         yield f"plan[{index}].radius_m", f"a radius of {radius:g} m {reason}"
 
 
-def _altitude_mistake(key: str, altitude: float, envelope: Envelope) -> Iterator[tuple[str, str]]:
-    floor, ceiling = envelope.altitude.floor_m, envelope.altitude.ceiling_m
+def _altitude_mistake(key: str, altitude: float, envelope: Envelope, ground: float) -> Iterator[tuple[str, str]]:
+    floor, ceiling = ground + envelope.altitude.floor_m, envelope.altitude.ceiling_m
     if not floor <= altitude <= ceiling:
-        reason = f"the ground is at 0 m (ellipsoid), choose from {floor:g} to {ceiling:g}"
+        reason = f"the ground is at {ground:g} m (ellipsoid), choose from {floor:g} to {ceiling:g}"
         yield key, f"{altitude:g} m can't be flown: {reason}"
 
 

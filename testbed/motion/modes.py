@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nav.earth import STANDARD_GRAVITY
-from testbed.motion.flight import POUND, Aircraft
+from testbed.motion.model import POUND, Aircraft
 from testbed.motion.sections import Start
 
 

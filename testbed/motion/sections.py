@@ -26,13 +26,35 @@ TickRate: TypeAlias = Annotated[
 
 
 class Start(Section):
-    """Where and how a flight starts: trimmed, straight and level."""
+    """Where and how a flight starts: trimmed, straight and level; or at rest, from where it takes off."""
 
     lat_deg: Latitude
     lon_deg: Longitude
     alt_m: Altitude
     heading_deg: Heading = Field(description="true heading of the nose")
-    airspeed_mps: float = Field(gt=0, le=100, description="true airspeed, at which it is trimmed")
+    airspeed_mps: float = Field(
+        default=0.0,
+        ge=0,
+        le=100,
+        description="true airspeed, at which it is trimmed; of no start on the ground",
+    )
+    on_ground: bool = Field(
+        default=False,
+        description="whether it begins at rest on its launcher; `alt_m` is then the height of the ground there",
+    )
+    rest_s: float = Field(
+        default=30.0, ge=3, le=LONGEST_RUN_S, description="how long it rests there before it is launched by itself"
+    )
+
+    @model_validator(mode="after")
+    def _moving_or_not(self) -> Self:
+        if self.on_ground and self.airspeed_mps > 0:
+            raise ValueError("on_ground is a start at rest: leave airspeed_mps out")
+        if not self.on_ground and self.airspeed_mps == 0:
+            raise ValueError("airspeed_mps is missing or 0: give the speed to begin with, or set on_ground = true")
+        if not self.on_ground and "rest_s" in self.model_fields_set:
+            raise ValueError("rest_s is of a start at rest: set on_ground = true, or leave it out")
+        return self
 
 
 class GaussMarkov(Section):
@@ -183,7 +205,7 @@ class FlightTruth(Section):
         default="loiter", description="a shipped aircraft by name, or the path of a folder, seen from this file"
     )
     rate_hz: TickRate = 200.0
-    start: Start = Field(description="where the flight begins, trimmed, straight and level")
+    start: Start = Field(description="where the flight begins")
     wind: Wind = Field(default=Wind(), description="wind and turbulence; none: calm air")
     terrain: Terrain = Field(default=Terrain(), description="the ground that sensors see; it stops nobody")
 

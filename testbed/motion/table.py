@@ -24,6 +24,8 @@ from nav.samples import Array
 from testbed.errors import UserError
 
 SAVE_TICKS = 20_000  # rows of a motion being stored that are in memory at a time
+# Of the column leg, where no leg of a plan is flown. The launch ends with the row at which the aircraft is free.
+OUTSIDE, CLIMBING_OUT, ON_GROUND = -1.0, -2.0, -3.0
 FLYING_MPS = 8.0  # faster than this, through the air or over ground, is flight: well below any stall speed
 
 
@@ -58,7 +60,7 @@ COLUMNS: dict[str, Column] = {
     "fuel": Column("kg", 1, "fuel on board"),
     "controls": Column("1", 4, "aileron, elevator, rudder, throttle after the actuators, normalised"),
     "commands": Column("rad, m, m/s", 3, "guidance commands: bank, altitude, true airspeed"),
-    "leg": Column("1", 1, "index of the plan leg being flown, -1 outside a plan"),
+    "leg": Column("1", 1, "index of the plan leg being flown; -1 outside a plan, -2 before it, -3 on the ground"),
 }
 
 

@@ -46,9 +46,16 @@ def _limits(envelope: aircraft.Envelope) -> Table:
         "altitude": f"{envelope.altitude.floor_m:g} to {envelope.altitude.ceiling_m:g} m",
         "usually flown, true airspeed": f"{usual.airspeed_mps:g} m/s",
         "usual turn": turn,
+        "launched": _launched(envelope.launch),
     }.items():
         table.add_row(what, value)
     return table
+
+
+def _launched(launch: aircraft.Launch | None) -> str:
+    if launch is None:
+        return "not from the ground"
+    return f"nose up {launch.pitch_deg:g} deg, to {launch.speed_mps:g} m/s over {launch.length_m:g} m"
 
 
 def _trims(trims: list[Trim], envelope: aircraft.Envelope) -> Table:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from nav.terrain import ground as height_of_ground
 from testbed import measures
 from testbed.errors import UserError, unknown
 from testbed.estimators.ahrs import AhrsSection
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 LONGEST_NAME = 32  # as the record keeps them
 EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
+ON_THE_GROUND_M = 1.0  # as near as the height of a start must be told
 RESERVED = frozenset({"run", "flight", "truth"})  # `run.wall_s` and the like would become ambiguous
 
 
@@ -76,8 +79,34 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     except UserError as error:
         yield ("truth", "wind", "file"), str(error)
         return
-    for key, what in guidance.plan_mistakes(scenario.plan, scenario.truth.start, envelope, foreseen):
+    start = scenario.truth.start
+    yield from _launch_mistakes(scenario.truth, envelope)
+    begun, ground = guidance.beginning(start, envelope), start.alt_m if start.on_ground else 0.0
+    for key, what in guidance.plan_mistakes(scenario.plan, begun, envelope, foreseen, ground):
         yield keypath.read(key), what
+
+
+def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope) -> Iterator[tuple[KeyPath, str]]:
+    """What of a start on the ground can't be."""
+    start = truth.start
+    if not start.on_ground:
+        return
+    if envelope.launch is None:
+        lacking = f"the aircraft {truth.aircraft!r} has no [launch] in its envelope.toml"
+        yield ("truth", "start", "on_ground"), f"{lacking}: add it, or begin in the air"
+    try:
+        relief = terrain.of(truth.terrain)
+    except UserError:  # told already
+        return
+    lat, lon = math.radians(start.lat_deg), math.radians(start.lon_deg)
+    ground = height_of_ground(lat, lon, relief.heights, relief.grid)[0]
+    if not abs(start.alt_m - ground) <= ON_THE_GROUND_M:
+        whose = "truth.terrain.file" if truth.terrain.file else "truth.terrain.height_m"
+        yield (
+            ("truth", "start", "alt_m"),
+            f"a start on the ground is where the ground is, {ground:.1f} m by {whose}, not at {start.alt_m:g}:"
+            " change the one or the other",
+        )
 
 
 def _aircraft_mistakes(named: str) -> Iterator[tuple[KeyPath, str]]:

@@ -28,11 +28,11 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,
   while GNSS has a fix, and not from the beginning of a fault to `RECOVERY_WINDOW_S` after its alarm has ceased.
   ``false_alarms_per_h``: the same per hour of such time.
-* ``flight.`` is how the aircraft flew, in truth, whatever it flew on: ``bank``; ``stall_margin`` and
-  ``overspeed_margin``, equivalent airspeed above the stall at its bank and below the fastest that is flown;
-  ``altitude_error`` from the altitude commanded; ``path_error``, across the circle of loiters that have a ``centre``,
-  from `ON_CIRCLE_S` after it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the first
-  `RETURN_S` after an outage.
+* ``flight.`` is how the aircraft flew, in truth, whatever it flew on, and not before its launch: ``bank``;
+  ``stall_margin`` and ``overspeed_margin``, equivalent airspeed above the stall at its bank and below the fastest that
+  is flown; ``altitude_error`` from the altitude commanded; ``path_error``, across the circle of loiters that have a
+  ``centre``, from `ON_CIRCLE_S` after it is first within `ON_CIRCLE_M` of it. Here ``recovery_`` stands before the
+  first `RETURN_S` after an outage.
 * A recorded flight is judged against its reference: the log's solution, or its GNSS, that kept back in a denial too.
   What the reference doesn't know is not judged; its own covariance is added to the claimed one for NEES.
 * A quantity that could not be formed (no outage, never aligned, never recovered) has no key. Nothing is ever NaN.
@@ -52,6 +52,7 @@ from nav.samples import Array, has_fix
 from testbed.errors import UserError
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
+from testbed.motion.table import ON_GROUND
 from testbed.record.reader import scenario_of
 from testbed.results import write_result
 from testbed.schema import LONGEST_RUN_S
@@ -183,8 +184,10 @@ def _flight(dataset: xarray.DataTree, windows: list[Window]) -> dict[str, float]
     path_error = _path_error(dataset, scenario.plan)
     denied = inside(t, windows)
     returning = inside(t, [(end, end + RETURN_S) for _, end in windows]) & ~denied
+    flown = column(dataset, "truth/leg") != ON_GROUND
+    denied, returning, healthy = denied & flown, returning & flown, ~denied & ~returning & flown
     result: dict[str, float] = {}
-    for prefix, mask in (("", ~denied & ~returning), ("outage_", denied), ("recovery_", returning)):
+    for prefix, mask in (("", healthy), ("outage_", denied), ("recovery_", returning)):
         if not mask.any():
             continue
         result |= {

@@ -17,7 +17,7 @@ from bench.shares import shares
 
 from testbed.exports import FORMATS, export
 from testbed.loop import loop
-from testbed.motion.flight import Aircraft
+from testbed.motion.model import Aircraft
 from testbed.motion.sections import FlightTruth
 from testbed.results import RECORD
 from testbed.scenario import Scenario

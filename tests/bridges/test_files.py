@@ -119,6 +119,20 @@ def test_airspeeds_are_changed_and_turns_are_timed(tmp_path: Path) -> None:
     assert metres(tuple(circles[4:]), (34.05, 108.05, 150.0)) < 0.01
 
 
+def test_from_the_ground_it_begins_with_a_take_off(tmp_path: Path) -> None:
+    path = files.write(Path("take_off"), "plan", tmp_path / "from_rest.plan")
+    first = json.loads(path.read_text())["mission"]["items"][0]
+    launch = aircraft.load("loiter").launch
+    assert launch is not None
+    assert first["command"] == mav.MAV_CMD_NAV_TAKEOFF
+    assert first["params"][0] == launch.pitch_deg
+    # 30 m at the climb that is kept at 25 m/s and 330 m: 4 m/s
+    there, _ = ahead((47.0, 8.0, 300.0), 300.0, 30.0 / 4.0 * 25.4, 330.0)
+    assert metres(tuple(first["params"][4:]), there) < 5
+    trimmed = files.write(Path("take_off"), "px4-params", tmp_path / "from_rest.params").read_text()
+    assert "FW_AIRSPD_TRIM\t25.0\t" in trimmed
+
+
 def test_parameters_for_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = files.write(LOITER, "ardupilot-params", tmp_path / "plane.parm")
     own = mavparm.MAVParmDict()

@@ -81,6 +81,39 @@ def test_until_it_takes_over_the_plan_is_flown() -> None:
     assert same(result.dataset["truth"], run(scenario(4.0)).dataset["truth"])
 
 
+def from_rest(duration_s: float) -> Scenario:
+    changes = {"duration_s": duration_s, "truth.rate_hz": RATE_HZ, "sensors.imu.rate_hz": RATE_HZ, "expect": {}}
+    return Scenario.load("take_off", {**changes, "truth.start.rest_s": 3})
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("protocol", ["px4", pytest.param("ardupilot", marks=pytest.mark.slow)])
+def test_it_takes_off_once_it_is_armed(protocol: str) -> None:
+    armed_s = 4.0  # later than it would have been launched by itself
+    at = round(armed_s * RATE_HZ)
+    peer = (autopilots.Px4 if protocol == "px4" else autopilots.ArduPilot)(at=at, pilot=autopilots.TakeOff())
+    try:
+        far_end = (Px4 if protocol == "px4" else ArduPilot)(peer.url, flies=True)
+        result = run(from_rest(20.0), far_end=far_end)
+    finally:
+        peer.over.set()
+    assert result.failure == ""
+    truth, events = result.dataset["truth"], list(result.dataset["events/text"].values)
+    t, moving = truth["time"].values, np.linalg.norm(truth["v_n"].values, axis=1) > 1e-6
+    assert armed_s + 1.5 < t[moving][0] < armed_s + 3.0
+    assert events.index("launch") > next(k for k, text in enumerate(events) if text.endswith("flies from here on"))
+    assert truth["h"].values[-1] > 310
+    assert result.metrics["flight.stall_margin_min_mps"] > 0
+
+
+def test_until_it_is_armed_it_stays_on_the_ground() -> None:
+    peer = autopilots.Px4()
+    result = run(from_rest(6.0), far_end=Px4(peer.url, flies=True))
+    assert "the aircraft was on the ground to the end: PX4 was never armed with its throttle up" in result.remarks
+    assert np.abs(result.dataset["truth/v_n"].values).max() < 1e-9
+    assert not any(key.startswith("flight.") for key in result.metrics)
+
+
 def test_what_does_not_fly_a_plan_can_not_be_flown() -> None:
     peer = autopilots.Px4()
     kinematic = Scenario.load("kinematic_u_flight", {"duration_s": 1})

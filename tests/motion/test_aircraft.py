@@ -10,8 +10,9 @@ import pytest
 from pydantic import TypeAdapter
 
 from testbed.motion.aircraft import load
-from testbed.motion.flight import FOOT, POUND, Aircraft, Flight
+from testbed.motion.flight import Flight
 from testbed.motion.legs import Leg
+from testbed.motion.model import FOOT, POUND, Aircraft
 from testbed.motion.modes import modes, modes_table
 from testbed.motion.sections import FlightTruth, Start
 

@@ -9,7 +9,7 @@ import pytest
 
 from testbed.errors import UserError
 from testbed.motion import aircraft
-from testbed.motion.flight import Aircraft
+from testbed.motion.model import Aircraft
 from testbed.scenario import Scenario
 
 SCENARIO = """

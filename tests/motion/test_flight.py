@@ -22,9 +22,10 @@ import testbed
 from nav import earth, strapdown
 from testbed.data import data_dir
 from testbed.motion import aircraft
-from testbed.motion.flight import LOGGER, Aircraft, Flight
+from testbed.motion.flight import Flight
 from testbed.motion.guidance import plan_mistakes
 from testbed.motion.legs import Leg
+from testbed.motion.model import LOGGER, Aircraft
 from testbed.motion.paths import Feedback
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import COLUMNS, TruthBlock

@@ -56,6 +56,20 @@ class Circle:
         return right, up, yaw, max(0.0, min(1.0, self._power + 0.1 * slow))
 
 
+class TakeOff(Circle):
+    """Full throttle and surfaces still until it is flying; then wings level, `CLIMB_M` higher than where it was."""
+
+    BANK = 0.0
+    FLYING_MPS, SPEED_MPS, CLIMB_M = 12.0, 25.0, 40.0
+
+    def fly(self, t: float, rates: Sequence[float], angles: Sequence[float], h: float, climb: float, v: float) -> Any:
+        """See `Circle`."""
+        if v < self.FLYING_MPS and self._begun is None:
+            return 0.0, 0.0, 0.0, 1.0
+        self._begun = self._begun or (h + self.CLIMB_M, self.SPEED_MPS)
+        return super().fly(t, rates, angles, h, climb, v)
+
+
 class Voice:
     """What PX4 says over its own MAVLink: truth, but `NORTH_M` too far north. Its clock begins with the first stamp.
 
