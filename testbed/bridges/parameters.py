@@ -24,6 +24,7 @@ from testbed.sensors.imu import ImuConfig
 
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
 AXES = "XYZ"
+AT_ONCE = "the launcher waits for the throttle, which must not wait for the launch"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +59,7 @@ class Facts:
     antenna: tuple[float, float, float]
     imu: tuple[float, float, float]
     airspeed: bool
+    on_ground: bool
 
 
 def content(scenario: Scenario, autopilot: str) -> bytes:
@@ -97,6 +99,7 @@ def _facts(scenario: Scenario) -> Facts:
         antenna=receivers[0].lever_arm_m if receivers else (0.0, 0.0, 0.0),
         imu=imus[0].lever_arm_m if imus else (0.0, 0.0, 0.0),
         airspeed=any(isinstance(one, AirspeedConfig) for one in sections),
+        on_ground=start.on_ground,
     )
 
 
@@ -134,9 +137,7 @@ def _of_px4(facts: Facts) -> Iterator[Parameter]:
         )
     yield Parameter("FW_AIRSPD_STALL", _within(facts.stall, 0.5, 100), "stall [m/s]")
     yield Parameter("FW_AIRSPD_MIN", _within(facts.slowest, 0.5, 100), "slowest, with the margin to the stall [m/s]")
-    yield Parameter(
-        "FW_AIRSPD_TRIM", _within(facts.cruise, 0.5, 100), "the airspeed at which the scenario begins [m/s]"
-    )
+    yield Parameter("FW_AIRSPD_TRIM", _within(facts.cruise, 0.5, 100), "the airspeed at which the plan begins [m/s]")
     yield Parameter("FW_AIRSPD_MAX", _within(facts.fastest, 0.5, 100), "fastest [m/s]")
     yield Parameter("FW_T_CLMB_MAX", _within(facts.climb, 1, 15), "steepest climb at that airspeed [m/s]")
     yield Parameter("FW_T_SINK_MIN", _within(facts.least_sink, 1, 5), "sink at idle at that airspeed [m/s]")
@@ -150,6 +151,8 @@ def _of_px4(facts: Facts) -> Iterator[Parameter]:
         for axis, arm in zip(AXES, place, strict=True):
             yield Parameter(f"EKF2_{what}_POS_{axis}", round(float(arm), 3), f"place of the {sensor} [m]")
     yield Parameter("MIS_TKO_LAND_REQ", 0, "a mission needs neither take-off nor landing")
+    if facts.on_ground:
+        yield Parameter("FW_LAUN_DETCN_ON", 0, AT_ONCE)
     yield Parameter("COM_RC_IN_MODE", 4, "there are no sticks")
     yield Parameter("NAV_DLL_ACT", 0, "a ground station may go away")
     yield Parameter("CBRK_SUPPLY_CHK", 894281, "there is no power supply to be checked before arming")
@@ -180,7 +183,7 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
     yield Parameter(
         "AIRSPEED_CRUISE",
         round(facts.cruise, 2),
-        f"the airspeed at which the scenario begins [m/s]; before 4.5: TRIM_ARSPD_CM,{round(100 * facts.cruise)}",
+        f"the airspeed at which the plan begins [m/s]; before 4.5: TRIM_ARSPD_CM,{round(100 * facts.cruise)}",
     )
     yield Parameter("AIRSPEED_MAX", math.floor(facts.fastest), "fastest [m/s]; before 4.5: ARSPD_FBW_MAX, the same")
     yield Parameter("TECS_CLMB_MAX", _within(facts.climb, 0.1, 20), "steepest climb at that airspeed [m/s]")
@@ -207,5 +210,8 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
         for axis, arm in zip(AXES, facts.antenna, strict=True):
             where = round(float(arm), 3)
             yield Parameter(f"GPS1_POS_{axis}", where, f"place of the antenna [m]; before 4.6: GPS_POS1_{axis},{where}")
+    if facts.on_ground:
+        for name in ("TKOFF_THR_MINACC", "TKOFF_THR_MINSPD"):
+            yield Parameter(name, 0, AT_ONCE)
     for axis, arm in zip(AXES, facts.imu, strict=True):
         yield Parameter(f"INS_POS1_{axis}", round(float(arm), 3), "place of the first IMU [m]")

@@ -131,6 +131,10 @@ def test_from_the_ground_it_begins_with_a_take_off(tmp_path: Path) -> None:
     assert metres(tuple(first["params"][4:]), there) < 5
     trimmed = files.write(Path("take_off"), "px4-params", tmp_path / "from_rest.params").read_text()
     assert "FW_AIRSPD_TRIM\t25.0\t" in trimmed
+    assert "FW_LAUN_DETCN_ON\t0\t6" in trimmed
+    own = mavparm.MAVParmDict()
+    assert own.load(str(files.write(Path("take_off"), "ardupilot-params", tmp_path / "from_rest.parm")))
+    assert (own["TKOFF_THR_MINACC"], own["TKOFF_THR_MINSPD"], own["AIRSPEED_CRUISE"]) == (0, 0, 25)
 
 
 def test_parameters_for_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

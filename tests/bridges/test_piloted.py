@@ -13,6 +13,7 @@ from testbed import RunResult, Scenario, run
 from testbed.bridges.ardupilot import ArduPilot
 from testbed.bridges.px4 import Px4
 from testbed.errors import UserError
+from testbed.feeds.played import played
 
 TAKEN_OVER_S = 3.0
 RATE_HZ = 100.0
@@ -104,6 +105,7 @@ def test_it_takes_off_once_it_is_armed(protocol: str) -> None:
     assert events.index("launch") > next(k for k, text in enumerate(events) if text.endswith("flies from here on"))
     assert truth["h"].values[-1] > 310
     assert result.metrics["flight.stall_margin_min_mps"] > 0
+    assert same(run(from_rest(20.0), far_end=played(result.dataset)).dataset, result.dataset)
 
 
 def test_until_it_is_armed_it_stays_on_the_ground() -> None:
