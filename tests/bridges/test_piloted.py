@@ -114,6 +114,7 @@ def test_until_it_is_armed_it_stays_on_the_ground() -> None:
     assert "the aircraft was on the ground to the end: PX4 was never armed with its throttle up" in result.remarks
     assert np.abs(result.dataset["truth/v_n"].values).max() < 1e-9
     assert not any(key.startswith("flight.") for key in result.metrics)
+    assert any("never flown: the run ended before the first" in remark for remark in result.remarks)
 
 
 def test_what_does_not_fly_a_plan_can_not_be_flown() -> None:
