@@ -27,6 +27,7 @@ def test_the_promised_scenarios_are_shipped() -> None:
         "survey_racetrack_wind",
         "jammer_zone",
         "static_bench",
+        "take_off",
     }
     promised |= {"loiter_ahrs_denied", "loiter_ahrs_continuous", "loiter_heading", "loiter_fault_tolerant"}
     promised |= {"regression", "hardware_loiter", "hardware_gnss_outage"}

@@ -23,16 +23,6 @@ END_S, TAKEN_OVER_S = 5.0, 3.0
 TICK_HZ, IMU_HZ = 100.0, 50.0  # so that a chunk may end between two steps
 
 
-def from_rest(folder: Path) -> Path:
-    changes = {"duration_s": END_S, "truth.rate_hz": TICK_HZ, "sensors.imu.rate_hz": IMU_HZ, "expect": {}}
-    peer = autopilots.Px4(at=round(1.0 * IMU_HZ), pilot=autopilots.TakeOff())
-    try:
-        run(Scenario.load("take_off", changes), far_end=Px4(peer.url, flies=True), out=folder)
-    finally:
-        peer.over.set()
-    return folder / "run.nc"
-
-
 def fly(folder: Path, behaviour: str = "") -> Path:
     changes = {"duration_s": END_S, "truth.rate_hz": TICK_HZ, "sensors.imu.rate_hz": IMU_HZ, "expect": {}}
     one = {"name": "ins", "aids": ["gnss", "barometer", "magnetometer", "airspeed"]}
@@ -74,13 +64,6 @@ def test_the_record_is_run_again_bit_for_bit(flown: Path, tmp_path: Path, monkey
     again, before = load(tmp_path / "run.nc"), load(flown)
     assert same(again, before)
     assert again.attrs["far_end"] == before.attrs["far_end"]
-
-
-@pytest.mark.ci
-def test_a_take_off_is_repeated_too(tmp_path: Path) -> None:
-    before = load(from_rest(tmp_path))
-    assert "launch" in before["events/text"].values.tolist()
-    assert same(run(scenario_of(before), far_end=played(before)).dataset, before)
 
 
 @pytest.mark.ci
