@@ -15,6 +15,7 @@ import numpy as np
 from nav import unscented
 from nav._jit import njit
 from nav.aids.airspeed import AirspeedAid, Silence
+from nav.aids.barometer import BarometerAid, Scatter
 from nav.aids.base import (
     FUSED,
     OUTSIDE,
@@ -31,7 +32,7 @@ from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_error
 from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
-from nav.samples import Array, Outcome, Sample, UpdateReport
+from nav.samples import Array, BarometerSample, Outcome, Sample, UpdateReport
 from nav.smoother import Smoother
 from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
@@ -71,6 +72,7 @@ class LocalFilter:
         self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
+        self._scatters = {aid.sensor: Scatter() for aid in aids if isinstance(aid, BarometerAid) and aid.scatters}
         self._silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
@@ -188,6 +190,9 @@ class LocalFilter:
         here = OperatingPoint(reference, state, state.x[self.row], self._starts[aid.sensor], state.P[self.row])
         measurement = aid.measure(part, sample, here)
         noise = self._noise(aid.sensor, part)
+        if measurement is not None and isinstance(sample, BarometerSample) and aid.sensor in self._scatters:
+            scatter = self._scatters[aid.sensor].heard(sample)
+            measurement = measurement._replace(R=np.maximum(measurement.R, scatter))
         if measurement is None or noise is None:
             return measurement
         return measurement._replace(R=noise.learned(measurement.R), reported=measurement.R)

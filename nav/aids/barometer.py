@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -10,31 +11,42 @@ import numpy as np
 from nav._jit import njit
 from nav.aids.base import Measurement, OperatingPoint, range_problem
 from nav.earth import pressure_altitude
-from nav.error_model import POS, Block
+from nav.error_model import POS, Block, markov
 from nav.samples import Array, BarometerSample, Sample
 
+CLOSE_S = 0.25  # between neighbours: 10 m/s^2 bend the line by 0.1 m then [s]
+SCATTER_SAMPLES, OUTLYING = 100, 10.0  # that are averaged; times the mean square that one of them counts at most
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly report [Pa]
 
 
 @dataclass(frozen=True)
 class BarometerAid:
-    """Pressure altitude with a walking bias: weather and geoid, before the first GNSS height tells."""
+    """Pressure altitude with a walking bias, weather and geoid before the first GNSS height tells, and the airframe's
+    wake, a first-order Markov error.
+    """
 
     sensor: str = "barometer"
     sigma: float = 0.5  # [m]
     bias_sigma: float = 300.0  # [m]
     bias_walk: float = 0.03  # [m/sqrt(s)]
+    error_sigma: float = 0.0  # of the wake [m]
+    error_correlation_s: float = 10.0
+    scatters: bool = False  # its samples may scatter by more than sigma: see `Scatter`
 
     parts = (("barometer", 1),)
 
     @property
     def states(self) -> tuple[str, ...]:
         """See `Aid`."""
-        return (f"{self.sensor}_bias",)
+        return f"{self.sensor}_bias", f"{self.sensor}_error"
 
     def blocks(self) -> list[Block]:
         """See `Aid`."""
-        return [Block(self.states[0], 1, self.bias_sigma, self.bias_walk)]
+        bias, error = self.states
+        return [
+            Block(bias, 1, self.bias_sigma, self.bias_walk),
+            markov(error, 1, self.error_sigma, self.error_correlation_s),
+        ]
 
     @cached_property
     def _R(self) -> Array:
@@ -43,8 +55,39 @@ class BarometerAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, BarometerSample)
-        nu, H = barometer(at.state.lla, at.x, at.starts[0], pressure_altitude(sample.pressure))
+        bias, error = at.starts
+        nu, H = barometer(at.state.lla, at.x, bias, error, pressure_altitude(sample.pressure))
         return Measurement(nu, H, self._R)
+
+
+@dataclass
+class Scatter:
+    """The white noise that a barometer's own samples show, whatever a filter thinks of them.
+
+    It is how far each is from the line through its neighbours, where these are so close that height can't have bent
+    it: squares averaged over some seconds. Parts of one kind differ by ten times in it.
+    """
+
+    variance: float = 0.0  # [m^2]
+    _taken: int = 0
+    _last: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=3))  # times, pressure altitudes
+
+    def heard(self, sample: BarometerSample) -> float:
+        """The variance [m^2] with one more sample; one that it was told of before changes nothing."""
+        last = self._last
+        if last and sample.t <= last[-1][0]:
+            return self.variance
+        last.append((sample.t, pressure_altitude(sample.pressure)))
+        if len(last) < 3 or sample.t - last[0][0] > 2 * CLOSE_S:
+            return self.variance
+        (t0, h0), (t1, h1), (t2, h2) = last
+        share = (t1 - t0) / (t2 - t0)
+        square = (h1 - h0 - share * (h2 - h0)) ** 2 / (1 + share**2 + (1 - share) ** 2)
+        if self._taken >= SCATTER_SAMPLES:
+            square = min(square, OUTLYING * self.variance)
+        self._taken = min(self._taken + 1, SCATTER_SAMPLES)
+        self.variance += (square - self.variance) / self._taken
+        return self.variance
 
 
 def problem(sample: BarometerSample) -> str:
@@ -53,10 +96,13 @@ def problem(sample: BarometerSample) -> str:
 
 
 @njit
-def barometer(lla: Array, x: Array, barometer_bias: int, pressure_altitude: float) -> tuple[Array, Array]:
-    """Pressure altitude [m]: h + bias."""
-    nu = np.array([pressure_altitude - lla[2] - x[barometer_bias]])
+def barometer(lla: Array, x: Array, bias: int, error: int, pressure_altitude: float) -> tuple[Array, Array]:
+    """Pressure altitude [m]: h + bias + error; each is where its state is, -1 for none."""
+    nu = np.array([pressure_altitude - lla[2]])
     H = np.zeros((1, len(x)))
     H[0, POS + 2] = -1.0
-    H[0, barometer_bias] = 1.0
+    for state in (bias, error):
+        if state >= 0:
+            H[0, state] = 1.0
+            nu[0] -= x[state]
     return nu, H

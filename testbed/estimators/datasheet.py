@@ -148,9 +148,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
                 velocity_lag=e.velocity_lag,
             )
         case BarometerConfig():
-            b = section.errors()
-            walk = _drive(b.drift, b.drift_tau) * METRES_PER_PASCAL
-            return BarometerAid(name, sigma=math.hypot(b.noise, b.unsteady) * METRES_PER_PASCAL, bias_walk=walk)
+            return _barometer(name, section)
         case MagnetometerConfig():
             return _compass(name, section, usual)
         case AirspeedConfig():
@@ -180,6 +178,19 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             return WindReportAid(name, w.local, w.tau, left, air.wind_walk)
     maker = registry.of(section).aid  # of a sensor of the user's
     return None if maker is None else maker(name, section, imu)
+
+
+def _barometer(name: str, section: BarometerConfig) -> Aid:
+    """A barometer; one in a wake is of an installation whose white noise no data sheet knows."""
+    b = section.errors()
+    return BarometerAid(
+        name,
+        sigma=b.noise * METRES_PER_PASCAL,
+        bias_walk=_drive(b.drift, b.drift_tau) * METRES_PER_PASCAL,
+        error_sigma=b.unsteady * METRES_PER_PASCAL,
+        error_correlation_s=b.unsteady_tau,
+        scatters=b.unsteady > 0,
+    )
 
 
 def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:

@@ -159,6 +159,7 @@ EXTRA = {
         "s", "estimated latency of GNSS position, and further lag of its velocity, beyond what is told", ("fix_part",)
     ),
     "barometer_bias": Variable("m", "estimated bias of pressure altitude"),
+    "barometer_error": Variable("m", "estimated correlated error of pressure altitude"),
     "magnetometer_bias": Variable("T", "estimated magnetometer bias", ("body",)),
     "magnetometer_anomaly": Variable("T", "estimated error of the reference field, constant over ground", ("ned",)),
     "magnetometer_soft_iron": Variable("1", "estimated soft iron matrix less the unit matrix", ("element",)),

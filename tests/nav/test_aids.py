@@ -27,7 +27,7 @@ from nav.samples import (
 IMU = ImuModel(1e-4, 1e-3, 1e-4, 0.05, 0, 0, 1e-5, 1e-3, 300.0, 300.0, 1e-3, 1e-3)
 AIDS = (
     aids.GnssAid(position_error_sigma=(1.0, 1.0, 2.0), velocity_error_sigma=(0.1, 0.1, 0.1)),
-    aids.BarometerAid(),
+    aids.BarometerAid(error_sigma=1.0),
     aids.MagnetometerAid(anomaly_sigma=1e-7, error_sigma=1e-7),
     aids.AirspeedAid(gust_sigma=1.0, scale_sigma=0.02),
 )
@@ -39,7 +39,7 @@ FIELD_N = np.array([28e-6, -2e-6, 40e-6])
 STEPS = {"phi": 1e-5, "dv": 1e-2, "dp": 1.0, "gyro_bias": 1e-3, "gyro_drift": 1e-3, "gyro_scale": 1e-3,
          "accel_bias": 1e-2, "accel_drift": 1e-2, "accel_scale": 1e-2, "magnetometer_bias": 1e-7,
          "magnetometer_anomaly": 1e-7, "magnetometer_error": 1e-7, "magnetometer_soft_iron": 1e-3,
-         "airspeed_scale": 1e-3, "wind": 1e-2, "gust": 1e-2}  # fmt: skip
+         "airspeed_scale": 1e-3, "wind": 1e-2, "gust": 1e-2, "barometer_error": 1.0}  # fmt: skip
 
 
 def state(seed):
@@ -80,7 +80,9 @@ def gnss_velocity(at):
 
 
 def barometer(at):
-    return aids.barometer.barometer(at[2], at[3], MODEL.start("barometer_bias"), pressure_altitude(95_000.0))
+    return aids.barometer.barometer(
+        at[2], at[3], MODEL.start("barometer_bias"), MODEL.start("barometer_error"), pressure_altitude(95_000.0)
+    )
 
 
 def magnetometer(at):

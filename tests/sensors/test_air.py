@@ -69,7 +69,7 @@ def test_airspeed_errors():
         assert config.errors().bias + 25.0 * config.errors().scale == pytest.approx(sigma)
 
 
-def test_unsteady_errors_are_gauss_markov_and_told_as_noise():
+def test_unsteady_errors_are_gauss_markov_and_filters_know():
     truth = still(40_000, 10.0)
     config = BarometerConfig(grade="perfect", rate_hz=10.0, noise_pa=3.0, unsteady_pa=40.0, unsteady_time_s=8.0)
     off = pressures(config, truth, rate_hz=10.0) - 101_325
@@ -80,9 +80,10 @@ def test_unsteady_errors_are_gauss_markov_and_told_as_noise():
     assert off.std() == pytest.approx(14, rel=0.05)
     assert np.corrcoef(off[20:], off[:-20])[0, 1] == pytest.approx(np.exp(-1), abs=0.1)
     rig = Scenario.load("u_turn", {"sensors.barometer.grade": "hobby", "sensors.airspeed.grade": "hobby"}).rig(1)
-    told = [aid_of(name, rig, rig.imu("imu").errors(), rig.air(0.0)).sigma for name in ("barometer", "airspeed")]
-    assert told[0] == pytest.approx(40.1 / 12, rel=0.01)
-    assert told[1] == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
+    told = {name: aid_of(name, rig, rig.imu("imu").errors(), rig.air(0.0)) for name in ("barometer", "airspeed")}
+    wake = told["barometer"]
+    assert (wake.sigma, wake.error_sigma, wake.error_correlation_s) == pytest.approx((3 / 12, 40 / 12, 8.0))
+    assert told["airspeed"].sigma == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
 
 
 @pytest.mark.parametrize("beta_deg", [0.0, 10.0, -20.0])
