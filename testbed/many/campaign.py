@@ -308,7 +308,7 @@ def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
     flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
-        "scenario text": scenarios[0].text,
+        "scenario": _deciding(scenarios[0].text),
         "overrides": list(plan.overrides),
         "varied values": {key: list(values) for key, values in plan.vary.items()},
         "code": code(),
@@ -316,6 +316,14 @@ def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
         "logs": log_digests(scenarios),
         "versions": versions(),
     }
+
+
+def _deciding(text: str) -> dict[str, Any]:
+    """A scenario's text as data, without what it expects: that changes no number, and is set by what was flown."""
+    told = tomllib.loads(text)
+    told.pop("expect", None)
+    plain: dict[str, Any] = json.loads(json.dumps(told, default=str))
+    return plain
 
 
 def _stem(folder: Path, combination: int, seed: int) -> Path:

@@ -460,8 +460,13 @@ def test_folder_of_another_campaign(at_rest: Path, tmp_path: Path, threads: str)
     campaign(at_rest, 1, workers=threads, out=out)
     with pytest.raises(UserError, match="different overrides: choose another folder with --out"):
         campaign(at_rest, 1, overrides=["duration_s=79"], workers=threads, out=out)
-    at_rest.write_text(AT_REST + "# changed\n")
-    with pytest.raises(UserError, match="different scenario text"):
+    begun = (out / "setup.json").stat().st_mtime_ns
+    at_rest.write_text(AT_REST + '[expect]\n"ins.position_horizontal_rms_m" = 100\n')
+    again = campaign(at_rest, 1, workers=threads, out=out)
+    assert [one.share.value for one in again.statistics.expected] == [1.0]
+    assert (out / "setup.json").stat().st_mtime_ns == begun
+    at_rest.write_text(AT_REST.replace("rate_hz = 5\n", "rate_hz = 2\n"))
+    with pytest.raises(UserError, match="different scenario: choose"):
         campaign(at_rest, 1, workers=threads, out=out)
     (out / "setup.json").write_text("{")
     with pytest.raises(UserError, match=r"setup\.json: is damaged"):
