@@ -41,6 +41,8 @@ NOT_RUN = {
     "testbed check": "flies in processes, for minutes without names: tests/many, tests/test_shipped.py",
     "testbed run loiter_gnss_outage --px4": "waits for PX4: tests/bridges/test_px4.py",
     "testbed run loiter_gnss_outage --ardupilot": "waits for ArduPilot: tests/bridges/test_ardupilot.py",
+    "testbed run take_off --px4": "waits for PX4: tests/bridges/test_piloted.py",
+    "testbed run take_off --ardupilot": "waits for ArduPilot: tests/bridges/test_piloted.py",
     "testbed papers": "takes minutes: tests/papers",
     "testbed view": "opens a browser: tests/report/test_compare.py",
     "python scenarios/sweep_outage.py": "flies half an hour",

@@ -20,6 +20,8 @@ from testbed.loop.keyboard import Keyboard, keys
 from testbed.loop.requests import End, Faster, Restart, Step, Toggle
 from testbed.record import reader as record
 
+PATIENCE_S = 120.0  # with a machine that is busy with something else
+
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
@@ -92,7 +94,7 @@ class Typist:
 
     def sees(self, text: str) -> bool:
         """Whether ``text`` appears within a while, after what was seen before."""
-        until = time.monotonic() + 30.0
+        until = time.monotonic() + PATIENCE_S
         while text not in self.seen and time.monotonic() < until:
             if select.select([self._ours], [], [], 0.1)[0]:
                 self.seen += os.read(self._ours, 4096).decode(errors="replace")
@@ -102,7 +104,7 @@ class Typist:
 
     def ended(self) -> int:
         """The exit code, everything read, as a terminal does."""
-        until = time.monotonic() + 30.0
+        until = time.monotonic() + PATIENCE_S
         while self.running.poll() is None and time.monotonic() < until:
             if select.select([self._ours], [], [], 0.1)[0]:
                 os.read(self._ours, 4096)
