@@ -16,7 +16,6 @@ from testbed.papers.zhu2020.flight import (
     FRKF,
     FRKF_ALONE,
     OUTAGE,
-    RARELY,
     SHARED,
     SHARED_ALONE,
     TFKF,
@@ -46,7 +45,6 @@ CONVERGED: Mapping[str, tuple[str, tuple[int, ...], float]] = {
     "longitude": ("m", (P_E,), 16.0),
 }
 LOST: Mapping[str, tuple[int, float]] = {"latitude": (P_N, 17.57), "longitude": (P_E, 18.68)}  # section 4.3
-SOME = f"one draw in {RARELY}"
 
 
 def conclude(results: Sequence[Any]) -> list[Claim]:
@@ -75,7 +73,7 @@ def largest(flown: Flown, columns: Sequence[int], start: float, end: float = np.
 
 def ratios(draws: Sequence[Draw], pair: tuple[str, str], column: int, start: float, end: float) -> list[float]:
     """Of standard deviations, the robust filter's over the traditional one's."""
-    both = [(one.river[pair[0]], one.river[pair[1]]) for one in draws if pair[0] in one.river]
+    both = [(one.river[pair[0]], one.river[pair[1]]) for one in draws]
     return [std(robust, column, start, end) / std(plain, column, start, end) for robust, plain in both]
 
 
@@ -91,10 +89,7 @@ def _spread_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
             for what, (column, plain, robust) in SPREAD.items():
                 ours, paper = ratios(draws, pair, column, start, end), robust / plain
                 printed = f"{paper:.2f}" if claimed and start == 0 and end == np.inf else ""
-                note = "" if claimed else SOME
-                yield Claim(
-                    f"{mode}, {span}: std of {what}, robust over traditional", "", printed, ours, paper, note=note
-                )
+                yield Claim(f"{mode}, {span}: std of {what}, robust over traditional", "", printed, ours, paper)
     for what, (column, _, robust) in SPREAD.items():
         ours = [std(one.river[FRKF_ALONE], column) for one in draws]
         unit = "m/s" if what.startswith("v") else "m"
@@ -108,7 +103,7 @@ def _converged_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
     for mode, name, claimed in (("no feedback", FRKF_ALONE, True), ("with feedback", FRKF, False)):
         for what, (unit, columns, limit) in CONVERGED.items():
             factor = float(np.degrees(1.0)) if unit == "deg" else 1.0
-            ours = [factor * largest(one.river[name], columns, CONVERGED_S) for one in draws if name in one.river]
+            ours = [factor * largest(one.river[name], columns, CONVERGED_S) for one in draws]
             quantity = f"{mode}, after convergence: largest error of {what}"
             printed, statistic = (f"< {limit:g}", NEARLY_ALL) if claimed else ("", MEDIAN)
             yield Claim(quantity, unit, printed, ours, limit, statistic=statistic)
@@ -126,7 +121,7 @@ def _step_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
 
 
 def _lost(draws: Sequence[Draw], name: str, columns: Sequence[int], start: float = OUTAGE[0]) -> list[float]:
-    return [largest(one.outage[name], columns, start, OUTAGE[1]) for one in draws if name in one.outage]
+    return [largest(one.outage[name], columns, start, OUTAGE[1]) for one in draws]
 
 
 def _outage_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
@@ -137,19 +132,19 @@ def _outage_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
         name = f"{gap}, no feedback: largest error of {what}"
         yield Claim(name, "m", f"{paper:.1f}", ours, paper, statistic=NEARLY_ALL)
         yield Claim(f"{name}, draws within the paper's", "", "its one", np.array(ours) <= paper, 0.5, True, SHARE)
-    for name, label, note in (
-        (FRKF, "with feedback", SOME),
-        (SHARED, "with feedback, shares by covariance", SOME),
-        (SHARED_ALONE, "no feedback, shares by covariance", SOME),
+    for name, label in (
+        (FRKF, "with feedback"),
+        (SHARED, "with feedback, shares by covariance"),
+        (SHARED_ALONE, "no feedback, shares by covariance"),
     ):
         for what, (column, paper) in LOST.items():
             quantity = f"{gap}, {label}: largest error of {what}"
-            yield Claim(quantity, "m", "", _lost(draws, name, (column,)), paper, statistic=MEDIAN, note=note)
+            yield Claim(quantity, "m", "", _lost(draws, name, (column,)), paper)
     alone = _lost(draws, DVL, HORIZONTAL)
-    yield Claim(f"{gap}: largest error of the log's filter alone", "m", "81.5", alone, 81.53, note=SOME)
+    yield Claim(f"{gap}: largest error of the log's filter alone", "m", "81.5", alone, 81.53)
     alone = _lost(draws, AST, HORIZONTAL, OUTAGE[1])
     quantity = "error of the transponder's filter alone at the end of it"
-    yield Claim(quantity, "m", "225", alone, 100.0, at_least=True, note=SOME)
+    yield Claim(quantity, "m", "225", alone, 100.0, at_least=True)
 
 
 def _weight_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
@@ -169,7 +164,7 @@ def _weight_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
         for what, (column, paper) in LOST.items():
             quantity = f"outage by equation 13 {units}: largest error of {what}"
             ours = _lost(draws, name, (column,))
-            yield Claim(quantity, "m", f"{paper:.1f}", ours, paper, misprint=misprint, note=SOME)
+            yield Claim(quantity, "m", f"{paper:.1f}", ours, paper, misprint=misprint)
 
 
 def _clean_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
@@ -179,9 +174,9 @@ def _clean_claims(draws: Sequence[Draw]) -> Iterator[Claim]:
         return float(np.sqrt(np.mean(flown.error[:, columns] ** 2)))
 
     for what, columns in (("position", HORIZONTAL), ("velocity", (V_N, V_E))):
-        loss = [100 * (rms(one.clean[FRKF], columns) / rms(one.clean[TFKF], columns) - 1) for one in draws if one.clean]
+        loss = [100 * (rms(one.clean[FRKF], columns) / rms(one.clean[TFKF], columns) - 1) for one in draws]
         quantity = f"sound Gaussian data: RMS of {what}, loss by inflation"
-        yield Claim(quantity, "%", "", loss, 2.0, note=SOME)
+        yield Claim(quantity, "%", "", loss, 2.0)
 
 
 def _solver_claims(solved: Mapping[str, float]) -> Iterator[Claim]:

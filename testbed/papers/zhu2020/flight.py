@@ -38,13 +38,11 @@ CLEAN = ("fault=[]", 'sensors.ast.distribution="gaussian"', "sensors.ast.horizon
 OUTLIERS = 150.5 + 150.0 * np.arange(23)  # [s]
 OUTAGE = (1500.0, 2500.0)
 EVERY_S = 10.0
-RARELY = 5  # one draw of so many has what is no claim of the paper, equation 13, and the filters of one aid
 COMMON = 15  # states that the local filters share
 LIMIT = chi_square_threshold(0.01, 2)
 CASES = 4000
 FRKF, TFKF = "frkf", "tfkf"  # with feedback; without, as section 3.2 has it:
 FRKF_ALONE, TFKF_ALONE = "frkf_no_reset", "tfkf_no_reset"
-ALWAYS = (FRKF_ALONE, TFKF_ALONE)
 DVL, AST = "rkf_dvl", "rkf_ast"
 EQ13, EQ13_DEGREES, SHARED, SHARED_ALONE = "eq13", "eq13_degrees", "shared", "shared_no_reset"
 WEIGHTS: Mapping[str, Weigh] = {
@@ -63,8 +61,8 @@ class Flown(NamedTuple):
 
 
 class Draw(NamedTuple):
-    """One draw: each filter by name on the ``river`` and in the ``outage``; on the river without any fault, where that
-    was flown; the weight of the transponder's filter at the end of the outage by each of `WEIGHTS`.
+    """One draw: each filter by name on the ``river``, in the ``outage``, and on the river without any fault; the weight
+    of the transponder's filter at the end of the outage by each of `WEIGHTS`.
     """
 
     river: Mapping[str, Flown]
@@ -85,24 +83,17 @@ def placed(name: str, seed: int, *overrides: str) -> Scenario:
     return scenario(name, (*here.start, period, *rates, *overrides))
 
 
-def fly(seed: int, rarely: bool) -> Draw:
-    """Every filter on one draw; ``rarely`` those too that are flown in some draws only."""
+def fly(seed: int) -> Draw:
+    """Every filter on one draw."""
     chosen = placed("zhu2020", seed, SLOW_LOG)
-    river = navigate(chosen, seed, _lanes(chosen, seed, rarely), chosen.duration_s)
+    river = navigate(chosen, seed, flights.lanes(chosen, seed), chosen.duration_s)
     chosen = placed("zhu2020_outage", seed)
-    lanes = _lanes(chosen, seed, rarely) | (others(chosen, seed) if rarely else {})
+    lanes = flights.lanes(chosen, seed) | others(chosen, seed)
     outage = navigate(chosen, seed, lanes, OUTAGE[1])
-    clean: Mapping[str, Flown] = {}
-    if rarely:
-        sound = placed("zhu2020", seed, SLOW_LOG, *CLEAN)
-        both = {name: lane for name, lane in flights.lanes(sound, seed).items() if name in (FRKF, TFKF)}
-        clean = navigate(sound, seed, both, sound.duration_s)
+    sound = placed("zhu2020", seed, SLOW_LOG, *CLEAN)
+    both = {name: lane for name, lane in flights.lanes(sound, seed).items() if name in (FRKF, TFKF)}
+    clean = navigate(sound, seed, both, sound.duration_s)
     return Draw(river, outage, clean, weights(lanes[FRKF_ALONE]))
-
-
-def _lanes(chosen: Scenario, seed: int, rarely: bool) -> dict[str, Lane]:
-    """The scenario's estimators; but for ``rarely`` those that the paper's claims are about."""
-    return {name: lane for name, lane in flights.lanes(chosen, seed).items() if rarely or name in ALWAYS}
 
 
 def others(chosen: Scenario, seed: int) -> dict[str, Lane]:
