@@ -1,12 +1,12 @@
 """What the runs of a campaign say together: statistics, tables, figures.
 
-Median, 95th percentile and worst are over the runs of one combination of varied values. An interval of a quantile is
-from one order statistic to another, and holds the quantile of all draws with at least 95 %, whatever the distribution
-(Conover, Practical Nonparametric Statistics, 1999, 3.2). Consistency is judged by the
-position NEES: over n independent runs of a filter whose covariance is right, the sum at one instant is chi-square with
-3 n degrees of freedom, so that the mean per degree of freedom lies between the 2.5 % and 97.5 % points of
-chi2(3 n) / (3 n) at 95 % of all instants (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
-Navigation, 2001, 5.4).
+Median, 95th percentile and worst are over the runs of one combination of varied values: what half of them, or 95 %, do
+not exceed (`testbed.score.claims`). An interval of a quantile is from one order statistic to another, and holds the
+quantile of all draws with at least 95 %, whatever the distribution (Conover, Practical Nonparametric Statistics, 1999,
+3.2). Consistency is judged by the position NEES: over n independent runs of a filter whose covariance is right, the sum
+at one instant is chi-square with 3 n degrees of freedom, so that the mean per degree of freedom lies between the 2.5 %
+and 97.5 % points of chi2(3 n) / (3 n) at 95 % of all instants (Bar-Shalom, Li, Kirubarajan, Estimation with
+Applications to Tracking and Navigation, 2001, 5.4).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from testbed.report.expected import COLUMNS, Kept, kept
 from testbed.report.page import Shown, png, render, script_of
 from testbed.results import REPORT, write_result
 from testbed.score.accuracy import AXES
-from testbed.score.claims import student
+from testbed.score.claims import HARDLY_ANY, MEDIAN, NEARLY_ALL, student
 from testbed.score.metrics import OUTAGE_MARKS_S
 
 if TYPE_CHECKING:
@@ -67,7 +67,6 @@ OF_FAULTS: Mapping[str, str] = {
 }
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})
 ERROR_AT, BOUND_AT = "outage_position_horizontal_at_{}s_m", "outage_bound_at_{}s_m"
-CONFIDENCE = 0.95  # of the interval of a quantile, or of a mean
 MEAN_ERROR = re.compile(r"(outage_)?(position|velocity)_(north|east|down)_mean_\w+")
 
 
@@ -76,7 +75,7 @@ class Spread:
     """One metric of one estimator over the runs of one combination; ``runs`` counts those that have a number for it.
 
     ``p95`` is what 95 % of them do not exceed, or do not stay below where large is good. The ``_low`` and ``_high`` of
-    median and p95 are the ends of their 95 % intervals, NaN where there are too few runs for one.
+    median and p95 are the ends of their 95 % intervals, infinite where there are too few runs for one.
     """
 
     combination: int
@@ -183,10 +182,10 @@ def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> I
         key = f"{estimator}.{metric}"
         found = [(o.metrics[key], o.seed) for o in outcomes if key in o.metrics]
         if found:
-            values = [value for value, _ in found]
+            values = np.array([value for value, _ in found])
             small = metric.partition(".")[0] in BEST_LARGE
             worst, seed = (min if small else max)(found, key=lambda pair: pair[0])
-            median, p95 = _quantile(values, 0.5), _quantile(values, 0.05 if small else 0.95)
+            median, p95 = MEDIAN.of(values), (HARDLY_ANY if small else NEARLY_ALL).of(values)
             yield Spread(combination, estimator, metric, *median, *p95, worst, seed, len(found))
 
 
@@ -215,14 +214,6 @@ def _mean(values: Array) -> tuple[float, float, float]:
     if len(values) < 2:
         return float(values.mean()), math.nan, math.nan
     return student(values)
-
-
-def _quantile(values: Sequence[float], p: float) -> tuple[float, float, float]:
-    """The ``p`` quantile of some values, and the ends of its interval."""
-    from scipy.stats import quantile_test  # takes half a second to import
-
-    interval: Any = quantile_test(values, p=p).confidence_interval(CONFIDENCE)
-    return float(np.quantile(values, p)), float(interval.low), float(interval.high)
 
 
 def _consistency(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Consistency:
@@ -421,11 +412,12 @@ def _called(metric: str) -> str:
 
 def _interval(low: float, high: float) -> str:
     """Both ends, or the one that there is."""
-    if math.isnan(low) and math.isnan(high):
+    ends = math.isfinite(low), math.isfinite(high)
+    if all(ends):
+        return f"{_number(low)} – {_number(high)}"
+    if not any(ends):
         return "too few runs"
-    if math.isnan(low):
-        return f"≤ {_number(high)}"
-    return f"≥ {_number(low)}" if math.isnan(high) else f"{_number(low)} – {_number(high)}"
+    return f"≥ {_number(low)}" if ends[0] else f"≤ {_number(high)}"
 
 
 def _number(value: float) -> str:

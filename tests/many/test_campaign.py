@@ -578,15 +578,15 @@ def test_statistics(tmp_path: Path) -> None:
     assert second.inside == 0.0
     assert first.false_alarms_per_h == pytest.approx(0.5)
     rms = next(s for s in statistics.spreads if s.metric == "position_horizontal_rms_m")
-    assert (rms.median, rms.worst, rms.worst_seed, rms.runs) == (14.5, 29.0, 29, 30)
-    assert rms.p95 == pytest.approx(0.95 * 29)
+    assert (rms.median, rms.worst, rms.worst_seed, rms.runs) == (14.0, 29.0, 29, 30)  # half do not exceed 14
+    assert rms.p95 == 28.0  # the 29th of 30
     recovery = next(s for s in statistics.spreads if s.metric == "recovery_s")
     assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
     delay = next(s for s in statistics.spreads if s.metric == "detection_delay_s.jump")
     assert (delay.worst, delay.worst_seed) == (pytest.approx(2.9), 29)
     coverage = next(s for s in statistics.spreads if s.metric == "coverage.jump")  # little is bad
     assert (coverage.worst, coverage.worst_seed) == (pytest.approx(0.71), 29)
-    assert coverage.p95 == pytest.approx(1 - 0.95 * 0.29)
+    assert coverage.p95 == pytest.approx(0.72)  # the second
     shown = "".join(str(cell) for cell in campaign_report.tables(made_up_campaign(tmp_path, ["0"]))[0].columns[1].cells)
     assert "jump: detected after \\[s]" in shown
 
@@ -655,19 +655,6 @@ def test_the_manual_has_a_section_for_each_scenario(tmp_path: Path, monkeypatch:
 def test_the_manual_is_of_shipped_scenarios(plan: Plan) -> None:
     with pytest.raises(UserError, match="shipped scenarios"):
         expected.require_shipped(plan)
-
-
-@pytest.mark.ci
-def test_intervals_of_quantiles_hold_them() -> None:
-    rng = np.random.default_rng(8)
-    draws, held = 300, {0.5: 0, 0.95: 0}
-    for _ in range(draws):
-        runs = rng.exponential(size=100)
-        for p in held:
-            at, low, high = campaign_report._quantile(runs, p)
-            assert low <= at <= high
-            held[p] += low <= -math.log(1 - p) <= high
-    assert min(held.values()) >= 0.95 * draws - 3 * math.sqrt(0.95 * 0.05 * draws)
 
 
 def test_few_runs_have_no_interval(tmp_path: Path) -> None:
