@@ -6,6 +6,7 @@ Nothing heavy is imported before a command needs it, so that help and completion
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
 import tomllib
@@ -14,10 +15,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
-from testbed import interrupts
+from testbed import interrupts, threads
 
 if sys.argv[0] == __file__ or Path(sys.argv[0]).name == "testbed":  # this is the program, and not a module of another
     interrupts.end_at_once()  # while all else is imported
+    os.environ.update({name: value for name, value in threads.ONE.items() if name not in os.environ})
 
 import typer
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import re
 import runpy
 import signal
@@ -19,6 +20,7 @@ import pytest
 from rich.console import Console
 
 import testbed.__main__ as cli
+from testbed import threads
 from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.loop import links, loop
@@ -368,6 +370,15 @@ def test_an_interrupted_run_says_what_it_leaves(testbed: Testbed, monkeypatch: p
     monkeypatch.setattr(loop, "run", interrupted)
     ended = testbed("run", "u_turn")
     assert (ended.code, ended.err) == (130, "testbed: interrupted: nothing was recorded\n")
+
+
+def test_the_program_multiplies_on_one_thread_unless_it_is_told() -> None:
+    """On two, the bound of an outage takes five times the processor time, and a run an eighth more."""
+    told = {name: value for name, value in os.environ.items() if name not in threads.ONE}
+    ask = "import os, sys; sys.argv = ['testbed']; import testbed.__main__; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    for environment, many in ((told, "1"), (told | {"OPENBLAS_NUM_THREADS": "4"}, "4")):
+        ran = subprocess.run([sys.executable, "-c", ask], env=environment, capture_output=True, text=True, timeout=60)
+        assert ran.stdout == f"{many}\n"
 
 
 @pytest.mark.ci

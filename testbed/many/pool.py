@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeAlias, TypeVar, cast
 
-from testbed import interrupts
+from testbed import interrupts, threads
 from testbed.errors import UserError
 
 if TYPE_CHECKING:
@@ -376,11 +376,10 @@ class _Crew:
             process.wait()
 
 
-# What a worker multiplies is small. Dask's statistical profiler would look at the Python stack a hundred times a
-# second, and it would log that its scheduler has gone.
+# Dask's statistical profiler would look at the Python stack a hundred times a second, and it would log that its
+# scheduler has gone.
 _ENVIRONMENT = {
-    "OPENBLAS_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
+    **threads.ONE,
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",
     "DASK_LOGGING__DISTRIBUTED": "critical",
 }
