@@ -10,6 +10,7 @@ interrupted carries on with the runs that are missing.
 
 from __future__ import annotations
 
+import gc
 import io
 import itertools
 import json
@@ -383,6 +384,8 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
     from testbed.feeds.simulated import motion
     from testbed.loop.loop import run
 
+    # The tree of a record refers to itself: Python would leave those of hundreds of runs, of up to 100 MB each.
+    gc.collect()
     try:
         require_code(task.code)
         shared = task.truth if task.truth is not None and task.truth.is_dir() else None

@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -655,6 +656,22 @@ def test_the_manual_has_a_section_for_each_scenario(tmp_path: Path, monkeypatch:
 def test_the_manual_is_of_shipped_scenarios(plan: Plan) -> None:
     with pytest.raises(UserError, match="shipped scenarios"):
         expected.require_shipped(plan)
+
+
+def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    left: list[weakref.ref[Any]] = []
+    plain = campaigns._history
+
+    def history(dataset: Any) -> Any:
+        left.append(weakref.ref(dataset["truth/h"].values))
+        return plain(dataset)
+
+    monkeypatch.setattr(campaigns, "_history", history)
+    scenario = Scenario.load(at_rest, ["duration_s=5", "sensors.gnss.denied=[]"])
+    for seed in (1, 2):
+        flown = campaigns._fly(campaigns._Task(0, seed, scenario, None, folder.code()), lambda share: None)
+        assert isinstance(flown, Outcome)
+        assert sum(one() is not None for one in left) == 1  # the last
 
 
 def test_few_runs_have_no_interval(tmp_path: Path) -> None:
