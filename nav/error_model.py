@@ -93,6 +93,7 @@ class Drive(IntEnum):
 
 # What the axis of the first index feels of the second, in the order of the states of a cross block.
 CROSS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+_OPPOSED = tuple((i, CROSS.index((of, axis))) for i, (axis, of) in enumerate(CROSS) if axis < of)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,8 @@ class Block:
     """One named group of error states.
 
     ``sigma`` is the 1-sigma at the start, one number or one per state; ``density`` the root spectral density of the
-    driving noise [unit/sqrt(s)]; ``correlation_s`` the time constant, infinite for a random walk.
+    driving noise [unit/sqrt(s)]; ``correlation_s`` the time constant, infinite for a random walk; ``covariance`` what
+    two of the states, (i, j, covariance), have in common at the start.
     """
 
     name: str
@@ -109,6 +111,19 @@ class Block:
     density: float | tuple[float, ...] = 0.0
     correlation_s: float = math.inf
     drive: Drive = Drive.NONE
+    covariance: tuple[tuple[int, int, float], ...] = ()
+
+
+def cross(name: str, misalignment: float, nonorthogonality: float, drive: Drive) -> Block:
+    """What the axes of a triad feel of each other (`CROSS`), from 1-sigma [rad] of its turn and of its leaning axes.
+
+    A small turn m of the triad is -[m x]: what one axis feels of another, that one feels of it with the opposite sign.
+    Axes y and z lean, each by itself, towards those before them. Were the six taken for independent, a turn, which
+    nothing in flight shows, would begin with half of its variance.
+    """
+    sigma = tuple(math.hypot(misalignment, nonorthogonality if of < axis else 0.0) for axis, of in CROSS)
+    opposed = tuple((i, j, -(misalignment**2)) for i, j in _OPPOSED)
+    return Block(name, len(CROSS), sigma, drive=drive, covariance=opposed)
 
 
 def markov(
@@ -125,8 +140,8 @@ class ImuModel:
     """What the filter is told of the inertial sensors, each axis alike.
 
     A bias is a turn-on value that walks, plus, when its sigma is not zero, an in-run part that is first-order Markov.
-    Scale factor errors are states when their sigma is not zero, and so is what an axis feels of the others, as triads
-    do that are turned and not square (`CROSS`).
+    Scale factor errors are states when their sigma is not zero, and so is what an axis feels of the others when a triad
+    is told to be turned or not square (`cross`).
 
     Errors that come with motion and have no state are white noise beside that of rest: ``gyro_motion`` and
     ``accel_motion`` are the shares of the rate, and of the specific force less gravity, that go wrong over each
@@ -146,8 +161,10 @@ class ImuModel:
     accel_drift_correlation_s: float = 300.0
     gyro_scale_sigma: float = 0.0  # scale factor error [1]
     accel_scale_sigma: float = 0.0
-    gyro_cross_sigma: tuple[float, ...] = ()  # six, or none [rad]
-    accel_cross_sigma: tuple[float, ...] = ()
+    gyro_misalignment: float = 0.0  # small turn of the triad, about each axis [rad]
+    accel_misalignment: float = 0.0
+    gyro_nonorthogonality: float = 0.0  # by which y and z lean towards the axes before them [rad]
+    accel_nonorthogonality: float = 0.0
     gyro_motion: float = 0.0  # [1]
     accel_motion: float = 0.0  # [1]
     vibration: float = 0.0  # [1]
@@ -178,10 +195,10 @@ class ImuModel:
             blocks.append(Block("gyro_scale", 3, self.gyro_scale_sigma, drive=Drive.GYRO_SCALE))
         if self.accel_scale_sigma > 0:
             blocks.append(Block("accel_scale", 3, self.accel_scale_sigma, drive=Drive.ACCEL_SCALE))
-        if any(self.gyro_cross_sigma):
-            blocks.append(Block("gyro_cross", len(CROSS), self.gyro_cross_sigma, drive=Drive.GYRO_CROSS))
-        if any(self.accel_cross_sigma):
-            blocks.append(Block("accel_cross", len(CROSS), self.accel_cross_sigma, drive=Drive.ACCEL_CROSS))
+        if self.gyro_misalignment > 0 or self.gyro_nonorthogonality > 0:
+            blocks.append(cross("gyro_cross", self.gyro_misalignment, self.gyro_nonorthogonality, Drive.GYRO_CROSS))
+        if self.accel_misalignment > 0 or self.accel_nonorthogonality > 0:
+            blocks.append(cross("accel_cross", self.accel_misalignment, self.accel_nonorthogonality, Drive.ACCEL_CROSS))
         return blocks
 
 
@@ -190,8 +207,8 @@ class ErrorModel:
 
     ``size`` states, the first ``mixing`` of which take part in the motion; ``slices[name]`` is where a block lies and
     ``start(name)`` where it begins, -1 when there is none. ``sigma``, ``density``, ``decay_rate`` (size,) hold each
-    state's initial 1-sigma, noise density and 1/correlation_s; ``driven`` (blocks, 2) the kind and the start of each
-    block that drives the motion.
+    state's initial 1-sigma, noise density and 1/correlation_s; ``prior`` (size, size) the covariance at the start;
+    ``driven`` (blocks, 2) the kind and the start of each block that drives the motion.
     """
 
     def __init__(self, imu: ImuModel, aid_blocks: Iterable[Block] = ()) -> None:
@@ -216,6 +233,11 @@ class ErrorModel:
             self.decay_rate[where] = 1 / block.correlation_s
             if block.drive is not Drive.NONE:
                 driven.append((int(block.drive), where.start))
+        self.prior = np.diag(self.sigma**2)
+        for block in self.blocks:
+            for i, j, covariance in block.covariance:
+                row, column = self.slices[block.name].start + i, self.slices[block.name].start + j
+                self.prior[row, column] = self.prior[column, row] = covariance
         self.driven = np.array(driven, dtype=np.int64)
         self.mixing = self.slices[imu.blocks()[-1].name].stop
 

@@ -100,7 +100,7 @@ class Reference:
         filters, n = len(self.models), self.size
         P = np.zeros((filters, n, n))
         for i, model in enumerate(self.models):
-            P[i, range(model.size), range(model.size)] = model.sigma**2
+            P[i, : model.size, : model.size] = model.prior
             P[i, :MOTION, :MOTION] = initial.covariance
             for given, sigma in initial.widened.items():
                 name = names[i].get(given, given) if names else given

@@ -25,7 +25,7 @@ from nav.aids import (
 from nav.aids.magnetometer import FIELD_SIZE
 from nav.aids.terrain import Search
 from nav.earth import STANDARD_GRAVITY
-from nav.error_model import CROSS, ImuModel
+from nav.error_model import ImuModel
 from nav.point_mass import PointMass
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
@@ -107,17 +107,14 @@ def imu_model(
         accel_drift_correlation_s=errors.accel_in_run_tau,
         gyro_scale_sigma=errors.gyro_scale if full else 0.0,
         accel_scale_sigma=errors.accel_scale if full else 0.0,
-        gyro_cross_sigma=_cross(errors.gyro_misalignment, errors.gyro_nonorthogonality) if matrix else (),
-        accel_cross_sigma=_cross(errors.accel_misalignment, errors.accel_nonorthogonality) if matrix else (),
+        gyro_misalignment=errors.gyro_misalignment if matrix else 0.0,
+        accel_misalignment=errors.accel_misalignment if matrix else 0.0,
+        gyro_nonorthogonality=errors.gyro_nonorthogonality if matrix else 0.0,
+        accel_nonorthogonality=errors.accel_nonorthogonality if matrix else 0.0,
         gyro_motion=errors.gyro_motion,
         accel_motion=errors.accel_motion,
         vibration=errors.vibration_share,
     )
-
-
-def _cross(misalignment: float, nonorthogonality: float) -> tuple[float, ...]:
-    """1-sigma of what an axis feels of the others (`nav.error_model.CROSS`): y and z lean, and all are turned."""
-    return tuple(math.hypot(misalignment, nonorthogonality if of < axis else 0.0) for axis, of in CROSS)
 
 
 def _drive(sigma: float, tau: float) -> float:

@@ -13,6 +13,7 @@ from worlds.lanes import lanes
 from nav.aids import AirspeedAid, GnssAid
 from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, exponential, plain
 from nav.earth import position_difference_n
+from nav.error_model import CROSS
 from nav.federated import Federated
 from nav.ins import Ins
 from nav.unscented import Scaling
@@ -24,7 +25,7 @@ from testbed.motion.kinematic import Kinematic
 from testbed.motion.sections import KinematicStart
 from testbed.score import accuracy
 from testbed.sensors import build as build_sensor
-from testbed.sensors.imu import ImuConfig
+from testbed.sensors.imu import ImuConfig, _axis_errors
 
 TWO_RECEIVERS = [
     "duration_s=20",
@@ -76,16 +77,20 @@ def test_drift_and_scale_factors_are_states_when_asked_for() -> None:
 
 
 def test_misalignment_is_a_state_when_asked_for() -> None:
-    """A turn of the triad for every pair, beside it y and z that lean; no walk of a bias stands in for them."""
+    """Their prior is that of the draws of which a unit is made; no walk of a bias stands in for them."""
     scenario = Scenario.load("loiter_gnss_outage", ['estimator.ins.states="matrix"'])
     imu = scenario.sensors["imu"]
     assert isinstance(imu, ImuConfig)
     e, found = imu.errors(), told(scenario)
     full = told(Scenario.load("loiter_gnss_outage", ['estimator.ins.states="full"'])).config.imu
-    both = math.hypot(e.gyro_misalignment, e.gyro_nonorthogonality)
-    turned = e.gyro_misalignment
-    assert found.config.imu.gyro_cross_sigma == pytest.approx((turned, turned, both, turned, both, both))
-    assert full.gyro_cross_sigma == ()
+    for sensor in ("gyro", "accel"):
+        turned, leaning = (getattr(e, f"{sensor}_{what}") for what in ("misalignment", "nonorthogonality"))
+        draws = np.diag([turned] * 3 + [leaning] * 3)  # each alone, by one sigma
+        units = np.array([_axis_errors(np.zeros(3), draw[:3], draw[3:]) for draw in draws])
+        felt = np.array([units[:, axis, of] for axis, of in CROSS])
+        own = found.model.slices[f"{sensor}_cross"]
+        np.testing.assert_allclose(found.model.prior[own, own], felt @ felt.T, atol=1e-12)
+    assert full.gyro_misalignment == full.accel_nonorthogonality == 0.0
     assert found.config.imu.gyro_bias_walk < full.gyro_bias_walk
     assert found.config.imu.accel_bias_sigma == full.accel_bias_sigma
     assert found.config.mounting_sigma == 0.0

@@ -108,7 +108,7 @@ def test_transition_is_the_derivative_of_the_strapdown(lat_deg):
 
 
 def test_what_axes_feel_of_each_other_drives_the_motion_as_differences_say():
-    model = ErrorModel(dataclasses.replace(FULL, gyro_cross_sigma=(1e-3,) * 6, accel_cross_sigma=(2e-3,) * 6))
+    model = ErrorModel(dataclasses.replace(FULL, gyro_misalignment=1e-3, accel_misalignment=2e-3))
     samples, state, sums, step_ = 10, nominal(48.0), np.zeros((3, 3, 3)), 1e-2
     end = propagate(state, np.zeros((4, 3)), samples, sums)
     Phi, FT = np.zeros((MOTION, model.mixing)), np.zeros((MOTION, model.mixing))

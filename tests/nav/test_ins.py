@@ -313,7 +313,7 @@ def test_what_axes_feel_of_each_other_is_taken_off_the_increments(sensor):
     increments = dataclasses.replace(increments, **{field_: getattr(increments, field_) @ matrix.T})
     off = []
     for known in (0.0, 1.0):
-        told = dataclasses.replace(NOISELESS, **{f"{sensor}_cross_sigma": tuple(np.abs(share))})
+        told = dataclasses.replace(NOISELESS, **{f"{sensor}_misalignment": 5e-3})
         ins = Ins(InsConfig(told, (PRESSURE,)), field)
         ins.start(true_start(truth))
         ins._state.imu[ins.model.slices[f"{sensor}_cross"]] = known * share
