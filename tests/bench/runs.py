@@ -141,13 +141,19 @@ def campaign_efficiency(effort: Effort) -> Iterator[Row]:
 
 
 def start_up(effort: Effort) -> Iterator[Row]:
-    """Cold compile of every kernel, and the time from process start to the first tick when they are compiled."""
+    """Cold compile of every kernel, and the time from process start to the first tick when they are compiled.
+
+    Kernels can't be compiled in part: less than all of the work is to do without those of the estimators.
+    """
+    overrides = ["duration_s=20", "sensors.gnss.denied=[]"]
+    if effort.share < 1:
+        overrides += ["estimator=[]", "expect={}"]
     script = (
         "import time; from testbed import Scenario, run\n"
         "first = []\n"
         "def tick(p):\n"
         "    first or first.append(time.time())\n"
-        f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]']), progress=tick)\n"
+        f"run(Scenario.load('{MAIN}', {overrides!r}), progress=tick)\n"
         "print(first[0])\n"
     )
     with tempfile.TemporaryDirectory() as cache:
@@ -178,23 +184,33 @@ def growth(effort: Effort) -> Iterator[Row]:
         ("of 600 s, 1 estimator", 600, ["estimator=[{name='ins', aids=['gnss']}]"]),
         ("of 600 s, 4 estimators", 600, [f"estimator=[{many}]"]),
     )
+    flights: list[tuple[str, int, list[str]]] = []
     for case, full, further in cases:
         duration = effort.count(full)
         denied = f"sensors.gnss.denied=[[{duration / 3:.0f}, {duration * 2 / 3:.0f}]]"
-        overrides = [denied, "expect={}", f"duration_s={duration}", *further]
-        script = (
-            "import os, re, tempfile, time; from pathlib import Path; from testbed import Scenario, run\n"
-            f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]', 'expect={{}}']))  # imports\n"
-            f"scenario = Scenario.load('{MAIN}', {overrides!r})\n"
-            "with tempfile.TemporaryDirectory() as folder:\n"
-            "    began, before = time.perf_counter(), sum(os.times()[:4])\n"
-            "    run(scenario, out=Path(folder))\n"
-            "    wall, cpu = time.perf_counter() - began, sum(os.times()[:4]) - before\n"
-            # not getrusage, whose maximum is that of the process which started this one, if that was larger
-            "memory = int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1]) / 1024\n"
-            "print(cpu, wall, memory)\n"
-        )
-        out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-        cpu, wall, memory = map(float, out.split())
-        detail = f"{duration} s flown in {wall:.2f} s of wall time, at most {memory:.0f} MiB"
-        yield Row(f"run {case}", (cpu * 3600 / duration,), "CPU s/h", detail=detail)
+        flights.append((case, duration, [denied, "expect={}", f"duration_s={duration}", *further]))
+    # Each by itself, or memory would be that of the flights before; of little work most would be the imports.
+    for together in [flights] if effort.share < 1 else [[flight] for flight in flights]:
+        figures = _grown([overrides for _, _, overrides in together])
+        for (case, duration, _), (cpu, wall, memory) in zip(together, figures, strict=True):
+            detail = f"{duration} s flown in {wall:.2f} s of wall time, at most {memory:.0f} MiB"
+            yield Row(f"run {case}", (cpu * 3600 / duration,), "CPU s/h", detail=detail)
+
+
+def _grown(flights: list[list[str]]) -> list[list[float]]:
+    """Processor and wall seconds and largest memory [MiB] of flights one after the other in a fresh interpreter."""
+    script = (
+        "import os, re, tempfile, time; from pathlib import Path; from testbed import Scenario, run\n"
+        f"run(Scenario.load('{MAIN}', ['duration_s=20', 'sensors.gnss.denied=[]', 'expect={{}}']))  # imports\n"
+        f"for overrides in {flights!r}:\n"
+        f"    scenario = Scenario.load('{MAIN}', overrides)\n"
+        "    with tempfile.TemporaryDirectory() as folder:\n"
+        "        began, before = time.perf_counter(), sum(os.times()[:4])\n"
+        "        run(scenario, out=Path(folder))\n"
+        "        wall, cpu = time.perf_counter() - began, sum(os.times()[:4]) - before\n"
+        # not getrusage, whose maximum is that of the process which started this one, if that was larger
+        "    memory = int(re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[1]) / 1024\n"
+        "    print(cpu, wall, memory)\n"
+    )
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    return [[float(word) for word in line.split()] for line in out.splitlines()]

@@ -39,6 +39,7 @@ def test_none_is_there_unless_asked_for():
     assert FurtherStates(replace(MISALIGNED, accel_bias_sigma=0.0)).gust == slice(9, 11)
 
 
+@pytest.mark.ci
 def test_gusts_are_as_likely_as_the_means_of_markov_noise():
     """Variance of the means of a second exact; their long-term power, what a mean over many seconds has, exact too."""
     rng = np.random.default_rng(1)

@@ -40,6 +40,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "no estimator": {"duration_s": 20.0, "estimators": {}},
     "denied to the end": {"duration_s": 100.0, "denied": ((70.0, 1e9),)},
 }
+AT_ONCE = ("outage", "never aligned", "shortest", "no estimator")  # the others are like them, and take seconds
+KINDS = [pytest.param(kind, marks=() if kind in AT_ONCE else pytest.mark.ci) for kind in RUNS]
 
 
 def printed(found: dict[str, float]) -> str:
@@ -59,7 +61,7 @@ def pictured(images: Iterable[str]) -> list[str]:
     return [name for name in images if name.endswith(("_allan.png", "_spectra.png")) or name == "visibility.png"]
 
 
-@pytest.mark.parametrize("kind", RUNS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> None:
     run = synthetic_run.dataset(**RUNS[kind])
     found = metrics.compute(run)

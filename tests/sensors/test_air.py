@@ -55,6 +55,7 @@ def flying(n, rate_hz=RATE_HZ):
     return truth
 
 
+@pytest.mark.ci
 def test_airspeed_errors():
     truth = flying(50_000)
     config = AirspeedConfig(grade="perfect", rate_hz=RATE_HZ, noise_pa=2.0)

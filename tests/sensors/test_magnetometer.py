@@ -104,6 +104,7 @@ def test_current_disturbs_in_proportion():
     np.testing.assert_allclose(three, 3 * one, rtol=1e-6)
 
 
+@pytest.mark.ci
 def test_throttle_disturbs_in_proportion():
     idle, half, full = still(2), still(2), still(2)
     half.controls[:, 3], full.controls[:, 3] = 0.5, 1.0

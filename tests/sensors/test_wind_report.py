@@ -79,6 +79,7 @@ def test_a_report_is_the_mean_of_the_wind_as_long_ago_as_it_says() -> None:
     np.testing.assert_allclose(found[0].wind_n, seconds[0])
 
 
+@pytest.mark.ci
 def test_errors_are_as_large_and_as_slow_as_is_told() -> None:
     truth = walking(400_000 / RATE_HZ)
     white = np.array([one.wind_n for one in reports(truth, rate_hz=1.0, noise_mps=0.7)]) - [6.0, -2.0]
