@@ -236,7 +236,8 @@ def against_golden(golden: Mapping[str, float], metrics: Mapping[str, float]) ->
             rows.append(Row(key, "none", now, "new", True))
         else:
             measure = measures.find(key) or measures.Measure(measures.Aim.NONE)
-            verdict = "missing" if now is None else measure.verdict(before, now)
+            size = golden.get(f"{key.partition('.')[0]}.{measure.size}")
+            verdict = "missing" if now is None else measure.verdict(before, now, size)
             rows.append(Row(key, f"{before:.4g}", now, verdict, True))
     return rows
 

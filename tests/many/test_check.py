@@ -80,6 +80,24 @@ def test_verdict_on_one_metric(metric: str, golden: float, now: float, verdict: 
     assert (row.verdict, row.sound) == (verdict, verdict in ("same", "better"))
 
 
+@pytest.mark.parametrize(
+    ("mean", "now", "verdict"),
+    [
+        # As it came out on two machines, whose matrix products differ in their last bits,
+        (-0.01457, -0.01577, "same"),
+        (-0.01457, 0.0, "better"),
+        # and one that is further from zero, or nearer, than rounding makes it.
+        (-0.01457, -0.0195, "worse"),
+        (-0.0195, -0.01457, "better"),
+    ],
+)
+@pytest.mark.parametrize("outage", ["", "outage_"])
+def test_a_mean_is_held_against_its_rms(outage: str, mean: float, now: float, verdict: str) -> None:
+    rms = {f"ins.{outage}heading_rms_deg": 0.086}
+    rows = against_golden({f"ins.{outage}heading_mean_deg": mean} | rms, {f"ins.{outage}heading_mean_deg": now} | rms)
+    assert [row.verdict for row in rows] == [verdict, "same"]
+
+
 def test_a_metric_that_is_gone_or_new_is_a_failure() -> None:
     rows = against_golden({"ins.recovery_s": 1.0}, {"ins.nonfinite_samples": 1.0})
     assert [(row.metric, row.verdict, row.sound) for row in rows] == [
@@ -98,6 +116,7 @@ def test_tolerances_leave_no_room_for_a_tenth() -> None:
         large = 1e4
         assert measure.verdict(large, 1.11 * large) in ("worse", "better", "changed"), name
         assert measure.verdict(large, large) == "same"
+        assert not measure.size or measure.size in measures.MEASURES, name
 
 
 def test_judge() -> None:
