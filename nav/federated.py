@@ -273,8 +273,8 @@ class Federated:
             return report_on(sample, part, nu, S, nis, math.nan, withheld)
         monitors = filter_.of_sensor[sample.sensor]
         suspect = any(w.suspect for w in monitors)
-        judged = self._against_master(state, filter_, sample, part) if suspect else (nu, S)
-        decision, changed = monitor.judge(*judged, t)
+        nu_judged, S_judged = self._against_master(state, filter_, sample, part) if suspect else (nu, S)
+        decision, changed = monitor.judge(nu_judged, filter_.as_judged(part, sample, S_judged), t)
         if changed:
             self._note(t, filter_, sample.sensor, part, monitor)
             if changed is Change.ISOLATED:

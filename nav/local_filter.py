@@ -27,12 +27,13 @@ from nav.aids.base import (
     aid_blocks,
     report_on,
 )
+from nav.aids.gnss import Contradiction, GnssAid
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
-from nav.samples import Array, BarometerSample, Outcome, Sample, UpdateReport
+from nav.samples import Array, BarometerSample, GnssSample, Outcome, Sample, UpdateReport
 from nav.smoother import Smoother
 from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
@@ -73,6 +74,9 @@ class LocalFilter:
         self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
         self._scatters = {aid.sensor: Scatter() for aid in aids if isinstance(aid, BarometerAid) and aid.scatters}
+        self._contradictions = {
+            aid.sensor: Contradiction(aid.largest_jump) for aid in aids if isinstance(aid, GnssAid) and aid.largest_jump
+        }
         self._silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
@@ -202,6 +206,14 @@ class LocalFilter:
         x: Array = state.x[self.row].copy()
         x[: len(state.imu)] = state.imu
         return x
+
+    def as_judged(self, part: str, sample: Sample, S: Array) -> Array:
+        """S (m, m) as a detector is given it: of positions wider by what the receiver's velocities contradict them."""
+        if part != "gnss_position" or sample.sensor not in self._contradictions:
+            return S
+        assert isinstance(sample, GnssSample)
+        wide: Array = S + np.diag(self._contradictions[sample.sensor].heard(sample))
+        return wide
 
     def innovate(self, state: State, measurement: Measurement) -> tuple[Array, Array, float]:
         """(nu, S, nis) of a measurement at the filter's own estimate."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from nav.unscented import Points
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+CONTRADICTION_S, REMEMBERED_S = 2.0, 6.0  # over which positions are held against velocities, faults remembered
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class GnssAid:
     against the velocity at that time, to first order. Where it is known to ``latency_sigma`` only when a sample was
     valid, two states say by how much earlier the position was, and by how much more the velocity lags. The receiver's
     own filters make both change with each manoeuvre by as much: velocity times that is noise of the position beside its
-    sigma, and acceleration times that of the velocity.
+    sigma, and acceleration times that of the velocity. Positions of a sound receiver that jump against its velocities by
+    no more than ``largest_jump`` are no fault: see `Contradiction`.
     """
 
     sensor: str = "gnss"
@@ -57,6 +59,7 @@ class GnssAid:
     course: Course | None = None
     latency_sigma: float = 0.0  # how well it is known when a sample was valid [s]
     velocity_lag: float = 0.0  # by which its velocity is older than its position [s]
+    largest_jump: float = 0.0  # [m]
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
@@ -152,6 +155,40 @@ def _white(sigma: Array, correlated_variance: Array) -> Array:
     """The white part of a receiver's reported variance, when the correlated part is a state of the filter."""
     reported = sigma * sigma
     return np.maximum(reported - correlated_variance, WHITE_SHARE * reported)
+
+
+@dataclass
+class Contradiction:
+    """How far a receiver's positions moved against its own velocities of late, whatever a filter thinks of either.
+
+    c_k = exp(-dt / T) c_(k-1) + p_k - p_(k-1) - dt (v_k + v_(k-1)) / 2 [m], NED, dt = t_k - t_(k-1), T
+    `CONTRADICTION_S`. In pull-ups, and when the satellites used change, a sound receiver contradicts itself by metres;
+    a fault that moves positions and velocities together, or slowly, does not. More than the ``largest`` [m] is no sound
+    receiver's, and explains nothing until it is forgotten.
+    """
+
+    largest: float
+    variance: Array = field(default_factory=lambda: np.zeros(3))  # c^2, as far as a sound receiver's [m^2]
+    _moved: Array = field(default_factory=lambda: np.zeros(3))
+    _last: GnssSample | None = None
+    _faulty: float = -math.inf  # when it was last more than a sound receiver's [s]
+
+    def heard(self, sample: GnssSample) -> Array:
+        """The variance (3,) [m^2] with one more sample; one that it was told of before changes nothing."""
+        last = self._last
+        if last is not None and sample.t <= last.t:
+            return self.variance
+        self._last = sample
+        if last is None or sample.t - last.t > CONTRADICTION_S or not (has_velocity(sample) and has_velocity(last)):
+            self._moved = np.zeros(3)
+        else:
+            dt = sample.t - last.t
+            moved = displacement_n(sample.lat, sample.lon, sample.h, last.lat, last.lon, last.h)
+            self._moved = math.exp(-dt / CONTRADICTION_S) * self._moved + moved - 0.5 * dt * (sample.v_n + last.v_n)
+        if np.abs(self._moved).max() > self.largest:
+            self._faulty = sample.t
+        self.variance = self._moved**2 if sample.t - self._faulty > REMEMBERED_S else np.zeros(3)
+        return self.variance
 
 
 def problem(sample: GnssSample) -> str:

@@ -143,6 +143,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
                 velocity_error_correlation_s=e.velocity_tau,
                 latency_sigma=e.latency_sigma,
                 velocity_lag=e.velocity_lag,
+                largest_jump=e.largest_jump,
             )
         case BarometerConfig():
             return _barometer(name, section)
