@@ -45,8 +45,8 @@ class GnssAid:
     against the velocity at that time, to first order. Where it is known to ``latency_sigma`` only when a sample was
     valid, two states say by how much earlier the position was, and by how much more the velocity lags. The receiver's
     own filters make both change with each manoeuvre by as much: velocity times that is noise of the position beside its
-    sigma, and acceleration times that of the velocity. Positions of a sound receiver that jump against its velocities by
-    no more than ``largest_jump`` are no fault: see `Contradiction`.
+    sigma, and acceleration times that of the velocity. Positions of a sound receiver that jump against its velocities
+    by no more than ``largest_jump`` are no fault: see `Contradiction`.
     """
 
     sensor: str = "gnss"
