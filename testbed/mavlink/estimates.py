@@ -206,8 +206,7 @@ def estimator_status(s: Snapshot) -> Fields:
     """What the estimator holds for known, innovations over their gates, its own sigma."""
     return {
         "time_usec": s.usec,
-        "flags": (_solution(s) if Status.ALIGNED in s.estimate.status else 0)
-        | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
+        "flags": (_solution(s) if s.aligned else 0) | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
         "vel_ratio": s.ratio("gnss_velocity"),
         "pos_horiz_ratio": s.ratio("gnss_position"),
         "pos_vert_ratio": s.ratio("barometer"),
@@ -219,11 +218,16 @@ def estimator_status(s: Snapshot) -> Fields:
     }
 
 
+def ekf_flags(s: Snapshot) -> int:
+    """What the estimator holds for known, in the bits of EKF_STATUS_REPORT."""
+    known: int = _solution(s) if s.aligned else mav.EKF_UNINITIALIZED
+    return known | (mav.EKF_GPS_GLITCHING if s.doubted else 0)
+
+
 def ekf_status_report(s: Snapshot) -> Fields:
     """The same in ArduPilot's form."""
     return {
-        "flags": (_solution(s) if Status.ALIGNED in s.estimate.status else mav.EKF_UNINITIALIZED)
-        | (mav.EKF_GPS_GLITCHING if s.doubted else 0),
+        "flags": ekf_flags(s),
         "velocity_variance": s.ratio("gnss_velocity"),  # "variance" means the same ratio, in ArduPilot's usage
         "pos_horiz_variance": s.ratio("gnss_position"),
         "pos_vert_variance": s.ratio("barometer"),

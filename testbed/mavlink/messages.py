@@ -9,9 +9,8 @@ Source of the fields' meaning and units: https://mavlink.io/en/messages/all.html
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
 
-import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from nav.earth import SEA_LEVEL_DENSITY, pressure_altitude
@@ -20,7 +19,7 @@ from nav.samples import (
     BarometerSample,
     GnssSample,
     MagnetometerSample,
-    Status,
+    Sample,
 )
 from testbed.mavlink.encode import Fields, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.identity import Identity
@@ -39,7 +38,7 @@ def heartbeat(s: Snapshot | None, identity: Identity) -> Fields:
     """Fixed wing, on its own; armed when flying; calibrating until the estimator is aligned, and before the run."""
     mode = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mav.MAV_MODE_FLAG_AUTO_ENABLED | mav.MAV_MODE_FLAG_STABILIZE_ENABLED
     flying = s is not None and s.flying
-    if s is None or Status.ALIGNED not in s.estimate.status:
+    if s is None or not s.aligned:
         state = mav.MAV_STATE_CALIBRATING
     else:
         state = mav.MAV_STATE_ACTIVE if flying else mav.MAV_STATE_STANDBY
@@ -58,33 +57,47 @@ def system_time(s: Snapshot) -> Fields:
     return {"time_unix_usec": s.start_us + s.usec, "time_boot_ms": s.boot_ms}
 
 
-def sys_status(s: Snapshot) -> Fields:
-    """Which sensors there are and which of them work.
+_INERTIAL: int = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+_ALIGNED: int = mav.MAV_SYS_STATUS_AHRS | mav.MAV_SYS_STATUS_PREARM_CHECK
+_ALWAYS: int = mav.MAV_SYS_STATUS_GEOFENCE  # without it MAVProxy reports a breach
+_AIDS: Mapping[type[Sample], int] = {
+    MagnetometerSample: mav.MAV_SYS_STATUS_SENSOR_3D_MAG,
+    BarometerSample: mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
+    AirspeedSample: mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE,
+    GnssSample: mav.MAV_SYS_STATUS_SENSOR_GPS,
+}
+
+
+def health(s: Snapshot) -> int:
+    """Which sensors work, in the bits of SYS_STATUS.
 
     Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
     """
-    inertial = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO | mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    always = mav.MAV_SYS_STATUS_GEOFENCE  # without it MAVProxy reports a breach
-    present = always | inertial | mav.MAV_SYS_STATUS_AHRS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    health = always
-    if np.isfinite(s.gyro).all() and np.isfinite(s.accel).all():
-        health |= inertial
-    if Status.ALIGNED in s.estimate.status:
-        health |= mav.MAV_SYS_STATUS_AHRS | mav.MAV_SYS_STATUS_PREARM_CHECK
-    aids: list[tuple[type[Any], int, bool]] = [
-        (MagnetometerSample, mav.MAV_SYS_STATUS_SENSOR_3D_MAG, True),
-        (BarometerSample, mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE, math.isfinite(s.pressure)),
-        (AirspeedSample, mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE, math.isfinite(s.eas)),
-        (GnssSample, mav.MAV_SYS_STATUS_SENSOR_GPS, s.gnss_fix is not None),
-    ]
-    for kind, bit, is_sound in aids:
-        if any(isinstance(sample, kind) for sample in s.samples.values()):
-            present |= bit
-            health |= bit if is_sound and s.works(kind) else 0
+    bits = _ALWAYS
+    if all(map(math.isfinite, (*floats(s.gyro), *floats(s.accel)))):
+        bits |= _INERTIAL
+    if s.aligned:
+        bits |= _ALIGNED
+    if s.works(MagnetometerSample):
+        bits |= _AIDS[MagnetometerSample]
+    if s.works(BarometerSample) and math.isfinite(s.pressure):
+        bits |= _AIDS[BarometerSample]
+    if s.works(AirspeedSample) and math.isfinite(s.eas):
+        bits |= _AIDS[AirspeedSample]
+    if s.works(GnssSample) and s.gnss_fix is not None:
+        bits |= _AIDS[GnssSample]
+    return bits
+
+
+def sys_status(s: Snapshot) -> Fields:
+    """Which sensors there are and which of them work."""
+    present = _ALWAYS | _INERTIAL | _ALIGNED
+    for kind in s.first:
+        present |= _AIDS.get(kind, 0)
     return {
         "onboard_control_sensors_present": present,
         "onboard_control_sensors_enabled": present,
-        "onboard_control_sensors_health": health,
+        "onboard_control_sensors_health": health(s),
         "load": 0,
         "voltage_battery": 2**16 - 1,  # not sent, nor the two below
         "current_battery": -1,
@@ -164,7 +177,7 @@ def home_position(s: Snapshot) -> Fields | None:
 
 def gps_raw_int(s: Snapshot) -> Fields | None:
     """What the receiver says: no fix and nothing known when it is denied."""
-    if not any(isinstance(sample, GnssSample) for sample in s.samples.values()):
+    if GnssSample not in s.first:
         return None
     fix = s.gnss_fix
     if fix is None:
@@ -205,7 +218,7 @@ def gnss_integrity(s: Snapshot) -> Fields | None:
 
     Spoofing is reported while the estimator isolates, or long refuses, a receiver that has one.
     """
-    if not any(isinstance(sample, GnssSample) for sample in s.samples.values()):
+    if GnssSample not in s.first:
         return None
     spoofing = mav.GPS_SPOOFING_STATE_UNKNOWN
     if s.gnss_fix:

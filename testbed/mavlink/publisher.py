@@ -108,13 +108,13 @@ class MavlinkPublisher:
         self._calls = 0
         self._leg = -1.0
         self._home: Point | None = None
-        self._health: object = None
+        self._health: tuple[int, int] | None = None
         self._imu_before: ImuSamples | None = None
         self._gyro: Array = np.full(3, math.nan)
         self._accel: Array = np.full(3, math.nan)
         self._ratios: dict[str, float] = {}
         self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
-        self._isolated: dict[tuple[str, str], bool] = {}
+        self._isolated: set[tuple[str, str]] = set()
         self._told: frozenset[str] = frozenset()  # isolations
         vehicle = Vehicle(self._identity, self._parameters, self._items, self._streams)
         self._main = Answers(vehicle, self._scenario, self._readonly)
@@ -160,7 +160,7 @@ class MavlinkPublisher:
                 self._identity,
                 self._legs,
                 self._silent_s,
-                frozenset(sensor for (sensor, _), is_so in self._isolated.items() if is_so),
+                frozenset(sensor for sensor, _ in self._isolated),
                 frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
             )
             self._tell_isolations(t, snapshot.isolated)
@@ -233,10 +233,12 @@ class MavlinkPublisher:
         made: dict[int, bytes | None] = {}
 
         def frame(stream: Stream, maker: Encoder) -> bytes | None:
-            if id(stream) not in made:
-                fields = stream.fields(snapshot)
-                made[id(stream)] = None if fields is None else maker.frame(stream.message, fields)
-            return made[id(stream)]
+            key = id(stream)
+            if key in made:
+                return made[key]
+            fields = stream.fields(snapshot)
+            one = made[key] = None if fields is None else maker.frame(stream.message, fields)
+            return one
 
         def frames(rates: Mapping[str, float]) -> list[bytes]:
             maker = vehicle.encoder if rates else encoder
@@ -314,22 +316,27 @@ class MavlinkPublisher:
 
     def _health_changed(self, snapshot: Snapshot) -> list[bytes]:
         """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
-        sensors, filters = messages.sys_status(snapshot), estimates.ekf_status_report(snapshot)
-        before, self._health = self._health, (sensors["onboard_control_sensors_health"], filters["flags"])
+        before, self._health = self._health, (messages.health(snapshot), estimates.ekf_flags(snapshot))
         if before in (None, self._health):
             return []
         self._heartbeat_at = -math.inf
-        return [self._encoder.frame("SYS_STATUS", sensors), self._encoder.frame("EKF_STATUS_REPORT", filters)]
+        return [
+            self._encoder.frame("SYS_STATUS", messages.sys_status(snapshot)),
+            self._encoder.frame("EKF_STATUS_REPORT", estimates.ekf_status_report(snapshot)),
+        ]
 
     def _read_report(self, report: UpdateReport) -> None:
         ratio = float(np.float64(report.nis) / report.threshold)
         self._ratios[report.aid] = math.sqrt(ratio) if ratio >= 0 else math.nan
         part = report.sensor, report.aid
-        self._isolated[part] = report.outcome is Outcome.ISOLATED
+        if report.outcome is Outcome.ISOLATED:
+            self._isolated.add(part)
+        else:
+            self._isolated.discard(part)
         if report.outcome is Outcome.OUTSIDE_GATE:
             self._refused[part] = self._refused.get(part, 0) + 1
         elif report.weight > 0:
-            self._refused[part] = 0
+            self._refused.pop(part, None)
 
     def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
         """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""

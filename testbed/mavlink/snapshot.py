@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from testbed.mavlink.identity import Identity
 from testbed.motion.table import FLYING_MPS, TruthBlock
 
 S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
+_KINDS = (GnssSample, BarometerSample, MagnetometerSample, AirspeedSample, PositionSample)
 Point: TypeAlias = tuple[float, float, float]
 
 # Blocks of an estimate's covariance.
@@ -62,14 +63,34 @@ class Snapshot:
     refused: frozenset[str]
 
     def __post_init__(self) -> None:
-        """What every call needs: time [s, ms, us], attitude and rates, which go out most often."""
+        """What every call needs: time [s, ms, us], what goes out most often, and what health depends on."""
         self.t = float(self.truth.t[0])
         self.boot_ms = boot_ms(self.t)
         self.usec = microseconds(self.t)
+        self.aligned = Status.ALIGNED in self.estimate.status
         # Estimated roll, pitch, heading [rad].
         self.euler = known_euler(self.estimate)
         # Angular rate [rad/s], body: the gyro less its estimated bias; Earth rate and transport rate are left in.
         self.rates = floats(self.gyro - self.estimate.gyro_bias)
+        # The newest sample of the first sensor of each kind, and those of them that have not fallen silent.
+        self.first: dict[type[Sample], Sample] = {}
+        self._heard: dict[type[Sample], Sample] = {}
+        # Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer.
+        self.fixed = False
+        for sample in self.samples.values():
+            kind = _kind(sample)
+            speaks = self.t - sample.t_arrival < self.silent_s[sample.sensor]
+            if kind not in self.first:
+                self.first[kind] = sample
+                if speaks:
+                    self._heard[kind] = sample
+            places = isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.has_fix)
+            self.fixed |= speaks and places
+        barometer, pitot, receiver = self.newest(BarometerSample), self.newest(AirspeedSample), self.newest(GnssSample)
+        # Measured static pressure [Pa] and equivalent airspeed [m/s]; the receiver's newest epoch if it has a fix.
+        self.pressure = float(barometer.pressure) if barometer else math.nan
+        self.eas = float(pitot.eas) if pitot else math.nan
+        self.gnss_fix = receiver if receiver and receiver.has_fix else None
 
     @cached_property
     def point(self) -> Point | None:
@@ -92,33 +113,6 @@ class Snapshot:
     def groundspeed(self) -> float:
         """Estimated horizontal speed over ground [m/s]."""
         return math.hypot(self.v_n[0], self.v_n[1])
-
-    @cached_property
-    def eas(self) -> float:
-        """Measured equivalent airspeed [m/s]."""
-        sample = self.newest(AirspeedSample)
-        return float(sample.eas) if sample else math.nan
-
-    @cached_property
-    def pressure(self) -> float:
-        """Measured static pressure [Pa]."""
-        sample = self.newest(BarometerSample)
-        return float(sample.pressure) if sample else math.nan
-
-    @cached_property
-    def gnss_fix(self) -> GnssSample | None:
-        """The receiver's newest epoch if it has a fix."""
-        sample = self.newest(GnssSample)
-        return sample if sample and sample.has_fix else None
-
-    @cached_property
-    def fixed(self) -> bool:
-        """Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer."""
-        return any(
-            isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.has_fix)
-            for sample in self.samples.values()
-            if self.t - sample.t_arrival < self.silent_s[sample.sensor]
-        )
 
     def works(self, kind: type[S]) -> bool:
         """Whether the first sensor of this kind says something, and is not isolated."""
@@ -180,10 +174,7 @@ class Snapshot:
 
     def newest(self, kind: type[S]) -> S | None:
         """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
-        for sample in self.samples.values():
-            if isinstance(sample, kind):
-                return sample if self.t - sample.t_arrival < self.silent_s[sample.sensor] else None
-        return None
+        return cast("S | None", self._heard.get(kind))
 
     def sigma(self, block: slice, dimensions: int = 3) -> float:
         """Root of the summed variances of the first ``dimensions`` components of a block of the covariance."""
@@ -192,6 +183,12 @@ class Snapshot:
     def ratio(self, aid: str) -> float:
         """Newest innovation of an aid over its gate, NaN when it is not known."""
         return self.ratios.get(aid, math.nan)
+
+
+def _kind(sample: Sample) -> type[Sample]:
+    """The one of `_KINDS` that a sample is of, of what is none its class."""
+    own = type(sample)
+    return own if own in _KINDS else next((kind for kind in _KINDS if isinstance(sample, kind)), own)
 
 
 def known_point(estimate: Estimate) -> Point | None:

@@ -11,6 +11,7 @@ import math
 import os
 import shutil
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import Protocol
 
@@ -101,14 +102,16 @@ class TruthBlock:
 
     def rows(self, start: int, stop: int) -> TruthBlock:
         """Rows ``start:stop`` of this block as views."""
-        columns = {f.name: getattr(self, f.name)[start:stop] for f in fields(self) if f.name != "tick"}
-        return TruthBlock(self.tick + start, **columns)
+        return TruthBlock(self.tick + start, *[column[start:stop] for column in _columns(self)])
 
     @staticmethod
     def empty(tick: int, n: int) -> TruthBlock:
         """A block of n rows filled with zeros, ready to be written."""
         columns = {name: np.zeros(n if c.width == 1 else (n, c.width)) for name, c in COLUMNS.items()}
         return TruthBlock(tick, **columns)
+
+
+_columns = attrgetter(*(f.name for f in fields(TruthBlock) if f.name != "tick"))
 
 
 class MotionSource(Protocol):
