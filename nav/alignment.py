@@ -11,7 +11,7 @@ on a biased accelerometer is not independent of that bias.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,8 +19,9 @@ import numpy as np
 from nav._jit import njit
 from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
 from nav.aids.gnss import has_velocity
+from nav.aids.magnetometer import FIELD_SIZE
 from nav.earth import displacement_n, earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL, ImuModel
+from nav.error_model import CROSS, MOTION, PHI, POS, VEL, ErrorModel, ImuModel
 from nav.rotation import (
     cross,
     dcm_from_quat,
@@ -42,6 +43,8 @@ NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share 
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
 UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its field is of another length than the Earth's
 FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
+_DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
+_MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
 STEP = 1e-6  # of each input, relative, in the differences
 
 
@@ -66,8 +69,8 @@ class InitialState:
 
 @dataclass(frozen=True)
 class AidSigmas:
-    """What alignment is told of the aids [1-sigma]: field in T (noise, constant, bent by iron), correlated GNSS errors
-    in m, m/s NED; wind in m/s.
+    """What alignment is told of the aids [1-sigma]: field in T (noise, constant and slow errors, anomaly of the
+    reference) and by soft iron [1], correlated GNSS errors in m, m/s NED; wind in m/s.
     """
 
     field: float
@@ -75,23 +78,32 @@ class AidSigmas:
     gnss_position: Array
     gnss_velocity: Array
     wind: float
-    field_bend: float = 0.0
+    field_anomaly: float = 0.0
+    field_error: float = 0.0
+    soft_iron: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """Errors (k,) of a block, of covariance ``known`` (k, k), that add ``gain`` (3, k) times them to a vector."""
+
+    vector: int  # of the four that TRIAD takes
+    block: str
+    gain: Array
+    known: Array
 
 
 @dataclass(frozen=True)
 class _Heading:
-    """The second pair of vectors, with the covariance of the one in body axes and of what else turns the heading.
-
-    ``bias`` (3, 3) is the part of ``variance_b`` that comes from a bias of the block ``block`` times ``gain``.
+    """The second pair of vectors, with the white variance of the one in body axes, what else it is wrong by, and what
+    else turns the heading.
     """
 
     s_b: Array
     s_n: Array
-    variance_b: Array
+    variance_b: float
+    causes: Sequence[_Cause] = ()
     heading_sigma: float = 0.0
-    block: str = ""
-    gain: float = 0.0
-    bias_variance: float = 0.0
 
 
 class Alignment:
@@ -99,6 +111,7 @@ class Alignment:
 
     def __init__(self, imu: ImuModel, aids: AidSigmas, arm_b: Array, duration_s: float) -> None:
         self.imu, self.aids, self.arm_b, self.duration_s = imu, aids, arm_b, duration_s
+        self._model = ErrorModel(imu)
         self.names: dict[str, str] = {}  # of the blocks in `InitialState.correlated`, where a filter has others
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
@@ -114,14 +127,16 @@ class Alignment:
         sigmas = AidSigmas(
             field=magnetometer.sigma,
             field_bias=magnetometer.bias_sigma,
-            field_bend=magnetometer.bend,
+            field_anomaly=magnetometer.anomaly_sigma,
+            field_error=magnetometer.error_sigma,
+            soft_iron=magnetometer.soft_iron_sigma,
             gnss_position=np.array(gnss.position_error_sigma),
             gnss_velocity=np.array(gnss.velocity_error_sigma),
             wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),
         )
         made = cls(imu, sigmas, gnss.arm, duration_s)
         made.names = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=False))
-        made.names["magnetometer_bias"] = magnetometer.states[0]
+        made.names |= dict(zip(_MAGNETOMETER, magnetometer.states, strict=True))
         return made
 
     def _restart(self, fix: GnssSample | None) -> None:
@@ -232,7 +247,8 @@ class Alignment:
         if self._fields == 0 or field_n is None or self.aids.field_bias == 0.0:
             return self.aids.field_bias
         excess = abs(float(np.linalg.norm(self._field_0)) / self._fields - float(np.linalg.norm(field_n)))
-        known = math.hypot(self.aids.field_bias, self.aids.field, self.aids.field_bend)
+        bent = math.hypot(self.aids.field_anomaly, self.aids.field_error, self.aids.soft_iron * FIELD_SIZE)
+        known = math.hypot(self.aids.field_bias, self.aids.field, bent)
         return excess if excess > UNCALIBRATED * known else self.aids.field_bias
 
     def _heading(
@@ -245,20 +261,13 @@ class Alignment:
             and field_n is not None
             and (told or field_bias <= FIELD_HEADING_LIMIT * math.hypot(field_n[0], field_n[1]))
         ):
-            variance = field_bias**2 + self.aids.field**2 / self._fields
+            field_b = C_b0 @ self._field_0 / self._fields
             return _Heading(
-                C_b0 @ self._field_0 / self._fields,
-                field_n,
-                variance * np.eye(3),
-                block="magnetometer_bias",
-                gain=1.0,
-                bias_variance=field_bias**2,
+                field_b, field_n, self.aids.field**2 / self._fields, self._magnetometer(field_b, field_bias)
             )
         if speed >= COURSE_SPEED:
             course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
-            return _Heading(
-                np.array([1.0, 0.0, 0.0]), course, np.zeros((3, 3)), heading_sigma=min(1.0, self.aids.wind / speed)
-            )
+            return _Heading(np.array([1.0, 0.0, 0.0]), course, 0.0, heading_sigma=min(1.0, self.aids.wind / speed))
         if max(speed, float(np.linalg.norm(first.v_n))) > REST_SPEED:
             lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
             self.problem = f"{lacking}, and it is too slow for the course: waiting for flight"
@@ -282,46 +291,68 @@ class Alignment:
         return _Heading(
             C_b0 @ self._angle_0,
             earth_n * T,
-            (bias_variance * T**2 + self.imu.gyro_noise**2 * T) * np.eye(3),
-            block="gyro_bias",
-            gain=T,
-            bias_variance=self.imu.gyro_bias_sigma**2,
+            self.imu.gyro_noise**2 * T,
+            [
+                _Cause(_S_B, name, T * np.eye(3), sigma**2 * np.eye(3))
+                for name, sigma in (("gyro_bias", self.imu.gyro_bias_sigma), ("gyro_drift", self.imu.gyro_drift_sigma))
+            ],
         )
+
+    def _magnetometer(self, field_b: Array, field_bias: float) -> list[_Cause]:
+        """What a field (3,) [T] of body axes is wrong by beside noise, ``field_bias`` [T] being its hard iron."""
+        bias, anomaly, error, soft_iron = _MAGNETOMETER
+        one = np.eye(3)
+        return [
+            _Cause(_S_B, bias, one, field_bias**2 * one),
+            _Cause(_S_N, anomaly, -one, self.aids.field_anomaly**2 * one),
+            _Cause(_S_B, error, one, self.aids.field_error**2 * one),
+            _Cause(_S_B, soft_iron, np.array(np.kron(one, field_b)), self.aids.soft_iron**2 * np.eye(9)),
+        ]
+
+    def _accelerometers(self, dv_b: Array, T: float) -> list[_Cause]:
+        """What a change of velocity (3,) [m/s] of body axes, over ``T`` seconds, is wrong by beside noise."""
+        crossing = np.zeros((3, len(CROSS)))
+        for state, (axis, of) in enumerate(CROSS):
+            crossing[axis, state] = dv_b[of]
+        gains = {
+            "accel_bias": T * np.eye(3),
+            "accel_drift": T * np.eye(3),
+            "accel_scale": np.diag(dv_b),
+            "accel_cross": crossing,
+        }
+        slices, prior = self._model.slices, self._model.prior
+        return [_Cause(_DV_B, n, gain, prior[slices[n], slices[n]]) for n, gain in gains.items() if n in slices]
 
     def _state(self, fix: GnssSample, T: float, dv_b: Array, dv_n: Array, heading: _Heading) -> InitialState:
         C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
-        J_b = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 0)
-        J_s = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 1)
-        J_n = _attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, 2)
+        J = [_attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, which) for which in range(4)]
 
-        bias2 = self.imu.accel_bias_sigma**2
-        variance_dv_b = (bias2 + self.imu.accel_drift_sigma**2) * T**2 + self.imu.accel_noise**2 * T
         variance_v = np.diag(fix.sigma_velocity_n**2)
         up = dv_n / np.linalg.norm(dv_n)
         gyro_turn = (self.imu.gyro_bias_sigma * T) ** 2 + self.imu.gyro_noise**2 * T
         P = np.zeros((MOTION, MOTION))
         phi, vel, pos = slice(PHI, PHI + 3), slice(VEL, VEL + 3), slice(POS, POS + 3)
         P[phi, phi] = (
-            variance_dv_b * J_b @ J_b.T
-            + J_n @ (2 * variance_v) @ J_n.T
-            + J_s @ heading.variance_b @ J_s.T
+            self.imu.accel_noise**2 * T * J[_DV_B] @ J[_DV_B].T
+            + J[_DV_N] @ (2 * variance_v) @ J[_DV_N].T
+            + heading.variance_b * J[_S_B] @ J[_S_B].T
             + heading.heading_sigma**2 * np.outer(up, up)
             + gyro_turn * np.eye(3)
         )
-        P[phi, vel] = J_n @ variance_v
+        P[phi, vel] = J[_DV_N] @ variance_v
         P[vel, phi] = P[phi, vel].T
         P[vel, vel] = variance_v
         P[pos, pos] = np.diag(fix.sigma_position_n**2)
 
-        # Every estimated bias is zero, so its error is minus the bias: hence the signs.
-        names = ("accel_bias", "gnss_position_error", "gnss_velocity_error")
-        correlated = {name: np.zeros((MOTION, 3)) for name in names}
-        correlated["accel_bias"][phi] = -bias2 * T * J_b
+        # Every estimated error is zero, so its error is minus what it is: hence the signs.
+        correlated = {name: np.zeros((MOTION, 3)) for name in ("gnss_position_error", "gnss_velocity_error")}
         correlated["gnss_position_error"][pos] = -np.diag(self.aids.gnss_position**2)
         correlated["gnss_velocity_error"][vel] = -np.diag(self.aids.gnss_velocity**2)
-        if heading.block:
-            correlated[heading.block] = np.zeros((MOTION, 3))
-            correlated[heading.block][phi] = -heading.gain * heading.bias_variance * J_s
+        for cause in (*self._accelerometers(dv_b, T), *heading.causes):
+            turning = J[cause.vector] @ cause.gain
+            P[phi, phi] += turning @ cause.known @ turning.T
+            correlated[cause.block] = np.zeros((MOTION, len(cause.known)))
+            correlated[cause.block][phi] = -turning @ cause.known
 
         q_nb = quat_from_dcm(C_nb)
         arm_n = C_nb @ self.arm_b

@@ -24,7 +24,7 @@ from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance
-from nav.local_filter import NO_SENSOR, LocalFilter
+from nav.local_filter import LocalFilter
 from nav.monitor import Change, Isolation, Monitor
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -45,6 +45,7 @@ from nav.reference import (
     turned,
 )
 from nav.samples import (
+    NO_SENSOR,
     Array,
     Estimate,
     GnssSample,

@@ -22,7 +22,7 @@ from nav.alignment import Alignment, InitialState
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
-from nav.local_filter import NO_SENSOR, LocalFilter
+from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -42,6 +42,7 @@ from nav.reference import (
     spread,
 )
 from nav.samples import (
+    NO_SENSOR,
     Array,
     Estimate,
     GnssSample,

@@ -40,7 +40,6 @@ from nav.unscented import CURVED, Scaling
 from nav.weighting import Fading, Policy, SageHusa, split
 
 LEFT_OUT = Ruling(Outcome.WEAKENED, "left out by the measurement policy")
-NO_SENSOR = "no sensor"  # that a report is of what is known without a sample
 
 
 class LocalFilter:

@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 Array: TypeAlias = npt.NDArray[np.float64]
 
+NO_SENSOR = "no sensor"  # that a report is of what is known without a sample
+
 
 class FixType(IntEnum):
     """GNSS fix type, numbered as in MAVLink's GPS_FIX_TYPE."""

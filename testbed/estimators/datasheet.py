@@ -65,8 +65,7 @@ def imu_model(
     With ``states`` "biases" scale factors do so too, and in-run instability (Gauss-Markov, sigma and tau) becomes a
     random walk of the same driving noise, q = sigma sqrt(2 / tau), beside the rate random walk: over minutes the two
     cannot be told apart. With "full" both are states of their own (Cui et al. 2022, Eq 36), and with "matrix"
-    misalignment, a small turn of the triad, and axes y and z that lean, too: biases no longer walk for them, but begin
-    as unknown, as before something moves nobody can tell one from the other.
+    misalignment, a small turn of the triad, and axes y and z that lean, too: biases no longer walk for them.
     """
     full, matrix = states != "biases", states == "matrix"
     beside = replace(errors, gyro_in_run=0.0, accel_in_run=0.0, gyro_scale=0.0, accel_scale=0.0) if full else errors
@@ -75,7 +74,6 @@ def imu_model(
             beside, gyro_misalignment=0.0, gyro_nonorthogonality=0.0, accel_misalignment=0.0, accel_nonorthogonality=0.0
         )
     level = math.hypot(beside.accel_misalignment, beside.accel_nonorthogonality, beside.accel_scale)
-    at_first = math.hypot(errors.accel_misalignment, errors.accel_nonorthogonality, beside.accel_scale)
     turn = math.hypot(beside.gyro_misalignment, beside.gyro_nonorthogonality, beside.gyro_scale)
     pull = beside.gyro_g_sensitivity * STANDARD_GRAVITY
     changes = math.sqrt(1 / MANOEUVRE_S)
@@ -88,7 +86,7 @@ def imu_model(
             beside.gyro_turn_on, beside.gyro_in_run, beside.gyro_temperature * WARM_UP_K, pull, turn * turn_rate
         ),
         accel_bias_sigma=math.hypot(
-            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, at_first * STANDARD_GRAVITY
+            beside.accel_turn_on, beside.accel_in_run, beside.accel_temperature * WARM_UP_K, level * STANDARD_GRAVITY
         ),
         gyro_bias_walk=math.hypot(
             beside.gyro_random_walk,

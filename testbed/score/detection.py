@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import Array, Outcome
+from nav.samples import NO_SENSOR, Array, Outcome
 from testbed.score.accuracy import (
     RECOVERY_WINDOW_S,
     SAME_TIME_S,
@@ -202,7 +202,9 @@ def _recorded_looks(dataset: xarray.DataTree, estimator: str) -> dict[str, Senso
         np.concatenate([column(dataset, f"{group}/{name}") for group in groups])
         for name in ("sample_time", "sensor", "weight", "outcome")
     )
-    return by_sensor(t, sensor.astype(str), weight, outcome)
+    looks = by_sensor(t, sensor.astype(str), weight, outcome)
+    looks.pop(NO_SENSOR, None)  # what is known without a sample is no sensor that could be isolated by mistake
+    return looks
 
 
 class FaultScore(NamedTuple):

@@ -10,22 +10,31 @@ from worlds.ins import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, 
 
 from nav.aids import GnssAid, MagnetometerAid
 from nav.alignment import AidSigmas, Alignment
-from nav.error_model import ImuModel
+from nav.error_model import CROSS, ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import FixType, GnssSample, ImuSamples, Status
 
+COMPASS, NOTHING = MagnetometerAid(), np.zeros((3, 3))
 NAVIGATION = ImuModel(0.002 * DEG / 60, 1e-4, 0.003 * DEG / 3600, 3e-4)
 
 
-def align(truth, model, rng, with_field=True, arm_b=(0.0, 0.0, 0.0), seconds=60.0, sigma_v=0.1, **config):
-    """The first estimate after alignment, the Ins, and the true sensor biases then."""
+def align(
+    truth, model, rng, with_field=True, arm_b=(0.0, 0.0, 0.0), seconds=60.0, sigma_v=0.1,
+    compass=COMPASS, triad=NOTHING, iron=NOTHING, **config
+):  # fmt: skip
+    """The first estimate after alignment, the Ins, and the true sensor biases then.
+
+    Specific force is wrong by ``triad`` (3, 3) times itself, the magnetic field by ``iron`` (3, 3) times itself.
+    """
     increments_, _, accel_bias = imu(truth, model, rng)
-    settings = InsConfig(model, (GnssAid(arm_b=arm_b), MagnetometerAid()), **config)
-    hard_iron = MagnetometerAid().bias_sigma * rng.normal(size=3)
+    increments_ = replace(increments_, dv=increments_.dv @ (np.eye(3) + triad).T)
+    settings = InsConfig(model, (GnssAid(arm_b=arm_b), compass), **config)
+    hard_iron = compass.bias_sigma * rng.normal(size=3)
     samples = gnss(truth, rng, 4.0, arm_b=arm_b, sigma_v=sigma_v)
     if with_field:
-        samples += magnetometer(truth, rng, hard_iron)
+        fields = magnetometer(truth, rng, hard_iron)
+        samples += [replace(one, field_b=one.field_b + iron @ (one.field_b - hard_iron)) for one in fields]
     ins = Ins(settings, (lambda *_: FIELD_N) if with_field else None)
     horizon = FusionHorizon(ins)
     for k in range(int(seconds / 0.25)):
@@ -74,6 +83,38 @@ def test_sigmas_are_honest_over_many_alignments(arm_b):
     assert ((low < nees) & (nees < high)).all()
     low, high = chi2.ppf([0.005, 0.995], 6 * runs) / runs
     assert low < joint < high
+
+
+def test_what_an_alignment_made_of_them_goes_with_triad_and_soft_iron():
+    """Two-sided 99 % bounds of the NEES of the attitude, and of it together with the errors that caused it.
+
+    Independent of them, a tilt levelled on a turned triad would soon tell that the triad is not turned.
+    """
+    model = replace(CONSUMER, accel_scale_sigma=2e-3, accel_misalignment=4e-3, accel_nonorthogonality=2e-3)
+    compass = MagnetometerAid(soft_iron_sigma=0.02)
+    truth, runs, found = flight(30), 120, np.zeros(2)
+    for seed in range(runs):
+        rng = np.random.default_rng(2000 + seed)
+        m, lean = 4e-3 * rng.normal(size=3), 2e-3 * rng.normal(size=3)
+        turn = -np.array([[0.0, -m[2], m[1]], [m[2], 0.0, -m[0]], [-m[1], m[0], 0.0]])
+        leaning = np.array([[0.0, 0.0, 0.0], [lean[0], 0.0, 0.0], [lean[1], lean[2], 0.0]])
+        scale, iron = 2e-3 * rng.normal(size=3), 0.02 * rng.normal(size=(3, 3))
+        triad = turn + leaning + np.diag(scale)
+        ins, estimate, accel_bias = align(truth, model, rng, compass=compass, triad=triad, iron=iron)
+        slices = ins.model.slices
+        causes = ("accel_bias", "accel_scale", "accel_cross", "magnetometer_soft_iron")
+        where = np.r_[0:3, *(slices[name] for name in causes)]
+        crossing = [triad[axis] for axis in CROSS]
+        x = ins._state.x[0].copy()
+        x[: len(ins._state.imu)] = ins._state.imu
+        wrong = np.r_[error(estimate, truth)[6:9], x[where[3:]] - np.r_[accel_bias, scale, crossing, iron.ravel()]]
+        for i, n in enumerate((3, len(where))):
+            P = ins._state.P[0][np.ix_(where[:n], where[:n])]
+            found[i] += wrong[:n] @ np.linalg.solve(P, wrong[:n]) / (n * runs)
+    for nees, n in zip(found, (3, len(where)), strict=True):
+        low, high = chi2.ppf([0.005, 0.995], n * runs) / (n * runs)
+        print(nees, "bounds", low, high)
+        assert low < nees < high
 
 
 def test_course_in_flight_without_magnetometer():

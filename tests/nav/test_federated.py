@@ -18,9 +18,9 @@ from nav.federation import Config, Local
 from nav.fusion import blend, combine, reset, weights_by_covariance
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import NO_SENSOR, LocalFilter
+from nav.local_filter import LocalFilter
 from nav.monitor import MonitoredAid
-from nav.samples import AirspeedSample, BarometerSample, FixType, ImuSamples, Outcome, Status
+from nav.samples import NO_SENSOR, AirspeedSample, BarometerSample, FixType, ImuSamples, Outcome, Status
 from nav.weighting import MahalanobisInflation, SageHusa, Weight
 
 INFORMATION = Config(CONSUMER, (Local("only", ()),))

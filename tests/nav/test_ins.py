@@ -30,8 +30,7 @@ from nav.detection import SURE, GnssMonitor, Verdict, WindMemory
 from nav.error_model import CROSS
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
-from nav.local_filter import NO_SENSOR
-from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
+from nav.samples import NO_SENSOR, AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples, Outcome, Status
 
 ARM = (0.5, 0.1, -0.3)
 RECEIVER, PRESSURE, COMPASS = GnssAid(arm_b=ARM), BarometerAid(), MagnetometerAid()

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import FixType, GnssSample, Outcome
+from nav.samples import NO_SENSOR, FixType, GnssSample, Outcome
 from testbed import Scenario
 from testbed import run as fly
 from testbed.errors import UserError
@@ -373,6 +373,16 @@ def test_the_wrong_sensor_is_no_isolation() -> None:
     assert metrics.compute(run)["ins.isolation_correct.jump"] == 1
     refuse(run, "barometer", 108.0, 120.0)
     assert metrics.compute(run)["ins.isolation_correct.jump"] == 0
+
+
+@pytest.mark.ci
+def test_what_is_known_without_a_sample_is_no_wrong_sensor() -> None:
+    run = faulty(("jump", "gnss", 100.0, 120.0))
+    refuse(run, "gnss_position", 110.0, 120.0)
+    refuse(run, "barometer", 108.0, 120.0)
+    sensor = run["estimators/ins/innovations/barometer/sensor"]
+    sensor[:] = np.where(sensor.values == "barometer", NO_SENSOR, sensor.values)
+    assert metrics.compute(run)["ins.isolation_correct.jump"] == 1
 
 
 @pytest.mark.ci
