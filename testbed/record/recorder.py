@@ -87,7 +87,8 @@ class Recorder:
         self._every = round(scenario.truth.rate_hz / scenario.record.rate_hz)
         self._tables: dict[str, Table] = {}
         self._increments = np.zeros((0, 6))  # dtheta and dv of the ticks since the last recorded row
-        self._t = 0.0
+        self._t = 0.0  # of the newest row of truth
+        self._heard = 0.0  # up to where all else has been taken, which comes after truth
         self._last_flush = time.monotonic()
         self._tended = False
         self._file: BinaryIO | None = None
@@ -97,6 +98,7 @@ class Recorder:
 
     def truth(self, block: TruthBlock) -> None:
         """Take full-rate rows; every n-th is recorded, with the increments summed since the one before."""
+        self._heard = self._t
         if len(block):
             self._record_truth(block)
             self._t = float(block.t[-1])
@@ -286,7 +288,7 @@ class Recorder:
         plans = {
             path: Plan(
                 table.time_name,
-                table.rows_expected(self._t, self._duration),
+                table.rows_expected(self._t if path == "truth" else self._heard, self._duration),
                 dict(table.columns),
             )
             for path, table in self._tables.items()
