@@ -184,7 +184,7 @@ class Ahrs:
         last_bad = -math.inf
         start, n = 0, len(imu)
         while start < n:
-            end = int(np.searchsorted(imu.t, s.period_end - COINCIDENT)) + 1
+            end = int(imu.t.searchsorted(s.period_end - COINCIDENT)) + 1
             rows = slice(start, min(end, n))
             bad = propagate(
                 s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,

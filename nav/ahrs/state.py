@@ -69,11 +69,12 @@ class State:
 
 
 T = TypeVar("T", State, InMotion)
+_OWN = np.ndarray, InMotion  # of what a copy has its own
 
 
 def copied(state: T) -> T:
     """The same in arrays of its own."""
-    values: list[Any] = [x.copy() if isinstance(x, np.ndarray | InMotion) else x for x in vars(state).values()]
+    values: list[Any] = [x.copy() if isinstance(x, _OWN) else x for x in vars(state).values()]
     return type(state)(*values)
 
 

@@ -10,7 +10,7 @@ from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from nav.earth import position_difference_n
+from nav.earth import displacement_n
 from nav.rotation import euler_from_quat, quat_conjugate, quat_multiply, rotvec_from_quat
 from nav.samples import (
     AirspeedSample,
@@ -102,7 +102,7 @@ class Snapshot:
         """Estimated position from home [m], NED."""
         if self.point is None or self.home is None:
             return None
-        return floats(position_difference_n(*self.point, *self.home))
+        return floats(displacement_n(*self.point, *self.home))
 
     @cached_property
     def v_n(self) -> list[float]:
@@ -160,7 +160,7 @@ class Snapshot:
         }
         if self.point is None:
             return of_attitude
-        north, east, down = floats(position_difference_n(*self.point, *self.true_point))
+        north, east, down = floats(displacement_n(*self.point, *self.true_point))
         speed = floats(self.estimate.v_n - self.truth.v_n[0])
         return {
             "err_horiz": math.hypot(north, east),
