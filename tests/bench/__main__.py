@@ -1,11 +1,17 @@
 """Speed of the product: ``python tests/bench --help``.
 
-Machines differ and are noisy, ratios measured in one run much less so. Peers come with the bench extra (`make bench`
-installs it): pyins (PyPI python-ins), smsfusion and vqf.
+Machines differ and are noisy, ratios measured in one run much less so. All multiply on one thread, as the program does
+unless the environment says otherwise. Peers come with the bench extra (`make bench` installs it): pyins (PyPI
+python-ins), smsfusion and vqf.
 """
 
+import os
 import sys
 from pathlib import Path
+
+from testbed import threads
+
+os.environ.update({name: value for name, value in threads.ONE.items() if name not in os.environ})
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # so that this folder is the package `bench`
 
