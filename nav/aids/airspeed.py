@@ -121,46 +121,58 @@ def problem(sample: AirspeedSample) -> str:
 def airspeed(
     q_nb: Array, v_n: Array, lla: Array, x: Array, wind: int, gust: int, airspeed_scale: int, eas: float
 ) -> tuple[Array, Array]:
-    """Equivalent airspeed along body x [m/s]: (1 + scale) sqrt(rho / rho0) e_x . C_nb' (v - wind - gust).
+    """Equivalent airspeed along body x [m/s]: sqrt(rho / rho0) e_x . C_nb' ((1 + scale) (v - wind) - gust).
 
-    The density rho is the standard atmosphere's at the estimated height.
+    The density rho is the standard atmosphere's at the estimated height. Gusts are as the tube feels them: were they
+    scaled, the scale would be learned from how they come and go, of which a filter knows little.
     """
-    C_nb = dcm_from_quat(q_nb)
-    scale = x[airspeed_scale] if airspeed_scale >= 0 else 0.0
-    root = (1 + scale) * math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
-    nu, H = _air_velocity(C_nb[:, 0], v_n, x, wind, gust)
-    predicted = -root * nu[0]
-    for i in range(len(x)):
-        H[0, i] *= root
-    nu[0] = eas - predicted
+    factor = 1 + x[airspeed_scale] if airspeed_scale >= 0 else 1.0
+    root = math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
+    axis_n = dcm_from_quat(q_nb)[:, 0].copy()
+    steady_n, air_n = _air(v_n, x, wind, gust, factor)
+    H = _jacobian(len(x), root * axis_n, cross(air_n, root * axis_n), wind, gust, factor)
+    predicted = root * (axis_n @ air_n)
     half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
     H[0, POS + 2] = -predicted * half_lapse
     if airspeed_scale >= 0:
-        H[0, airspeed_scale] = predicted / (1 + scale)
-    return nu, H
+        H[0, airspeed_scale] = root * (axis_n @ steady_n)
+    return np.array([eas - predicted]), H
 
 
 @njit
 def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[Array, Array]:
-    """The constraint that no air comes from the side: 0 = e_y . C_nb' (v - wind - gust) [m/s]."""
-    return _air_velocity(dcm_from_quat(q_nb)[:, 1], v_n, x, wind, gust)
+    """The constraint that no air comes from the side: 0 = e_y . C_nb' (v - wind - gust) [m/s].
+
+    The Jacobian is that of the angle of sideslip times the airspeed, so it lies across the velocity through the air and
+    not along e_y. An aircraft turns into a gust from the side: e_y moves with the innovation. A gain along e_y would
+    move with it too, and the mean of their product, which is not zero, would make a bias of the airspeed's scale.
+    """
+    axis_n = dcm_from_quat(q_nb)[:, 1].copy()
+    _, air_n = _air(v_n, x, wind, gust, 1.0)
+    slip, squared = axis_n @ air_n, air_n @ air_n
+    across_n = axis_n - slip / squared * air_n if squared > 0.0 else axis_n
+    return np.array([-slip]), _jacobian(len(x), across_n, cross(air_n, axis_n), wind, gust, 1.0)
 
 
 @njit
-def _air_velocity(axis_n: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[Array, Array]:
-    """Zero minus the velocity through the air along a body axis ``axis_n`` (3,), and the Jacobian of that velocity."""
-    air_n, along_n = np.empty(3), np.empty(3)
-    H = np.zeros((1, len(x)))
-    for i in range(3):
-        air_n[i], along_n[i] = v_n[i], axis_n[i]
-    for start in (wind, gust):
-        if start >= 0:
-            for i in range(2):
-                air_n[i] -= x[start + i]
-                H[0, start + i] = -along_n[i]
-    turned = cross(air_n, along_n)
-    nu = np.zeros(1)
-    for i in range(3):
-        H[0, PHI + i], H[0, VEL + i] = turned[i], along_n[i]
-        nu[0] -= along_n[i] * air_n[i]
-    return nu, H
+def _air(v_n: Array, x: Array, wind: int, gust: int, factor: float) -> tuple[Array, Array]:
+    """The velocity through the mean wind (3,), and factor times that less the gust (3,)."""
+    steady_n, gust_n = v_n.copy(), np.zeros(3)
+    if wind >= 0:
+        steady_n[:2] -= x[wind : wind + 2]
+    if gust >= 0:
+        gust_n[:2] = x[gust : gust + 2]
+    return steady_n, factor * steady_n - gust_n
+
+
+@njit
+def _jacobian(n: int, slope_n: Array, turned: Array, wind: int, gust: int, factor: float) -> Array:
+    """Jacobian (1, n) of what has the gradient ``slope_n`` in factor (v - wind) - gust, and ``turned`` in phi."""
+    H = np.zeros((1, n))
+    H[0, PHI : PHI + 3] = turned
+    H[0, VEL : VEL + 3] = factor * slope_n
+    if wind >= 0:
+        H[0, wind : wind + 2] = -factor * slope_n[:2]
+    if gust >= 0:
+        H[0, gust : gust + 2] = -slope_n[:2]
+    return H

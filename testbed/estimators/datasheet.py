@@ -50,7 +50,7 @@ SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, nei
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 CRUISE_THROTTLE = 0.5  # of full throttle
-SIDESLIP = 0.15  # of a coordinated flight in calm air [m/s]
+SIDESLIP = 0.5  # of a coordinated flight: what is left of a gust, for a third of a second, and a mean in turns [m/s]
 
 
 def imu_model(
