@@ -20,7 +20,14 @@ Estimators = Annotated[
         help="mypackage:Mine or ./filters.py:Mine in the place of ins; repeat it to have ins, or others, beside.",
     ),
 ]
-Draws = Annotated[int | None, typer.Option(metavar="N", min=1, help="Flights of each weather: 20, 4 with --quick.")]
+Draws = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        min=1,
+        help="Flights of each weather: 20, 4 with --quick; five times as many, without it, of what goals are set for.",
+    ),
+]
 Draw = Annotated[
     int | None,
     typer.Option(metavar="N", min=0, help="Seeds that no other draw has; that of the documentation."),

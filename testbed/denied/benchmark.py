@@ -1,7 +1,8 @@
 """Flying the table: which flights there are, working them off in parallel, carrying on where it stopped.
 
-Draw k of a ``number`` has the seed ``number * DRAW + k`` in every weather, so that weathers share gusts and noise. The
-folder keeps each flight as it is finished; more draws in the same folder fly those that are missing.
+Draw k of a ``number`` has the seed ``number * DRAW + k`` in every weather, so that weathers share gusts and noise. Of
+what goals are set for there are further draws. The folder keeps each flight as it is finished; more draws in the same
+folder fly those that are missing.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -32,7 +33,7 @@ from testbed.motion.sections import FlightTruth
 if TYPE_CHECKING:
     from testbed.many.progress import Tell
 
-RECORDED_DRAW = 51001  # of the table in the documentation, and what is drawn when nobody says
+RECORDED_DRAW = 740001  # of the table in the documentation, and what is drawn when nobody says
 OURS = "ins"
 FLIGHTS, SCENARIOS = "flights", "scenarios"  # folders
 
@@ -49,9 +50,16 @@ class Plan:
 
     @property
     def seeds(self) -> range:
-        """One for each draw."""
+        """One for each draw of the whole table."""
         first = 1 + self.number * DRAW
         return range(first, first + (self.draws or self.table.draws))
+
+    @property
+    def further(self) -> range:
+        """One for each further draw of what goals are set for."""
+        judged = self.table.judged(self.contestants)
+        count = len(self.seeds) * (self.table.judged_draws - 1) if judged else 0
+        return range(self.seeds.stop, self.seeds.stop + count)
 
     def cases(self) -> Iterator[Case]:
         """All of them."""
@@ -69,11 +77,15 @@ class Failure(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A finished benchmark: what was planned, its flights in order of weather and seed, and those that failed."""
+    """A finished benchmark: what was planned, its flights in order of weather and seed, and those that failed.
+
+    ``outcomes`` are of the whole table, ``further`` of what goals are set for alone.
+    """
 
     plan: Plan
     outcomes: Sequence[Outcome]
     failures: Sequence[Failure]
+    further: Sequence[Outcome] = ()
 
     def at(self, weather: str) -> flight.At:
         """What the flights of a weather came to, at the times of the table."""
@@ -86,6 +98,7 @@ class _Task(NamedTuple):
     weather: Weather
     seed: int
     cases: tuple[Case, ...]
+    path: Path
     code: str
 
 
@@ -125,17 +138,14 @@ def fly(plan: Plan, workers: int | None = None, tell: Tell | None = None) -> Res
 
     A flight that fails stops no other. Raises UserError when the folder can't be written or holds another benchmark.
     """
-    require_draw(plan.number, len(plan.seeds))
+    require_draw(plan.number, plan.further.stop - plan.seeds.start)
     claim(plan.out, FLIGHTS, "benchmark", _setup(plan))
     _write_scenarios(plan)
-    found: dict[tuple[str, int], Outcome] = {}
-    for weather in plan.table.weathers:
-        for seed in plan.seeds:
-            if (outcome := flight.stored(_path(plan.out, weather, seed))) is not None:
-                found[weather.name, seed] = outcome
+    every = list(_tasks(plan))
+    found = {one.path: outcome for one in every if (outcome := flight.stored(one.path)) is not None}
     failures: list[Failure] = []
-    tasks = list(_tasks(plan, found))
-    total, before = len(tasks) + len(found), len(found)
+    tasks = [one for one in every if one.path not in found]
+    total, before = len(every), len(found)
 
     def say(now: pool.Standing[_Task]) -> None:
         if tell is not None:
@@ -150,25 +160,28 @@ def fly(plan: Plan, workers: int | None = None, tell: Tell | None = None) -> Res
                 if one.result is None:
                     failures.append(Failure(one.task.weather.name, one.task.seed, _said(one.error)))
                 else:
-                    flight.store(one.result, _path(plan.out, one.task.weather, one.task.seed))
-                    found[one.task.weather.name, one.task.seed] = one.result
-    ordered = [found[w.name, seed] for w in plan.table.weathers for seed in plan.seeds if (w.name, seed) in found]
+                    flight.store(one.result, one.task.path)
+                    found[one.task.path] = one.result
+    ordered = [path for w in plan.table.weathers for seed in plan.seeds if (path := _path(plan.out, w, seed)) in found]
     if not ordered:
         raise UserError(f"no flight came to its end: {failures[0].message}")
-    return Result(plan, ordered, sorted(failures))
+    further = [path for seed in plan.further if (path := _judged_path(plan.out, seed)) in found]
+    return Result(plan, [found[path] for path in ordered], sorted(failures), [found[path] for path in further])
 
 
 def _said(error: Exception | None) -> str:
     return str(error) if isinstance(error, UserError | pool.Died) else f"{type(error).__name__}: {error}"
 
 
-def _tasks(plan: Plan, found: Mapping[tuple[str, int], Outcome]) -> Iterator[_Task]:
-    """The flights that are not there yet, a draw after the other: what is interrupted has as many of every weather."""
+def _tasks(plan: Plan) -> Iterator[_Task]:
+    """All flights, a draw after the other: what is interrupted has as many of every weather."""
     cases = {weather.name: tuple(plan.table.cases(weather, plan.contestants)) for weather in plan.table.weathers}
     for seed in plan.seeds:
         for weather in plan.table.weathers:
-            if (weather.name, seed) not in found:
-                yield _Task(weather, seed, cases[weather.name], code())
+            yield _Task(weather, seed, cases[weather.name], _path(plan.out, weather, seed), code())
+    judged = plan.table.judged(plan.contestants)
+    for seed in plan.further:
+        yield _Task(judged[0].weather, seed, judged, _judged_path(plan.out, seed), code())
 
 
 def _fly(task: _Task, tell: Any) -> Outcome:
@@ -179,7 +192,7 @@ def _fly(task: _Task, tell: Any) -> Outcome:
 
 def ended(result: Result) -> dict[tuple[str, str], int]:
     """Estimators that ended by errors of their own, ``aids/grade/estimator``, and why: in how many flights."""
-    return dict(Counter(pair for one in result.outcomes for pair in one.ended.items()))
+    return dict(Counter(pair for one in (*result.outcomes, *result.further) for pair in one.ended.items()))
 
 
 # --- the folder
@@ -187,6 +200,10 @@ def ended(result: Result) -> dict[tuple[str, str], int]:
 
 def _path(folder: Path, weather: Weather, seed: int) -> Path:
     return folder / FLIGHTS / f"{weather.name}_s{seed}.npz"
+
+
+def _judged_path(folder: Path, seed: int) -> Path:
+    return folder / FLIGHTS / f"judged_s{seed}.npz"
 
 
 def _setup(plan: Plan) -> dict[str, Any]:

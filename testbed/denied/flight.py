@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -54,6 +54,12 @@ class Outcome:
     bound: Array
     distance: Array
     ended: Mapping[str, str]
+
+    def lane(self, lane: tuple[str, str, str]) -> Outcome:
+        """The same of one lane. Raises ValueError where there is none."""
+        k = self.lanes.index(lane)
+        one = {name: getattr(self, name)[k : k + 1] for name in ("error", "covariance", "bound", "distance")}
+        return replace(self, lanes=(lane,), **one)
 
     @property
     def horizontal(self) -> Array:

@@ -7,12 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from nav.samples import Array
+from testbed.denied import flight
 from testbed.denied.benchmark import Result
-from testbed.denied.table import Aids
+from testbed.denied.table import JUDGED_GRADE, Aids
 from testbed.score.claims import EXACT, MEDIAN, NEARLY_ALL, RMS_OVER_BOUND, Claim
-
-WEATHER, GRADE = "walking", "consumer"
-
 
 # By aids, and the time since GNSS was lost [s]: median and 95 % of the horizontal error [m] at most.
 ERRORS = {
@@ -32,14 +30,16 @@ def claims(result: Result) -> dict[str, list[Claim]]:
 
 
 def _claims(result: Result, estimator: str) -> Iterator[Claim]:
-    own = [outcome for outcome in result.outcomes if outcome.weather == WEATHER]
-    if own:
-        then, marks, lanes = result.at(WEATHER), result.plan.table.marks_s, own[0].lanes
-        for aids in (aids for aids in result.plan.table.aids if (aids.name, GRADE, estimator) in lanes):
-            k = lanes.index((aids.name, GRADE, estimator))
-            for i, mark in enumerate(marks):
-                error, bound = then.horizontal[:, k, i], then.bound[:, k, i]
-                yield from _of_one(aids, mark, error, bound, then.distance[:, k, i])
+    marks = result.plan.table.marks_s
+    for case in result.plan.table.judged(()):
+        flown = [one for one in result.outcomes if one.weather == case.weather.name] + list(result.further)
+        if not flown:
+            continue
+        then = flight.at([one.lane((case.aids.name, JUDGED_GRADE, estimator)) for one in flown], marks)
+        for i, mark in enumerate(marks):
+            yield from _of_one(
+                case.aids, mark, *(column[:, 0, i] for column in (then.horizontal, then.bound, then.distance))
+            )
     beaten, judged = below_the_bound(result, estimator)
     if judged:
         quantity = f"figures of the whole table that are below the bound, of {judged}"

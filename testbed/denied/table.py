@@ -107,6 +107,8 @@ AIDS = (
         fault='[[fault]]\nsensor = "airspeed"\nkind = "dropout"\nwindow = [{half}, {end}]',
     ),
 )
+# What goals are set for (`testbed.denied.goals`), by names.
+JUDGED_WEATHER, JUDGED_GRADE, JUDGED_AIDS = "walking", "consumer", ("air_data", "flow", "terrain")
 GRADES = (
     Grade("consumer", "mems-consumer"),
     Grade("industrial", "mems-industrial"),
@@ -198,13 +200,17 @@ class Case:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Which part of the table is flown, how many draws unless somebody says, and when GNSS is lost, ``lost_s`` [s]."""
+    """Which part of the table is flown, how many draws unless somebody says, and when GNSS is lost, ``lost_s`` [s].
+
+    What goals are set for is flown in ``judged_draws`` times as many draws: a quantile of 95 % takes dozens.
+    """
 
     weathers: Sequence[Weather] = WEATHERS
     aids: Sequence[Aids] = AIDS
     grades: Sequence[Grade] = GRADES
     marks_s: Sequence[int] = (60, 120, 600, LONGEST_S)
     draws: int = 20
+    judged_draws: int = 1
     lost_s: int = 300
 
     def cases(self, weather: Weather, contestants: tuple[Contestant, ...]) -> Iterator[Case]:
@@ -213,6 +219,16 @@ class Table:
             for grade in self.grades:
                 yield Case(weather, aids, grade, contestants, self.lost_s, max(self.marks_s))
 
+    def judged(self, contestants: tuple[Contestant, ...]) -> tuple[Case, ...]:
+        """Those that goals are set for."""
+        return tuple(
+            case
+            for weather in self.weathers
+            if weather.name == JUDGED_WEATHER
+            for case in self.cases(weather, contestants)
+            if case.grade.name == JUDGED_GRADE and case.aids.name in JUDGED_AIDS
+        )
 
-FULL = Table()
+
+FULL = Table(judged_draws=5)
 QUICK = Table(grades=GRADES[:1], marks_s=(60, 120), draws=4)

@@ -127,7 +127,7 @@ def _json(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[C
         "failures": [failure._asdict() for failure in result.failures],
         "ended": [
             {"weather": one.weather, "seed": one.seed, "lane": lane, "why": why}
-            for one in result.outcomes for lane, why in one.ended.items()
+            for one in (*result.outcomes, *result.further) for lane, why in one.ended.items()
         ],
     }  # fmt: skip
 
@@ -153,7 +153,7 @@ def _csv(result: Result) -> str:
         ["weather", "aids", "grade", "estimator", "seed", "after_s", "north_m", "east_m", "variance_north_m2",
          "covariance_m2", "variance_east_m2", "bound_m", "distance_m"]
     )  # fmt: skip
-    for one in result.outcomes:
+    for one in (*result.outcomes, *result.further):
         rows = [int(np.searchsorted(one.t, mark - 1e-6)) for mark in result.plan.table.marks_s]
         for k, lane in enumerate(one.lanes):
             for mark, row in zip(result.plan.table.marks_s, rows, strict=True):
@@ -226,8 +226,8 @@ def page(result: Result, found: Sequence[Cell], claims: Mapping[str, Sequence[Cl
         "# The table of denied navigation",
         "",
         f"Written by `testbed denied --save --draw {plan.number} --draws {len(plan.seeds)}` on {today}, of"
-        f" {len(plan.seeds)} draws: an end of an interval that so few can't tell is infinite. [Denied"
-        " navigation](denied.md) says what each row and column is.",
+        f" {len(plan.seeds)} draws, goals of {len(plan.seeds) + len(plan.further)}: an end of an interval that so few"
+        " can't tell is infinite. [Denied navigation](denied.md) says what each row and column is.",
         "",
         "## Goals: consumer IMU, walking wind",
         "",

@@ -208,6 +208,22 @@ def test_what_was_interrupted_ends_as_if_it_had_not_been(
     assert len(made) == 9 + 9 + 3
 
 
+def test_what_goals_are_set_for_has_further_draws(made: list[tuple[str, int]], tmp_path: Path) -> None:
+    """They count for the goals, and for nothing else; more draws of the whole table fly theirs whole."""
+    table = dataclasses.replace(FULL, aids=AIDS[:2], grades=GRADES[:2], marks_s=(60, 120), judged_draws=3)
+    result = benchmark.fly(Plan(table, INS, tmp_path, 5, 2), 1)
+    first = result.plan.seeds.start
+    assert made[6:] == [("walking", first + k) for k in (2, 3, 4, 5)]
+    assert [one.lanes for one in result.further] == [(("air_data", "consumer", "ins"), ("flow", "consumer", "ins"))] * 4
+    assert {cell.draws for cell in report.cells(result)} == {2}
+    claims = goals.claims(result)["ins"]
+    assert [claim.draws for claim in claims] == [6, 6, 6, 6, 1]
+    more = benchmark.fly(Plan(table, INS, tmp_path, 5, 3), 1)
+    assert len(more.outcomes) == 9
+    assert {len(one.lanes) for one in more.outcomes} == {4}
+    assert len(more.further) == 6
+
+
 def test_a_folder_holds_one_benchmark(made: list[tuple[str, int]], tmp_path: Path) -> None:
     benchmark.fly(Plan(SMALL, INS, tmp_path), 1)
     with pytest.raises(UserError, match="holds a benchmark with different scenarios"):
