@@ -43,6 +43,13 @@ def skew(v: Array) -> Array:
 
 
 @njit
+def dot(u: Array, v: Array) -> float:
+    """U . v of (3,): in the same order, and so to the same bits, on every processor."""
+    product: float = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+    return product
+
+
+@njit
 def cross(u: Array, v: Array) -> Array:
     """U x v (3,): for three elements far cheaper than `numpy.cross`, and quicker to compile."""
     return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])

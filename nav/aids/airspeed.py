@@ -12,7 +12,7 @@ from nav._jit import njit
 from nav.aids.base import Measurement, OperatingPoint, Ruling, range_problem
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.error_model import PHI, POS, VEL, Block, markov
-from nav.rotation import cross, dcm_from_quat
+from nav.rotation import cross, dcm_from_quat, dot
 from nav.samples import AirspeedSample, Array, Outcome, Sample
 
 AIRSPEED_LIMITS = (-10.0, 300.0)  # what an instrument could possibly report [m/s]
@@ -131,11 +131,11 @@ def airspeed(
     axis_n = dcm_from_quat(q_nb)[:, 0].copy()
     steady_n, air_n = _air(v_n, x, wind, gust, factor)
     H = _jacobian(len(x), root * axis_n, cross(air_n, root * axis_n), wind, gust, factor)
-    predicted = root * (axis_n @ air_n)
+    predicted = root * dot(axis_n, air_n)
     half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
     H[0, POS + 2] = -predicted * half_lapse
     if airspeed_scale >= 0:
-        H[0, airspeed_scale] = root * (axis_n @ steady_n)
+        H[0, airspeed_scale] = root * dot(axis_n, steady_n)
     return np.array([eas - predicted]), H
 
 
@@ -149,7 +149,7 @@ def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[A
     """
     axis_n = dcm_from_quat(q_nb)[:, 1].copy()
     _, air_n = _air(v_n, x, wind, gust, 1.0)
-    slip, squared = axis_n @ air_n, air_n @ air_n
+    slip, squared = dot(axis_n, air_n), dot(air_n, air_n)
     across_n = axis_n - slip / squared * air_n if squared > 0.0 else axis_n
     return np.array([-slip]), _jacobian(len(x), across_n, cross(air_n, axis_n), wind, gust, 1.0)
 
