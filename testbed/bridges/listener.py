@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import time
 
 from testbed.bridges.address import address, bound
+from testbed.mavlink.encode import Encoder
+from testbed.mavlink.shell import typed
 from testbed.mavlink.told import Told
 
 DEFAULT = "udpin:127.0.0.1:14540"
 MOST_DATAGRAMS = 10_000  # heard at once
+STATION = 255  # system of those who command
+ARM = "commander arm -f"
 
 
 class Listener:
@@ -17,6 +22,8 @@ class Listener:
 
     def __init__(self, url: str) -> None:
         self.told = Told()
+        self._encoder = Encoder(system=STATION)
+        self._speaker: tuple[str, int] | None = None
         self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
 
     def listen(self, system: int, seconds: float = 0.0) -> None:
@@ -25,9 +32,20 @@ class Listener:
         for _ in range(MOST_DATAGRAMS):
             self._socket.settimeout(max(0.0, until - time.monotonic()))
             try:
-                self.told.hear(self._socket.recv(65536), system)
+                datagram, self._speaker = self._socket.recvfrom(65536)
+                self.told.hear(datagram, system)
             except OSError:  # there is no more
                 return
+
+    def arm(self, system: int) -> None:
+        """Have a PX4 that has spoken armed, whatever its checks say.
+
+        Its shell does that; a command over MAVLink is checked even where it says that it is by force.
+        """
+        if self._speaker is None:
+            return
+        with contextlib.suppress(OSError):  # it is said again until it was heard
+            self._socket.sendto(typed(self._encoder, system, ARM), self._speaker)
 
     def close(self) -> None:
         """Close the port."""

@@ -8,7 +8,9 @@ took; what else is sent depends on the run alone. What PX4 answers moves nothing
 when it is armed its outputs 1 to 4 are aileron, elevator, throttle and rudder, positive to the right, up, on, right.
 
 Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.told`). PX4's clock is that of
-the stamps it is sent, from the first of them on.
+the stamps it is sent, from the first of them on. PX4 takes itself for landed until it is armed, and its estimator then
+uses neither airspeed nor sideslip: so one that does not fly is armed there, by force, once it has said where it is.
+Armed before, it would terminate its flight, and a PX4 that has done so has no outputs to answer with.
 
 * Samples are those of the scenario with all their errors; of several units of a kind, the first, but all receivers.
 * Answers to earlier steps are passed over; a later one, none within ``answer_s``, more than `MOST_BYTES` without the
@@ -46,6 +48,7 @@ DEFAULT = "tcpin:127.0.0.1:4560"
 TRUTH_HZ = 50.0
 BOOT_HZ = 10.0  # of sensors other than the IMU, until PX4 answers
 CONNECT_S, BOOT_S, ANSWER_S = 120.0, 120.0, 10.0  # of wall time
+ARM_S = 1.0  # of the run, between two commands to arm
 LAST_S = 0.2  # of wall time, that its last words may take
 MOST_BYTES = 100_000  # said within one step, of which an answer has some hundred
 READ = 65536
@@ -87,7 +90,7 @@ class Px4:
         self._system = 0  # of PX4, as it answers
         self._fix: dict[str, GnssSample] = {}  # the last of each receiver
         self._order: list[str] = []  # of the aiding sensors, as the scenario has them
-        self._truth_due = -math.inf
+        self._truth_due = self._arm_due = -math.inf
         self._said = 0  # bytes, by PX4
         listener = bound(url, address(url, "tcpin", DEFAULT), socket.SOCK_STREAM)
         with listener:
@@ -111,6 +114,9 @@ class Px4:
                     self._await(stamp, step.t)
         for one in self._ears.values():
             one.listen(self._system)
+            if one.told.placed and not (self.armed or self.flies) and turn.reference.t[-1] >= self._arm_due:
+                self._arm_due = float(turn.reference.t[-1]) + ARM_S
+                one.arm(self._system)
 
     def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
         """What PX4 said over the whole run of its own motion."""
@@ -170,6 +176,7 @@ class Px4:
                 f"PX4 said {much} bytes at {t:.3f} s, but not the controls of that step"
                 if much > MOST_BYTES
                 else f"PX4 has not answered the step of {t:.3f} s for {self._answer_s:g} s"
+                + (": has it terminated its flight?" if self.armed else "")
             )
 
     def _take(self, controls: Sequence[float], t: float) -> None:

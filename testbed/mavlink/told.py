@@ -84,6 +84,11 @@ class Told:
             if take is not None and (message.system, message.component) == (system, dialect.MAV_COMP_ID_AUTOPILOT1):
                 take(message)
 
+    @property
+    def placed(self) -> bool:
+        """Whether it has said an attitude and a position."""
+        return bool(self._position.rows and (self._attitude.rows or self._odometry.rows))
+
     def estimates(self, times: Sequence[float], boot: float) -> Iterator[Estimate]:
         """The estimates at ``times`` [s] of a clock that says ``boot`` when the vehicle's says zero."""
         attitude = self._attitude if self._attitude.rows else self._odometry

@@ -76,6 +76,30 @@ def test_late_lacking_and_senseless_messages_do_no_harm() -> None:
     assert len(without) > 15
 
 
+@pytest.mark.ci
+def test_it_is_armed_once_it_has_said_where_it_is() -> None:
+    voice = autopilots.Voice(placed_s=4.0)
+    peer = autopilots.Px4(voice=voice)
+    far_end = Px4(peer.url, estimators={"theirs": voice.url})
+    result = run(scenario(), far_end=far_end)
+    assert result.failure == ""
+    assert voice.armed is not None
+    assert 4.0e6 <= voice.armed < 5.5e6
+    assert far_end.armed
+
+
+def test_one_that_flies_is_armed_by_whom_it_likes() -> None:
+    voice = autopilots.Voice()
+    peer = autopilots.Px4(voice=voice)
+    far_end = Px4(peer.url, estimators={"theirs": voice.url}, flies=True)
+    flown = {"duration_s": 2.0, "sensors.gnss.denied": [], "expect": {}}
+    run(
+        Scenario.load("loiter_gnss_outage", flown | {"estimator": [{"name": "theirs", "kind": "px4"}]}), far_end=far_end
+    )
+    assert voice.armed is None
+    assert not far_end.armed
+
+
 def test_without_px4_it_is_said_where_it_is() -> None:
     with pytest.raises(UserError, match="theirs: is PX4's own, which is there while PX4 follows the run: add --px4"):
         run(scenario())

@@ -74,13 +74,15 @@ class Voice:
     """What PX4 says over its own MAVLink: truth, but `NORTH_M` too far north. Its clock begins with the first stamp.
 
     With ``odd`` each message comes a turn late, the youngest first, among numbers that are none, others' and garbage,
-    and from 4 to 6 s nothing is said of the position.
+    and from 4 to 6 s nothing is said of the position. Before ``placed_s`` there is no position at all. Its shell takes
+    one command, whose stamp is ``armed`` [us]; as PX4's, it is gone at once when nobody asks for what it says.
     """
 
     NORTH_M, SIGMA_M = 3.0, 2.0
 
-    def __init__(self, odd: bool = False) -> None:
-        self.port, self.odd = free_port(socket.SOCK_DGRAM), odd
+    def __init__(self, odd: bool = False, placed_s: float = 0.0) -> None:
+        self.port, self.odd, self.placed_s = free_port(socket.SOCK_DGRAM), odd, placed_s
+        self.armed: int | None = None
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._mav, self._other = (mav.MAVLink(None, srcSystem=own, srcComponent=1) for own in (1, 7))
         self._begun: int | None = None
@@ -111,7 +113,7 @@ class Voice:
                 stamp, 1, 1, 0, 0, 0, q, *velocity, 0, 0, 0, covariance, [0.01] * 21, estimator_type=8
             ),
         ]
-        if not (self.odd and 4e6 < stamp < 6e6):
+        if stamp >= 1e6 * self.placed_s and not (self.odd and 4e6 < stamp < 6e6):
             said.append(place)
         frames = [bytes(message.pack(self._mav)) for message in said]
         if self.odd:
@@ -125,6 +127,17 @@ class Voice:
             frames, self._late = self._late, frames[::-1]
         for frame in frames:
             self._link.sendto(frame, ("127.0.0.1", self.port))
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._hear(self._link.recv(4096, socket.MSG_DONTWAIT), stamp)
+
+    def _hear(self, data: bytes, stamp: int) -> None:
+        for message in mav.MAVLink(None).parse_buffer(data) or []:
+            if message.get_type() != "SERIAL_CONTROL" or message.device != mav.SERIAL_CONTROL_DEV_SHELL:
+                continue
+            typed = bytes(message.data[: message.count])
+            if typed == b"commander arm -f\n" and message.flags & mav.SERIAL_CONTROL_FLAG_RESPOND:
+                self.armed = stamp if self.armed is None else self.armed
 
 
 class Px4(threading.Thread):
@@ -195,6 +208,8 @@ class Px4(threading.Thread):
         if self.pilot is not None and self._due and self._state is not None:
             right, up, yaw, throttle = self._flown()
             controls[:4], mode = [right, up, throttle, yaw], 1 | 128
+        elif self.voice is not None and self.voice.armed is not None:
+            mode |= 128
         return bytes(self._mav.hil_actuator_controls_encode(stamp, controls, mode, 1).pack(self._mav))
 
     def _flown(self) -> Any:
