@@ -377,7 +377,11 @@ class Federated:
             values[row] = values[n + row] = values[2 * n + row]
 
     def _cross_check(self, state: State, t: float) -> None:
-        """Isolate the sensor behind a contradiction between filters."""
+        """Isolate the sensor behind a contradiction between filters, which are held against each other in velocity.
+
+        It is the one whose own filter suspected it most of late: by its velocities, where it has some, for slow errors
+        of positions make suspicions of their own.
+        """
         healthy = self._healthy()
         against = np.zeros(len(healthy))
         if healthy.sum() >= 2:
@@ -389,7 +393,12 @@ class Federated:
         if not against.max() > chi_square_threshold(CROSS_CHECK_FALSE_ALARM, MOTION - VEL):
             return
         suspects = [self.locals[i] for i in np.flatnonzero(against >= CONTRADICTION_SHARE * against.max())]
-        evidence = {(f, key): monitor.suspicion for f in suspects for key, monitor in f.monitors.items()}
+        evidence = {
+            (f, (sensor, part)): monitor.suspected
+            for f in suspects
+            for (sensor, part), monitor in f.monitors.items()
+            if part != "gnss_position" or (sensor, "gnss_velocity") not in f.monitors
+        }
         filter_, (sensor, _) = max(evidence, key=lambda which: evidence[which])
         for (name, part), monitor in filter_.monitors.items():
             if name == sensor:

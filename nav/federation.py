@@ -40,8 +40,8 @@ Cross-check
     is compared with the fused solution of the others in position and velocity, which sharing has made independent:
     (x_i - x_o)' (P_i + P_o)^-1 (x_i - x_o) is chi-square of six degrees of freedom at most. When the largest exceeds
     its limit, one filter is wrong. Among the filters that contradict the others about as strongly, the sensor whose
-    detector has the most evidence (`Monitor.suspicion`) is isolated. A sound sensor's has none; a faulty one's has at
-    least a little if it remembers the onset, as `nav.detection.Glr` does. With resets all filters agree and nothing can
+    detector has had the most evidence of late (`Monitor.suspected`) is isolated. A sound sensor's has little; a faulty
+    one's has more if it remembers the onset, as `nav.detection.Glr` does. With resets all filters agree and nothing can
     be compared, so a cross-check needs ``no_reset``. With two receivers and no third filter to decide between them, a
     fault that is too slow for any detector is found, but may be laid on the wrong receiver.
 

@@ -17,6 +17,7 @@ from nav.samples import Array
 from nav.weighting import Policy, split
 
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Monitor`
+LATELY_S = 5.0  # in which a suspicion is forgotten
 ROUNDING = 1e-6  # of times [s]
 
 
@@ -75,7 +76,8 @@ class Monitor:
     it go. The detector begins anew then; what was learned of the colour of its innovations is kept.
 
     ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
-    measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement [s].
+    measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement [s];
+    ``suspected`` the largest suspicion of late, those before with a factor of exp(-age / `LATELY_S`).
     """
 
     def __init__(
@@ -86,7 +88,7 @@ class Monitor:
         self._patience, self._variance = patience, LongRunVariance() if coloured else None
         self.isolated: Mask = np.full(size, False)
         self.suspect = self.out = False
-        self.suspicion, self.judged = 0.0, -math.inf
+        self.suspicion, self.suspected, self.judged = 0.0, 0.0, -math.inf
         self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
         self._bad_since = np.full(size, math.inf)  # time of the first of those in a row
         self._clean = True
@@ -98,7 +100,9 @@ class Monitor:
             S = self._variance.widened(nu, S, t, sound=self._clean)
         decision = self.detector.step(nu, S, t)
         ratio = decision.statistic / decision.threshold
-        self.suspicion, self.judged = max(ratio, 0.0) if ratio == ratio else math.inf, t
+        self.suspicion = max(ratio, 0.0) if ratio == ratio else math.inf
+        faded = self.suspected * math.exp((self.judged - t) / LATELY_S) if 0 < self.suspected < math.inf else 0.0
+        self.suspected, self.judged = max(self.suspicion, faded), t
         if not decision.alarm and self._clean:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated

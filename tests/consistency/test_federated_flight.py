@@ -158,3 +158,15 @@ def test_faults_in_a_minute() -> None:
         assert found[f"federated.detection_delay_s.{name}"] <= delay
         assert found[f"federated.isolation_correct.{name}"] == 1
         assert found[f"federated.end_lag_s.{name}"] <= 3.0
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("seed", [710031000003, 710031000004])
+def test_of_two_receivers_the_one_that_is_dragged_away_is_isolated(seed: int) -> None:
+    """Seeds whose sound receiver was isolated, by what the slow errors of its positions looked like in that moment."""
+    scenario = Scenario.load("loiter_fault_tolerant", ["expect={}", "record.imu=false"])
+    own = {"estimator": scenario.estimator[-1:], "duration_s": 215.0}
+    dataset = run(scenario.model_copy(update=own), seed=seed).dataset
+    outcome = accuracy.column(dataset, "estimators/federated/innovations/gnss_velocity/outcome")
+    sensor = accuracy.column(dataset, "estimators/federated/innovations/gnss_velocity/sensor")
+    assert set(sensor[outcome == Outcome.ISOLATED].tolist()) == {"gnss1"}

@@ -61,6 +61,20 @@ def test_readmission_needs_consecutive_passes():
     assert not rows[-1][2]
 
 
+def test_a_suspicion_fades_and_one_that_is_none_is_forgotten_at_once():
+    class Suspects(Scripted):
+        def step(self, nu, S, t):
+            return super().step(nu, S, t)._replace(statistic=next(statistics))
+
+    statistics = iter([0.8, 0.1, 0.5, math.nan, 0.2])
+    watch = Monitor(Suspects([None] * 5), None, 2, Patience(3))
+    found = []
+    for t in (0.0, 2.0, 5.0, 6.0, 7.0):
+        watch.judge(np.zeros(2), np.eye(2), t)
+        found.append(watch.suspected)
+    np.testing.assert_allclose(found, [0.8, 0.8 * math.exp(-0.4), 0.5, math.inf, 0.2])
+
+
 def test_looks_that_are_sound_alone_for_long_overrule_the_detector():
     """Ten times four looks, of all isolated axes; then the detector begins anew."""
     watch = Monitor(Glr(1e-6), None, 2, Patience(3, readmit_after=4))
