@@ -15,7 +15,8 @@ from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from testbed.errors import UserError
 from testbed.motion import aircraft
 from testbed.motion.guidance import beginning
-from testbed.motion.legs import FigureEight, Loiter, Racetrack
+from testbed.motion.legs import TURN_BANK, FigureEight, Loiter, Racetrack
+from testbed.motion.paths import turn_radius
 from testbed.motion.sections import FlightTruth
 from testbed.scenario import Scenario
 from testbed.sensors.airspeed import AirspeedConfig
@@ -38,7 +39,8 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What parameters are made of: airspeeds are equivalent ones [m/s], ``radius`` [m] is None without circles.
+    """What parameters are made of: airspeeds are equivalent ones [m/s], ``radius`` [m] that of the last circle, or of
+    a turn where the plan has none.
 
     ``latency_s`` and ``antenna`` [m] are the first receiver's; ``imu`` [m] is where the first IMU is.
     """
@@ -52,7 +54,7 @@ class Facts:
     least_sink: float
     most_sink: float
     bank_deg: float
-    radius: float | None
+    radius: float
     right: bool
     receivers: int
     latency_s: float
@@ -92,8 +94,8 @@ def _facts(scenario: Scenario) -> Facts:
         least_sink=envelope.descent_limit(speed, h),
         most_sink=envelope.descent.max_mps,
         bank_deg=envelope.bank.max_deg,
-        radius=circles[-1].radius_m if circles else None,
-        right=bool(circles) and circles[-1].direction == "right",
+        radius=circles[-1].radius_m if circles else turn_radius(speed, TURN_BANK),
+        right=not circles or circles[-1].direction == "right",
         receivers=len(receivers),
         latency_s=receivers[0].latency_s if receivers else 0.0,
         antenna=receivers[0].lever_arm_m if receivers else (0.0, 0.0, 0.0),
@@ -143,8 +145,9 @@ def _of_px4(facts: Facts) -> Iterator[Parameter]:
     yield Parameter("FW_T_SINK_MIN", _within(facts.least_sink, 1, 5), "sink at idle at that airspeed [m/s]")
     yield Parameter("FW_T_SINK_MAX", _within(facts.most_sink, 1, 15), "steepest descent [m/s]")
     yield Parameter("FW_R_LIM", _within(facts.bank_deg, 35, 65), "steepest bank [deg]")
-    if facts.radius is not None:
-        yield Parameter("NAV_LOITER_RAD", _within(facts.radius, 25, 1000), "radius of the scenario's last circle [m]")
+    yield Parameter("FW_THR_MAX", 1.0, "what that climb takes; airframes of PX4's own have less")
+    yield Parameter("FW_THR_MIN", 0.0, "what that sink takes")
+    yield Parameter("NAV_LOITER_RAD", _within(facts.radius, 25, 1000), "radius of the last circle [m]")
     if facts.receivers:
         yield Parameter("EKF2_GPS_DELAY", _within(1e3 * facts.latency_s, 0, 300), "how late fixes come [ms]")
     for what, place, sensor in (("GPS", facts.antenna, "antenna"), ("IMU", facts.imu, "first IMU")):
@@ -194,11 +197,8 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
         facts.bank_deg,
         f"steepest bank [deg]; before 4.5: LIM_ROLL_CD,{round(100 * facts.bank_deg)}",
     )
-    if facts.radius is not None:
-        way = 1 if facts.right else -1
-        yield Parameter(
-            "WP_LOITER_RAD", way * round(facts.radius), "radius of the scenario's last circle, left below 0 [m]"
-        )
+    way = 1 if facts.right else -1
+    yield Parameter("WP_LOITER_RAD", way * round(facts.radius), "radius of the last circle, left below 0 [m]")
     yield Parameter("ARSPD_TYPE", 100 if facts.airspeed else 0, "the airspeed sensor that it is told of, or none")
     yield Parameter("ARSPD_USE", int(facts.airspeed), "whether it flies by that")
     for number in range(1, min(facts.receivers, 2) + 1):

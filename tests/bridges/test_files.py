@@ -132,6 +132,9 @@ def test_from_the_ground_it_begins_with_a_take_off(tmp_path: Path) -> None:
     trimmed = files.write(Path("take_off"), "px4-params", tmp_path / "from_rest.params").read_text()
     assert "FW_AIRSPD_TRIM\t25.0\t" in trimmed
     assert "FW_LAUN_DETCN_ON\t0\t6" in trimmed
+    radius = 25.4**2 / (GRAVITY * np.tan(np.radians(TURN_BANK_DEG)))  # it circles at the end, though no leg does
+    (circled,) = (float(line.split("\t")[3]) for line in trimmed.splitlines() if "NAV_LOITER_RAD" in line)
+    assert circled == pytest.approx(radius, rel=0.02)
     own = mavparm.MAVParmDict()
     assert own.load(str(files.write(Path("take_off"), "ardupilot-params", tmp_path / "from_rest.parm")))
     assert (own["TKOFF_THR_MINACC"], own["TKOFF_THR_MINSPD"], own["AIRSPEED_CRUISE"]) == (0, 0, 25)
@@ -172,6 +175,7 @@ def test_parameters_for_px4(tmp_path: Path) -> None:
     assert own["FW_AIRSPD_MIN"] == pytest.approx(envelope.margin * envelope.stall_mps, abs=0.006)
     assert own["FW_AIRSPD_MIN"] < own["FW_AIRSPD_TRIM"] < own["FW_AIRSPD_MAX"] == envelope.max_mps
     assert (own["EKF2_GPS_DELAY"], own["NAV_LOITER_RAD"], own["FW_R_LIM"]) == (100, 400, 40)
+    assert (own["FW_THR_MIN"], own["FW_THR_MAX"]) == (0, 1)  # PX4's own aeroplanes have 0.05 and 0.6
 
 
 def test_of_a_record_they_are_those_of_its_scenario(tmp_path: Path) -> None:
