@@ -156,6 +156,10 @@ def _of_px4(facts: Facts) -> Iterator[Parameter]:
     yield Parameter("MIS_TKO_LAND_REQ", 0, "a mission needs neither take-off nor landing")
     if facts.on_ground:
         yield Parameter("FW_LAUN_DETCN_ON", 0, AT_ONCE)
+    for name in ("COM_POS_LOW_EPH", "COM_POS_FS_EPH"):
+        yield Parameter(
+            name, -1.0, "the plan is flown on without GNSS, however doubtful the position, not home, nor down"
+        )
     yield Parameter("COM_RC_IN_MODE", 4, "there are no sticks")
     yield Parameter("NAV_DLL_ACT", 0, "a ground station may go away")
     yield Parameter("CBRK_SUPPLY_CHK", 894281, "there is no power supply to be checked before arming")

@@ -176,6 +176,7 @@ def test_parameters_for_px4(tmp_path: Path) -> None:
     assert own["FW_AIRSPD_MIN"] < own["FW_AIRSPD_TRIM"] < own["FW_AIRSPD_MAX"] == envelope.max_mps
     assert (own["EKF2_GPS_DELAY"], own["NAV_LOITER_RAD"], own["FW_R_LIM"]) == (100, 400, 40)
     assert (own["FW_THR_MIN"], own["FW_THR_MAX"]) == (0, 1)  # PX4's own aeroplanes have 0.05 and 0.6
+    assert (own["COM_POS_LOW_EPH"], own["COM_POS_FS_EPH"]) == (-1, -1)  # they go home, then down, within an outage
 
 
 def test_of_a_record_they_are_those_of_its_scenario(tmp_path: Path) -> None:
