@@ -111,9 +111,14 @@ class EventWatch:
 
 
 def legs_unflown(scenario: Scenario, leg: float) -> str:
-    """Which legs of the plan a run that ends in leg ``leg``, counted from 0, never came to; empty when none."""
+    """Which legs of the plan a run that ends in leg ``leg``, counted from 0, never came to; empty when none.
+
+    Who flies from outside has a plan of its own, of which nothing is known here.
+    """
+    if leg == OUTSIDE:
+        return ""
     names = [one.leg.replace("_", " ") for one in scenario.plan]
-    missed = [f"{number}/{len(names)} {name}" for number, name in enumerate(names, 1) if number > max(leg, OUTSIDE) + 1]
+    missed = [f"{number}/{len(names)} {name}" for number, name in enumerate(names, 1) if number > max(leg, -1) + 1]
     if not missed:
         return ""
     what = f"leg {missed[0]} was" if len(missed) == 1 else f"legs {', '.join(missed)} were"

@@ -112,6 +112,8 @@ class Flight:
         self._moved = True
         if self._launcher is not None:
             self._launcher.hear(throttle, self._tick - 1)
+        else:
+            self._commands = (*self._commands[:3], OUTSIDE)
         self._aircraft.move(aileron, elevator, rudder, throttle)
 
     def blow(self, from_deg: float, speed_mps: float) -> None:

@@ -88,6 +88,16 @@ def test_it_is_armed_once_it_has_said_where_it_is() -> None:
     assert far_end.armed
 
 
+def test_one_that_has_terminated_its_flight_is_told_of() -> None:
+    voice = autopilots.Voice()
+    peer = autopilots.Px4("stall", at=1000, voice=voice)
+    try:
+        result = run(scenario(), far_end=Px4(peer.url, estimators={"theirs": voice.url}, answer_s=3.0))
+    finally:
+        peer.over.set()
+    assert result.failure.endswith("for 3 s: has it terminated its flight?")
+
+
 def test_one_that_flies_is_armed_by_whom_it_likes() -> None:
     voice = autopilots.Voice()
     peer = autopilots.Px4(voice=voice)
