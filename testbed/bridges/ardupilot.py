@@ -3,22 +3,25 @@
 ArduPilot sends a packet of servo outputs per frame over UDP and waits for one line of JSON; a line goes out for each
 sample of the first IMU, when the packet of the next frame has come, and until then the run waits. What is ours in it:
 ``imu`` (gyro and accel_body, with all errors of the scenario), and ``airspeed`` where there is a sensor. ``position``
-(from the first place, NED), ``velocity`` and ``attitude`` are truth: of these ArduPilot makes GNSS, magnetometer and
-barometer of its own; our fixes can go to its MAVLink beside (`testbed.bridges.gps_input`). What the servos say moves
-nothing here, unless ArduPilot is to fly: then from its first throttle above `STARTED_US` on channels 1 to 4 are
-aileron, elevator, throttle and rudder, a packet old when they move.
+(from the first place, see `_metres`), ``velocity`` and ``attitude`` are truth: of these ArduPilot makes GNSS,
+magnetometer and barometer of its own; our fixes can go to its MAVLink beside (`testbed.bridges.gps_input`).
+``no_time_sync`` keeps it from waiting for the wall clock. What the servos say moves nothing here, unless ArduPilot is
+to fly: then from its first throttle above `STARTED_US` on channels 1 to 4 are aileron, elevator, throttle and rudder, a
+packet old when they move.
 
 A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
 earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
 more than `MOST_PACKETS` without the next frame ends it, and the run, with the reason.
 
 Source: SIM_JSON.cpp and .h of ArduPilot 4.6, and libraries/SITL/examples/JSON/readme.md there: magic 18458 with 16
-channels or 29569 with 32, rate, count, microseconds of each, little-endian; no space may stand before a list.
+channels or 29569 with 32, rate, count, microseconds of each, little-endian; no space may stand before a list. Airspeed
+is a true one, of which sitl_airspeed.cpp makes an equivalent one; places come of metres as in Location.cpp.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import socket
 import struct
 import time
@@ -26,7 +29,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from nav.earth import position_difference_n
+from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, Estimate
 from testbed.bridges.address import address, bound
@@ -42,6 +45,7 @@ MOST_PACKETS = 1000  # heard within one step
 _HEAD = struct.Struct("<HHI")  # magic, frame rate, frame count
 CHANNELS = {18458: 16, 29569: 32}  # by magic
 DIGITS = 9
+RADIUS_M = 6_378_100.0  # of ArduPilot's Earth, a sphere
 MIDDLE_US, TRAVEL_US, STARTED_US = 1500, 500, 1050  # of a channel
 
 
@@ -169,17 +173,27 @@ class ArduPilot:
         place = float(row.lat[0]), float(row.lon[0]), float(row.h[0])
         self._home = self._home or place
         if (speed := step.first(AirspeedSample)) is not None:
-            self._airspeed = speed.eas
+            self._airspeed = speed.eas * math.sqrt(SEA_LEVEL_DENSITY / float(isa_density(place[2])))
         said = {
             "timestamp": round(step.t, DIGITS),
             "imu": {"gyro": _list(step.gyro), "accel_body": _list(step.accel)},
-            "position": _list(position_difference_n(*place, *self._home)),
+            "position": _list(_metres(*place, *self._home)),
             "attitude": _list(np.array(euler_from_quat(row.q_nb[0]))),
             "velocity": _list(row.v_n[0]),
+            "no_time_sync": 1,  # else ArduPilot holds itself to the wall clock; a number, it reads no words
         }
         if self._airspeed is not None:
             said["airspeed"] = round(self._airspeed, DIGITS)
         return b"\n" + json.dumps(said, separators=(",", ":")).encode() + b"\n"
+
+
+def _metres(lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float) -> np.ndarray:
+    """North, east, down [m] of a place from another, with which ArduPilot's arithmetic leads there again.
+
+    Its Earth is a sphere: true metres would be 0.1 to 0.6 % short of where its GNSS, its mission and our fixes are.
+    """
+    east = (lon - lon0 + math.pi) % (2 * math.pi) - math.pi
+    return np.array([RADIUS_M * (lat - lat0), RADIUS_M * math.cos(0.5 * (lat + lat0)) * east, h0 - h])
 
 
 def _list(values: np.ndarray) -> list[float]:

@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pymap3d
 import pytest
 from scipy.spatial.transform import Rotation
 from worlds import autopilots
@@ -51,13 +50,34 @@ def test_a_run_that_ardupilot_follows_has_the_same_bits_and_is_told_as_it_is() -
     last = peer.said[-1]
     if last["timestamp"] == pytest.approx(10.0):  # the last answer may not have been read
         lat, lon, h = (truth[key].values for key in ("lat", "lon", "h"))
-        ned = pymap3d.geodetic2ned(*np.degrees([lat[-1], lon[-1]]), h[-1], *np.degrees([lat[0], lon[0]]), h[0])
-        np.testing.assert_allclose(last["position"], ned, atol=0.3)
+        assert place(lat[0], lon[0], last["position"]) == pytest.approx((lat[-1], lon[-1]), rel=0, abs=5e-8)  # 0.3 m
+        assert last["position"][2] == pytest.approx(h[0] - h[-1], abs=1e-6)
         np.testing.assert_allclose(last["velocity"], truth["v_n"].values[-1], atol=1e-6)
         attitude = Rotation.from_euler("ZYX", last["attitude"][::-1])
         same_as = Rotation.from_quat(truth["q_nb"].values[-1], scalar_first=True)
         assert (attitude * same_as.inv()).magnitude() < 1e-6
     assert last["airspeed"] == pytest.approx(50, abs=5)
+    assert all(b'"no_time_sync":1' in line for line in lines)
+
+
+def place(lat: float, lon: float, position: list[float]) -> tuple[float, float]:
+    """Where ArduPilot takes a position from a place to be [rad], in steps of 1e-7 degrees, each 1.1 cm."""
+    unit = np.radians(1e-7)
+    north = position[0] / 0.011131884502145034
+    east = position[1] / 0.011131884502145034 / np.cos(lat + north * unit / 2)
+    return lat + north * unit, lon + east * unit
+
+
+def test_airspeed_is_a_true_one_of_which_ardupilot_makes_an_equivalent_one() -> None:
+    peer = autopilots.ArduPilot()
+    changes = {"duration_s": 2, "truth.start.alt_m": 3000, "expect": {}}
+    try:
+        result = run(Scenario.load("kinematic_u_flight", changes), far_end=ArduPilot(peer.url))
+    finally:
+        peer.over.set()
+    equivalent = result.dataset["sensors/airspeed/eas"].values
+    told = {line["airspeed"] / 1.1609 for line in peer.said if "airspeed" in line}  # EAS2TAS there
+    assert max(abs(one - equivalent).min() for one in told) < 0.02
 
 
 @pytest.mark.parametrize("behaviour", ["double", "wrong", "wide"])
