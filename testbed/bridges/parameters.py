@@ -1,7 +1,7 @@
 """Parameters with which PX4 or ArduPlane fly the aircraft of a scenario, each with what it is for.
 
 Names and units: parameter definitions of PX4-Autopilot 1.16 (performance_model_params, control_allocator, pwm_out_sim,
-navigator, commander, ekf2) and of ArduPilot 4.6 (ArduPlane/Parameters.cpp, SRV_Channel, AP_GPS_Params,
+navigator, commander, ekf2) and of ArduPilot 4.6 (ArduPlane/Parameters.cpp, APM_Control, SRV_Channel, AP_GPS_Params,
 AP_Airspeed_Params, AP_TECS), whose earlier names are told beside. Airspeeds of both are equivalent (calibrated) ones.
 """
 
@@ -25,6 +25,18 @@ from testbed.sensors.imu import ImuConfig
 
 REAL32, INT32 = 9, 6  # MAV_PARAM_TYPE
 AXES = "XYZ"
+# Of ArduPlane's controllers of rate and angle, about those of its own model of a small aeroplane: with its defaults the
+# loiter aircraft swings by 30 m about its height in circles, and its throttle from end to end; with these by 9 m.
+GAINS = {
+    "roll": {"RLL_RATE_P": 0.3, "RLL_RATE_I": 0.25, "RLL_RATE_D": 0.017, "RLL_RATE_FF": 0.24, "RLL2SRV_TCONST": 0.3},
+    "pitch": {
+        "PTCH_RATE_P": 0.15,
+        "PTCH_RATE_I": 0.11,
+        "PTCH_RATE_D": 0.007,
+        "PTCH_RATE_FF": 0.6,
+        "PTCH2SRV_TCONST": 0.3,
+    },
+}
 AT_ONCE = "the launcher waits for the throttle, which must not wait for the launch"
 
 
@@ -201,6 +213,9 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
         facts.bank_deg,
         f"steepest bank [deg]; before 4.5: LIM_ROLL_CD,{round(100 * facts.bank_deg)}",
     )
+    for axis, gains in GAINS.items():
+        for name, value in gains.items():
+            yield Parameter(name, value, f"gain of {axis}, tried with the loiter aircraft")
     way = 1 if facts.right else -1
     yield Parameter("WP_LOITER_RAD", way * round(facts.radius), "radius of the last circle, left below 0 [m]")
     yield Parameter("ARSPD_TYPE", 100 if facts.airspeed else 0, "the airspeed sensor that it is told of, or none")
