@@ -220,6 +220,8 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
     yield Parameter("WP_LOITER_RAD", way * round(facts.radius), "radius of the last circle, left below 0 [m]")
     yield Parameter("ARSPD_TYPE", 100 if facts.airspeed else 0, "the airspeed sensor that it is told of, or none")
     yield Parameter("ARSPD_USE", int(facts.airspeed), "whether it flies by that")
+    if facts.airspeed:
+        yield Parameter("ARSPD_SKIP_CAL", 1, "it boots in the wind, or in flight: there is no zero to be found")
     for number in range(1, min(facts.receivers, 2) + 1):
         old = "GPS_TYPE" if number == 1 else "GPS_TYPE2"
         yield Parameter(f"GPS{number}_TYPE", 14, f"our fixes, as GPS_INPUT (--gps-input); before 4.6: {old}, the same")

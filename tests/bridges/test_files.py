@@ -155,6 +155,7 @@ def test_parameters_for_ardupilot(tmp_path: Path, capsys: pytest.CaptureFixture[
     )
     assert (own["GPS1_TYPE"], own["GPS1_DELAY_MS"], own["WP_LOITER_RAD"]) == (14, 100, -400)
     assert (own["ROLL_LIMIT_DEG"], own["ARSPD_TYPE"], own["ARSPD_USE"]) == (40, 100, 1)
+    assert own["ARSPD_SKIP_CAL"] == 1
     assert (own["PTCH_RATE_P"], own["PTCH_RATE_FF"], own["RLL_RATE_P"], own["RLL_RATE_FF"]) == (0.15, 0.6, 0.3, 0.24)
     assert "GPS2_TYPE" not in own
     lines = path.read_text().splitlines()
