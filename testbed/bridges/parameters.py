@@ -214,8 +214,8 @@ def _of_ardupilot(facts: Facts) -> Iterator[Parameter]:
         f"steepest bank [deg]; before 4.5: LIM_ROLL_CD,{round(100 * facts.bank_deg)}",
     )
     for axis, gains in GAINS.items():
-        for name, value in gains.items():
-            yield Parameter(name, value, f"gain of {axis}, tried with the loiter aircraft")
+        for name, gain in gains.items():
+            yield Parameter(name, gain, f"gain of {axis}, tried with the loiter aircraft")
     way = 1 if facts.right else -1
     yield Parameter("WP_LOITER_RAD", way * round(facts.radius), "radius of the last circle, left below 0 [m]")
     yield Parameter("ARSPD_TYPE", 100 if facts.airspeed else 0, "the airspeed sensor that it is told of, or none")
