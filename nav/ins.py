@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from nav import aids
-from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
+from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, RangefinderAid
 from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
+from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
@@ -66,6 +67,9 @@ RULINGS = {
     Verdict.RECOVER: Ruling(Outcome.FUSED, "outside the gate, but consistent for long: covariance reset", weight=1.0),
 }
 
+# Relief refused for so long contradicts the position or the sensor. A filter that follows a slope of the map where it
+# is not takes its error for wind: so much, and since then. A sensor may be off by so much, as the ground may be.
+ASTRAY_S, ASTRAY_MPS, ASTRAY_LASTING_S, ASTRAY_HEIGHT_M = 10.0, np.array([3.0, 3.0]), 60.0, 100.0
 REOPENED = "outside the gate for long: its bias is as good as unknown"
 
 
@@ -134,6 +138,9 @@ class Ins:
             config.outage_s, config.probation_s, config.recovery_s, config.patience_s, self._gate.threshold(3)
         )
         self._refusals = {name: Refusals(config.patience_s) for name in self._filter.aids if self._bias_of(name)}
+        self._astray = {
+            aid.sensor: Refusals(ASTRAY_S) for aid in config.aids if isinstance(aid, RangefinderAid) and aid.search
+        }
         self._winds = self._filter.wind_memory()
         self._wind_doubt = WindDoubt(self._gate.threshold(2))
         self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
@@ -233,7 +240,9 @@ class Ins:
             measurement = self._filter.measure(self._reference, state, aid, part, sample)
             if measurement is not None:
                 report = self._filter.fuse(self._reference, state, sample, part, measurement)
-                if isinstance(sample, WindSample):
+                if sample.sensor in self._astray:
+                    report = self._unless_astray(state, sample, report)
+                elif isinstance(sample, WindSample):
                     report = self._hear_of_wind(state, sample, aid, measurement.R, report)
                 else:
                     report = self._unless_lasting(state, sample, aid, report)
@@ -255,6 +264,22 @@ class Ins:
         assert again is not None  # as there was one
         report = self._filter.fuse(self._reference, state, sample, report.aid, again)
         return replace(report, reason="outside the gate, but as the report before: the wind was opened again")
+
+    def _unless_astray(self, state: State, sample: Sample, report: UpdateReport) -> UpdateReport:
+        """The ``report`` on a range; refused for `ASTRAY_S` without fixes, they open the position, and it is searched.
+
+        The search goes by the shape of the ground, which a sensor that is off leaves as it is.
+        """
+        refused = self._astray[sample.sensor]
+        if report.weight:
+            refused.taken()
+        if report.outcome is not Outcome.OUTSIDE_GATE or not refused.too_long(sample.t) or self._aided(sample.t):
+            return report
+        refused.taken()
+        self._filter.reopen_wind(state, ASTRAY_MPS, ASTRAY_LASTING_S)
+        if TERRAIN in self.model.slices:
+            forget(state.P[0], self.model.slices[TERRAIN].start, np.array([ASTRAY_HEIGHT_M**2]))
+        return replace(report, reason="outside the gate for long: the position is searched again")
 
     def _unless_lasting(self, state: State, sample: Sample, aid: Aid, report: UpdateReport) -> UpdateReport:
         """The ``report`` on a part of a sample, or that of its fusion with the aid's bias open again.

@@ -138,12 +138,14 @@ class LocalFilter:
         """Let the wind have changed by ``change`` (2,) [m/s], at any time in the last ``lasting_s`` [s].
 
         The velocity through the air is as well known as before: that over ground went along with the wind, and took the
-        position along since then.
+        position along since then. Of a filter without wind it is that over ground which may have changed.
         """
-        P, wind = state.P[self.row], self.model.slices["wind"].start
+        P, wind = state.P[self.row], self.model.slices.get("wind")
         for axis in range(2):
             along = np.zeros(len(P))
-            along[wind + axis] = along[VEL + axis] = change[axis]
+            along[VEL + axis] = change[axis]
+            if wind is not None:
+                along[wind.start + axis] = change[axis]
             along[POS + axis] = 0.5 * lasting_s * change[axis]
             P += np.outer(along, along)
             P[POS + axis, POS + axis] += (lasting_s * change[axis]) ** 2 / 12.0

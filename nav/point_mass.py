@@ -20,6 +20,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from nav._jit import njit
 from nav.earth import radii
@@ -32,6 +33,7 @@ FINEST = 5.0  # between points [m]
 # Mardia's kurtosis of what passes for a Gaussian in a plane, which has 8; two equal peaks 6, unequal ones more.
 GAUSSIAN = (7.0, 9.5)
 ON_EDGE = 1e-3  # of the posterior, at the most
+UNLIKELY = 1e-4  # that heights fit no better where they fit best, so that they are not of this ground
 
 
 class Fix(NamedTuple):
@@ -64,6 +66,7 @@ class PointMass:
         self.step = np.maximum(SPREAD * np.sqrt(P.diagonal()) / half, FINEST)
         self.axis = np.arange(POINTS) - half
         self.log_w = np.zeros((POINTS, POINTS))
+        self.level, self.weighed = 0.0, 0  # log likelihood of weight one, and of how many measurements
         self.errors = np.zeros((2, POINTS, POINTS))  # of the height: constant, local
         self.C = np.diag([sigma_h**2, self.local_sigma**2])  # of these
 
@@ -83,6 +86,7 @@ class PointMass:
         self.errors[1] *= phi
         self.C *= np.array([[1.0, phi], [phi, phi * phi]])
         self.C += np.diag([more[1], self.local_sigma**2 * (1 - phi * phi)])
+        self.level += float(self.log_w.max())
         _widen(self.log_w, self.errors, more[0] / self.step**2)
         self.t = t
 
@@ -97,6 +101,7 @@ class PointMass:
         K = self.C.sum(axis=1) / S
         nu = self.h - sight_n[2] - map_ - self.errors.sum(axis=0)
         self.log_w -= 0.5 * nu**2 / S
+        self.weighed += 1
         self.errors += K[:, None, None] * nu
         self.C -= np.outer(K, K) * S
 
@@ -116,6 +121,15 @@ class PointMass:
         C = np.einsum("ij,ijk,ijl->kl", w, away, away) + np.diag(self.step**2) / 12.0
         d2 = np.einsum("ijk,kl,ijl->ij", away, np.linalg.inv(C), away)
         return mean, C, float(np.sum(w * d2 * d2)), float(1.0 - w[1:-1, 1:-1].sum())
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is a place where the heights fit: their squared normalised innovations there, by chi-square.
+
+        A broken sensor, or a map of elsewhere, has its most likely place as well.
+        """
+        misfit = -2.0 * (self.level + float(self.log_w.max()))
+        return bool(misfit <= chdtri(max(self.weighed, 1), UNLIKELY))
 
     def fix(self, lat: float, lon: float, P: Array) -> Fix | None:
         """What was measured of the place, None while it is not one place, or hardly better known than before."""

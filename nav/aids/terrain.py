@@ -5,7 +5,8 @@ share: a rangefinder finds it, and optical flow is a velocity then. Over relief 
 Jacobian has the slope of the map where the line of sight ends (SITAN: Hostetler and Andreas, Nonlinear Kalman Filtering
 Techniques for Terrain-Aided Navigation, IEEE Trans. Automatic Control 28 (3), 1983), taken over as far as the position
 is uncertain (`REACH`), as theirs is of a plane fitted there: a slope at a point would make a filter sure of where the
-map has its bends. Where that is farther than hills are wide, all places are tried instead (`Search`).
+map has its bends. Where that is farther than hills are wide, all places are tried instead (`Search`). A range that
+repeats itself is not used (`STUCK`).
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from functools import cached_property
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import Measurement, OperatingPoint, range_problem
+from nav.aids.base import Measurement, OperatingPoint, Ruling, range_problem
 from nav.aids.position_fix import position_fix
 from nav.earth import earth_rate_n, radii
 from nav.error_model import PHI, POS, VEL, Block, markov
 from nav.point_mass import Fix, PointMass
 from nav.rotation import cross, dcm_from_quat
-from nav.samples import Array, OpticalFlowSample, RangeSample, Sample
+from nav.samples import Array, OpticalFlowSample, Outcome, RangeSample, Sample
 from nav.terrain import Terrain, slant_range, slope
 
 TERRAIN = "terrain"  # the state: how much higher the ground is than on the map, everywhere [m]
@@ -34,6 +35,8 @@ TIME_TOLERANCE = 1e-6  # [s]
 LOST_M, FOUND_M = 100.0, 50.0  # sigma of the position per axis from which on it is searched, and no more
 WEIGH_S, FIX_S = 1.0, 5.0  # in a search, from one range that is used to the next, and from one attempt at a fix
 GAP_S, GIVE_UP_S = 5.0, 240.0  # without a range, or without a fix, it begins again
+REPEATED = 5  # the same range to the last digit, so often in a row, is no echo of relief: the sensor is stuck
+STUCK = Ruling(Outcome.ISOLATED, "the same range again and again: the sensor is stuck")
 REACH = 2.0  # sigma of the horizontal position, to either side, over which slopes are taken
 
 
@@ -46,6 +49,12 @@ class Search:
         self.fix: Fix | None = None
         self._t = self._tried = -math.inf
         self._v_n = np.zeros(3)
+        self._range, self._repeated = math.nan, 0
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the latest range was the same as those before, too often for relief."""
+        return self._repeated >= REPEATED
 
     def hear(self, sample: RangeSample, at: OperatingPoint, height_sigma: float) -> None:
         """Take in a sample, once. A filter is `lost` from then on or not; `fix` is of this sample, if there is one.
@@ -56,10 +65,12 @@ class Search:
         if t == self._t:
             return
         self._t, self.fix = t, None
+        self._repeated = self._repeated + 1 if sample.range == self._range else 1
+        self._range = sample.range
         P, own = at.P[POS : POS + 2, POS : POS + 2], at.x[: POS + 3]
         sigma = math.sqrt(0.5 * P.trace())
         self.lost = sigma > (FOUND_M if self.lost else LOST_M)
-        if not self.lost:
+        if not self.lost or self.stuck:
             self._begun = False
             return
         R_M, R_N = radii(state.lla[0])
@@ -75,7 +86,9 @@ class Search:
             places.move(t, 0.5 * (v_n + self._v_n), np.sqrt([0.5 * (variance[0] + variance[1]), variance[2]]))
             self._v_n = v_n
             places.weigh(sample.range * dcm_from_quat(state.q_nb)[:, 2])
-            if t - self._tried >= FIX_S:
+            if not places.fits:
+                self._begun = False
+            elif t - self._tried >= FIX_S:
                 self._tried = t
                 self.fix = places.fix(lat, lon, P)
                 self._begun = self.fix is None
@@ -126,16 +139,18 @@ class RangefinderAid:
         """See `Aid`."""
         assert isinstance(sample, RangeSample)
         if self.search is not None:
-            self.search.hear(sample, at, math.hypot(self.map_sigma, self.scale_sigma * sample.range))
+            raised = self.map_sigma if at.starts[0] < 0 else math.sqrt(at.P[at.starts[0], at.starts[0]])
+            self.search.hear(sample, at, math.hypot(max(self.map_sigma, raised), self.scale_sigma * sample.range))
             if part == "terrain_fix":
                 return None if self.search.fix is None else _fixed(self.search.fix, at)
-            if self.search.lost:
+            if self.search.lost and not self.search.stuck:
                 return None
         state, terrain, (raised, local, scale) = at.state, self.terrain, at.starts
         nu, H = range_to_ground(
             state.q_nb, state.lla, at.x, raised, local, scale, reach(at.P), sample.range, terrain.heights, terrain.grid
         )
-        return None if math.isnan(nu[0]) else Measurement(nu, H, self._R)
+        stuck = STUCK if self.search is not None and self.search.stuck else None
+        return None if math.isnan(nu[0]) else Measurement(nu, H, self._R, stuck)
 
 
 @dataclass(frozen=True)

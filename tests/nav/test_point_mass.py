@@ -72,6 +72,12 @@ def test_weights_are_the_likelihood_of_all_heights_at_once() -> None:
     assert likely.mean() > 0.5
     found = places.log_w - places.log_w.max()
     np.testing.assert_allclose(found[likely], (expected - expected.max())[likely], atol=2e-3, rtol=1e-6)
+    whole = places.level + places.log_w.max()
+    assert whole == pytest.approx(expected.max() - together.logpdf(np.zeros(count)), abs=2e-3)
+    assert places.fits
+    for off in (150.0, -150.0):
+        places.weigh(np.array([30.0, -20.0, H_M - 1.5 * count - measured[-1] - off]))
+    assert not places.fits  # no two places side by side are 300 m apart in height
 
 
 def flown(seed: int, sigma: float, sigma_v: float = 0.5, local: float = 4.0) -> tuple[float, float, list[float]]:
