@@ -42,7 +42,8 @@ class Outcome:
     ``t`` (K,) [s] since GNSS was lost. Of each of N ``lanes``, by names of aids, grade and estimator: ``error``
     (N, K, 2) north and east [m]; ``covariance`` (N, K, 3) claimed of them, north, both, east [m^2]; ``bound`` (N, K),
     the least RMS of the horizontal error [m], NaN where there is none; ``distance`` (N, K) flown over ground since GNSS
-    was lost [m]. ``ended`` says by lane, ``aids/grade/estimator``, why an estimator ended by an error of its own.
+    was lost [m]; all NaN after a lane's own end, where others were flown longer. ``ended`` says by lane,
+    ``aids/grade/estimator``, why an estimator ended by an error of its own.
     """
 
     weather: str
@@ -147,13 +148,22 @@ def fly(cases: Sequence[Case], seed: int, tell: Callable[[float], None] = lambda
         parts.append(_route(own, seed, lambda one, before=before, share=share: tell(before + share * one)))  # type: ignore[misc]
         done += len(own)
 
+    t = max((part.t for part in parts), key=len)
+
     def whole(name: str) -> Array:
-        return np.concatenate([getattr(part, name) for part in parts])
+        return np.concatenate([_until(getattr(part, name), len(t)) for part in parts])
 
     lanes = tuple(lane for part in parts for lane in part.lanes)
     ended = {lane: why for part in parts for lane, why in part.ended.items()}
     columns = {name: whole(name) for name in ("error", "covariance", "bound", "distance")}
-    return Outcome(parts[0].weather, seed, parts[0].t, lanes, **columns, ended=ended)
+    return Outcome(parts[0].weather, seed, t, lanes, **columns, ended=ended)
+
+
+def _until(rows: Array, count: int) -> Array:
+    """Rows (N, K, ...) as ``count`` of them: NaN after the last."""
+    whole: Array = np.full((len(rows), count, *rows.shape[2:]), np.nan)
+    whole[:, : rows.shape[1]] = rows
+    return whole
 
 
 def _route(cases: Sequence[Case], seed: int, tell: Callable[[float], None]) -> Outcome:

@@ -6,8 +6,8 @@ Every case, one of each, is a scenario that `testbed run` flies too. `Case.text`
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -52,7 +52,7 @@ length_m = 1500
 [[plan]]
 leg = "loiter"
 radius_m = {radius_m}
-duration_s = 3000
+duration_s = 4000
 """
 CIRCLES = Route(
     "lat_deg = 34.0, lon_deg = 108.0, alt_m = 280, heading_deg = 30, airspeed_mps = 25",
@@ -202,7 +202,8 @@ class Case:
 class Table:
     """Which part of the table is flown, how many draws unless somebody says, and when GNSS is lost, ``lost_s`` [s].
 
-    What goals are set for is flown in ``judged_draws`` times as many draws: a quantile of 95 % takes dozens.
+    What goals are set for is flown in ``judged_draws`` times as many draws: a quantile of 95 % takes dozens. In those
+    that are added, sets of aids are flown until ``judged_longest_s`` after the loss where it names them.
     """
 
     weathers: Sequence[Weather] = WEATHERS
@@ -211,6 +212,7 @@ class Table:
     marks_s: Sequence[int] = (60, 120, 600, LONGEST_S)
     draws: int = 20
     judged_draws: int = 1
+    judged_longest_s: Mapping[str, int] = field(default_factory=dict)
     lost_s: int = 300
 
     def cases(self, weather: Weather, contestants: tuple[Contestant, ...]) -> Iterator[Case]:
@@ -222,7 +224,7 @@ class Table:
     def judged(self, contestants: tuple[Contestant, ...]) -> tuple[Case, ...]:
         """Those that goals are set for."""
         return tuple(
-            case
+            replace(case, longest_s=self.judged_longest_s.get(case.aids.name, case.longest_s))
             for weather in self.weathers
             if weather.name == JUDGED_WEATHER
             for case in self.cases(weather, contestants)
@@ -230,5 +232,5 @@ class Table:
         )
 
 
-FULL = Table(judged_draws=5)
+FULL = Table(judged_draws=5, judged_longest_s={"terrain": 3600})
 QUICK = Table(grades=GRADES[:1], marks_s=(60, 120), draws=4)

@@ -119,6 +119,19 @@ def test_estimators_of_others_are_handed_the_same(flown: Outcome) -> None:
 
 
 @pytest.mark.ci
+def test_some_aids_are_flown_longer(flown: Outcome) -> None:
+    """Then the others have nothing after their own end, and goals have a time of their own."""
+    table = dataclasses.replace(SMALL, judged_longest_s={"flow": 30})
+    longer = flight.fly(table.judged(INS), 7)
+    assert longer.t.tolist() == [0, 10, 20, 30]
+    for k, lane in enumerate(longer.lanes):
+        same = flown.lane(lane)
+        assert longer.error[k, :3] == pytest.approx(same.error[0], abs=1e-9)
+        assert np.isnan(longer.error[k, 3]).all() == (lane[0] == "air_data")
+    assert goals.claims(whole(2))["ins"][-2].quantity.endswith("after 1800 s")
+
+
+@pytest.mark.ci
 def test_what_is_stored_comes_back_as_it_was(flown: Outcome, tmp_path: Path) -> None:
     flight.store(flown, tmp_path / "one.npz")
     again = flight.stored(tmp_path / "one.npz")
@@ -222,6 +235,24 @@ def test_what_goals_are_set_for_has_further_draws(made: list[tuple[str, int]], t
     assert len(more.outcomes) == 9
     assert {len(one.lanes) for one in more.outcomes} == {4}
     assert len(more.further) == 6
+
+
+def test_a_goal_after_the_last_time_of_the_table_has_the_draws_that_went_on() -> None:
+    result = whole(20)
+    seeds = result.plan.further
+    judged = [(case.aids.name, case.grade.name, "ins") for case in FULL.judged(INS)]
+    flown = [made_up("walking", seed, judged) for seed in seeds]
+    hour = np.array([3600.0])
+    flown = [
+        dataclasses.replace(one, t=np.append(one.t, hour), **{
+            name: np.concatenate([getattr(one, name), getattr(one, name)[:, -1:]], axis=1)
+            for name in ("error", "covariance", "bound", "distance")
+        })
+        for one in flown
+    ]  # fmt: skip
+    found = goals.claims(dataclasses.replace(result, further=flown))["ins"]
+    assert [(one.draws, one.quantity[-7:]) for one in found[-3:-1]] == [(80, " 3600 s")] * 2
+    assert {one.draws for one in found[:-3]} == {100}
 
 
 def test_a_folder_holds_one_benchmark(made: list[tuple[str, int]], tmp_path: Path) -> None:
