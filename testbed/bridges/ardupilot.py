@@ -9,13 +9,19 @@ magnetometer and barometer of its own; our fixes can go to its MAVLink beside (`
 to fly: then from its first throttle above `STARTED_US` on channels 1 to 4 are aileron, elevator, throttle and rudder, a
 packet old when they move.
 
+Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.told`), once they are asked to
+speak. ArduPilot's clock is that of the lines: the sum of the differences of their stamps. One that is not armed takes
+itself for landed, and has no position without fixes: so one that does not fly is armed there, by force, once it has
+said where it is.
+
 A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
 earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
 more than `MOST_PACKETS` without the next frame ends it, and the run, with the reason.
 
-Source: SIM_JSON.cpp and .h of ArduPilot 4.6, and libraries/SITL/examples/JSON/readme.md there: magic 18458 with 16
-channels or 29569 with 32, rate, count, microseconds of each, little-endian; no space may stand before a list. Airspeed
-is a true one, of which sitl_airspeed.cpp makes an equivalent one; places come of metres as in Location.cpp.
+Source: SIM_JSON.cpp and .h, SIM_Aircraft.cpp of ArduPilot 4.6, and libraries/SITL/examples/JSON/readme.md there: magic
+18458 with 16 channels or 29569 with 32, rate, count, microseconds of each, little-endian; no space may stand before a
+list. Airspeed is a true one, of which sitl_airspeed.cpp makes an equivalent one; places come of metres as in
+Location.cpp.
 """
 
 from __future__ import annotations
@@ -34,6 +40,7 @@ from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, Estimate
 from testbed.bridges.address import address, bound
 from testbed.bridges.gps_input import GpsInput
+from testbed.bridges.listener import Listener
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
 from testbed.feeds.bridged import OURS, THEIRS
@@ -41,6 +48,9 @@ from testbed.feeds.feed import Surfaces, Turn
 
 DEFAULT = "udpin:127.0.0.1:9002"
 CONNECT_S, ANSWER_S = 120.0, 10.0  # of wall time
+SYSTEM = 1  # that ArduPilot is, where its MAV_SYSID is not changed
+ASK_S = 1.0  # of the run, between two times that it is asked to speak
+LAST_S = 0.2  # of wall time, that its last words may take
 MOST_PACKETS = 1000  # heard within one step
 _HEAD = struct.Struct("<HHI")  # magic, frame rate, frame count
 CHANNELS = {18458: 16, 29569: 32}  # by magic
@@ -53,7 +63,6 @@ class ArduPilot:
     """One ArduPilot that follows a run (`testbed.feeds.bridged.FarEnd`); ``answered`` counts steps."""
 
     name = "ArduPilot"
-    estimators: Collection[str] = ()
 
     def __init__(
         self,
@@ -61,6 +70,7 @@ class ArduPilot:
         *,
         flies: bool = False,
         fixes: GpsInput | None = None,
+        estimators: Mapping[str, str] | None = None,
         connect_s: float = CONNECT_S,
         answer_s: float = ANSWER_S,
     ) -> None:
@@ -78,6 +88,9 @@ class ArduPilot:
             "barometer": THEIRS,
         }
         self.surfaces: Surfaces | None = None
+        self._ears = {name: Listener(where) for name, where in (estimators or {}).items()}
+        self.estimators: Collection[str] = tuple(self._ears)
+        self._ask_due = -math.inf
         self._started = False
         self._answer_s = answer_s
         self._stepper = Stepper()
@@ -98,14 +111,28 @@ class ArduPilot:
         for step in self._stepper.steps(turn):
             if not self.failure:
                 self._answer(step)
+        t = float(turn.reference.t[-1])
+        asks = t >= self._ask_due
+        for one in self._ears.values():
+            one.listen(SYSTEM)
+            if asks and not one.told.placed:
+                one.ask(SYSTEM)
+            elif asks and not (one.told.armed or self.flies):
+                one.arm_ardupilot(SYSTEM)
+        self._ask_due = t + ASK_S if asks else self._ask_due
 
     def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
-        """None: what it estimates is not heard."""
-        return iter(())
+        """What ArduPilot said over the whole run of its own motion."""
+        for name, one in self._ears.items():
+            one.listen(SYSTEM, LAST_S)
+            for estimate in one.told.estimates(times, 0.0):
+                yield name, estimate
 
     def close(self) -> None:
-        """Close the port, and the link for fixes."""
+        """Close the port, the link for fixes, and where its estimators are heard."""
         self._socket.close()
+        for one in self._ears.values():
+            one.close()
         if self._fixes is not None:
             self._fixes.close()
 

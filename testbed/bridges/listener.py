@@ -8,7 +8,7 @@ import time
 
 from testbed.bridges.address import address, bound
 from testbed.mavlink.encode import Encoder
-from testbed.mavlink.shell import typed
+from testbed.mavlink.orders import armed, asked, typed
 from testbed.mavlink.told import Told
 
 DEFAULT = "udpin:127.0.0.1:14540"
@@ -37,15 +37,26 @@ class Listener:
             except OSError:  # there is no more
                 return
 
-    def arm(self, system: int) -> None:
+    def arm_px4(self, system: int) -> None:
         """Have a PX4 that has spoken armed, whatever its checks say.
 
         Its shell does that; a command over MAVLink is checked even where it says that it is by force.
         """
-        if self._speaker is None:
-            return
-        with contextlib.suppress(OSError):  # it is said again until it was heard
-            self._socket.sendto(typed(self._encoder, system, ARM), self._speaker)
+        self._say(typed(self._encoder, system, ARM))
+
+    def arm_ardupilot(self, system: int) -> None:
+        """Have an ArduPilot that has spoken armed, whatever its checks say."""
+        self._say(armed(self._encoder, system))
+
+    def ask(self, system: int) -> None:
+        """Have an ArduPilot that has spoken say where it is, which it does when it is asked."""
+        for frame in asked(self._encoder, system):
+            self._say(frame)
+
+    def _say(self, frame: bytes) -> None:
+        if self._speaker is not None:
+            with contextlib.suppress(OSError):  # it is said again until it was heard
+                self._socket.sendto(frame, self._speaker)
 
     def close(self) -> None:
         """Close the port."""

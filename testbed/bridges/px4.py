@@ -116,7 +116,7 @@ class Px4:
             one.listen(self._system)
             if one.told.placed and not (self.armed or self.flies) and turn.reference.t[-1] >= self._arm_due:
                 self._arm_due = float(turn.reference.t[-1]) + ARM_S
-                one.arm(self._system)
+                one.arm_px4(self._system)
 
     def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
         """What PX4 said over the whole run of its own motion."""

@@ -231,7 +231,7 @@ def _far_end(
         if flies:
             raise UserError("--pilot: there is no autopilot: add --px4 or --ardupilot, or leave it out")
         return None
-    from testbed.estimators.px4 import Px4Section
+    from testbed.estimators.outside import ArduPilotSection, Px4Section
     from testbed.sensors.imu import ImuConfig
 
     if px4 is not None and ardupilot is not None:
@@ -249,7 +249,8 @@ def _far_end(
 
     fixes = None if gps_input is None else _fixes(scenario, gps_input)
     remark(f"waiting for ArduPilot on {ardupilot}")
-    return ArduPilot(ardupilot, flies=flies, fixes=fixes)
+    theirs = {one.name: one.address for one in scenario.estimator if isinstance(one, ArduPilotSection)}
+    return ArduPilot(ardupilot, flies=flies, fixes=fixes, estimators=theirs)
 
 
 def _fixes(scenario: Scenario, url: str) -> GpsInput:

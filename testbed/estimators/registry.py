@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 from testbed import plugins
 from testbed.errors import UserError, choice, shown
-from testbed.estimators import ahrs, custom, federated, ins, px4
+from testbed.estimators import ahrs, custom, federated, ins, outside
 from testbed.estimators.lane import Lane
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection
@@ -26,7 +26,8 @@ BUILT_IN: Mapping[str, Kind] = {
     "ins": Kind(ins.InsSection, ins.build),
     "federated": Kind(federated.FederatedSection, federated.build),
     "ahrs": Kind(ahrs.AhrsSection, ahrs.build),
-    "px4": Kind(px4.Px4Section, px4.build),
+    "px4": Kind(outside.Px4Section, outside.build),
+    "ardupilot": Kind(outside.ArduPilotSection, outside.build),
 }
 Build: TypeAlias = Callable[[Sequence[EstimatorSection], Rig], dict[str, Lane]]  # as `build`
 CUSTOM = Kind(custom.CustomSection, custom.build)

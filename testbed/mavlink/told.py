@@ -64,12 +64,14 @@ class _Series:
 
 
 class Told:
-    """What one vehicle says of itself."""
+    """What one vehicle says of itself; ``armed`` is whether it is."""
 
     def __init__(self) -> None:
         self._attitude, self._odometry, self._position = _Series(), _Series(), _Series()
         self._coarse, self._fine, self._pose, self._accuracy = _Series(), _Series(), _Series(), _Series()
+        self.armed = False
         self._take: Mapping[str, Callable[[Message], None]] = {
+            "HEARTBEAT": self._take_heartbeat,
             "ATTITUDE_QUATERNION": self._take_attitude,
             "GLOBAL_POSITION_INT": self._take_position,
             "LOCAL_POSITION_NED": self._take_velocity,
@@ -113,6 +115,9 @@ class Told:
         if (position := self._accuracy.held(stamp)) is not None:
             covariance[:3, :3] = np.diag(position)
         return covariance
+
+    def _take_heartbeat(self, message: Message) -> None:
+        self.armed = bool(message["base_mode"] & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
 
     def _take_attitude(self, message: Message) -> None:
         q_nb = _rotation([message[key] for key in ("q1", "q2", "q3", "q4")])

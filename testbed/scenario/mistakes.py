@@ -11,7 +11,7 @@ from nav.terrain import ground as height_of_ground
 from testbed import measures
 from testbed.errors import UserError, unknown
 from testbed.estimators.ahrs import AhrsSection
-from testbed.estimators.px4 import Px4Section
+from testbed.estimators.outside import OutsideSection
 from testbed.estimators.section import EstimatorSection
 from testbed.motion import aircraft, guidance, terrain
 from testbed.motion.logged import LogTruth
@@ -228,8 +228,9 @@ def _autopilot_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     for where, name in groups:
         if name != "truth" and name not in known:
             yield where, unknown("estimator", name, [*known, "truth"])
-        elif isinstance(known.get(name), Px4Section):
-            yield where, f"{name!r} is PX4's own, heard too late to fly on here: let PX4 fly by --px4 --pilot"
+        elif isinstance(other := known.get(name), OutsideSection):
+            whose = f"{name!r} is {other.autopilot}'s own, heard too late to fly on here"
+            yield where, f"{whose}: let {other.autopilot} fly by {other.option} --pilot"
     kinds = {section.kind for section in scenario.sensors.values()}
     if feedback.position not in known:
         return

@@ -58,6 +58,7 @@ from nav.samples import (
 )
 from testbed.errors import UserError
 from testbed.estimators import registry
+from testbed.estimators.outside import OutsideSection
 from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
 from testbed.score.accuracy import column
@@ -92,8 +93,7 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     except UserError:  # `metrics.unscored` says so
         return {}
     found = {}
-    said = registry.BUILT_IN.keys() - {"px4"}  # others say nothing of it
-    own = [section for section in scenario.estimator if section.kind in said]
+    own = [one for one in scenario.estimator if one.kind in registry.BUILT_IN and not isinstance(one, OutsideSection)]
     for name, running in registry.build(own, scenario.rig(scenario.seed)).items():
         way = _way(dataset, name) if name in accuracy.names(dataset) else None
         if way is None:

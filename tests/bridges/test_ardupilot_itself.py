@@ -121,6 +121,38 @@ def ardupilot(tmp_path: Path, station: Station) -> Iterator[tuple[str, str]]:
             process.wait()
 
 
+def test_its_estimator_listens(tmp_path: Path) -> None:
+    """Our aircraft flies; what ArduPlane makes of the same samples is scored beside it, an outage included."""
+    ports = [autopilots.free_port(socket.SOCK_DGRAM) for _ in range(2)]
+    theirs = {"name": "ekf3", "kind": "ardupilot", "address": f"udpin:127.0.0.1:{ports[0]}"}
+    ours = {"name": "ins", "aids": ["gnss", "barometer", "magnetometer", "airspeed"]}
+    changes = {"duration_s": 330, "sensors.gnss.denied": [[200, 320]], "estimator": [ours, theirs], "expect": {}}
+    scenario = Scenario.load("loiter_gnss_outage", changes)
+    parameters = files.write(Path("loiter_gnss_outage"), "ardupilot-params", tmp_path / "loiter.parm")
+    command = [EXECUTABLE, "--wipe", "--instance", str(INSTANCE), "--model", "JSON:127.0.0.1"]
+    command += ["--home", "34.0,108.0,150,30", "--defaults", str(parameters), "--serial2", "none:"]
+    for number, port in enumerate(ports):
+        command += [f"--serial{number}", f"udpclient:127.0.0.1:{port}"]
+    with (tmp_path / "said.txt").open("wb") as said:
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=said, stderr=said)
+    far_end = None
+    try:
+        fixes = GpsInput(f"udpin:127.0.0.1:{ports[1]}", ["gnss"], scenario.date)
+        far_end = ArduPilot(
+            f"udpin:127.0.0.1:{9002 + 10 * INSTANCE}", fixes=fixes, estimators={"ekf3": str(theirs["address"])}
+        )
+        result = run(scenario, far_end=far_end)
+    finally:
+        process.kill()
+        process.wait()
+        if far_end is not None:
+            far_end.close()
+    assert result.failure == ""
+    assert result.metrics["ekf3.position_horizontal_rms_m"] < 3
+    assert result.metrics["ekf3.velocity_rms_mps"] < 0.5
+    assert 3 < result.metrics["ekf3.outage_position_horizontal_at_60s_m"] < 200  # it dead-reckons, as it is armed
+
+
 def test_it_takes_off_and_flies_the_plan_on_our_fixes(ardupilot: tuple[str, str], station: Station) -> None:
     url, speaks = ardupilot
     scenario = Scenario.load("take_off", {"duration_s": 240, "sensors.gnss.denied": [DENIED_S], "expect": {}})

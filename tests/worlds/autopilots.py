@@ -243,6 +243,76 @@ class Px4(threading.Thread):
         return True
 
 
+class Answering:
+    """What ArduPilot says over its own MAVLink: truth, but `NORTH_M` too far north, of what it was asked for.
+
+    It says what it is until then; it has no position before `placed_s`, and is armed when it is told so by force.
+    """
+
+    NORTH_M = 2.0
+
+    def __init__(self, lat: float, lon: float, h: float, placed_s: float = 0.0) -> None:
+        self.home, self.placed_s = (lat, lon, h), placed_s
+        self.armed: float | None = None  # when [s]
+        self._asked: dict[int, float] = {}  # intervals [us] by message
+        self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._port = free_port(socket.SOCK_DGRAM)
+        self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    @property
+    def url(self) -> str:
+        return f"udpin:127.0.0.1:{self._port}"
+
+    def close(self) -> None:
+        """It says no more."""
+        self._link.close()
+
+    def say(self, line: dict[str, Any]) -> None:
+        """Say what a line of JSON says, and hear what is asked."""
+        stamp, velocity = round(1e3 * line["timestamp"]), line["velocity"]
+        roll, pitch, yaw = (0.5 * angle for angle in line["attitude"])
+        q = _half_angles(roll, pitch, yaw)
+        lat, lon, h = self.home
+        north, east, down = line["position"]
+        place = [
+            math.degrees(lat + (north + self.NORTH_M) / 6_378_100) * 1e7,
+            math.degrees(lon + east / (6_378_100 * math.cos(lat + 0.5 * north / 6_378_100))) * 1e7,
+            1e3 * (h - down),
+        ]
+        flags = mav.MAV_MODE_FLAG_SAFETY_ARMED if self.armed is not None else 0
+        said = [
+            mav.MAVLink_heartbeat_message(mav.MAV_TYPE_FIXED_WING, mav.MAV_AUTOPILOT_ARDUPILOTMEGA, flags, 0, 0, 3),
+            mav.MAVLink_attitude_quaternion_message(stamp, *q, 0, 0, 0),
+        ]
+        if stamp >= 1e3 * self.placed_s:
+            said.append(mav.MAVLink_global_position_int_message(stamp, *map(round, place), 0, 0, 0, 0, 0))
+            said.append(mav.MAVLink_local_position_ned_message(stamp, north, east, down, *velocity))
+        for message in said:
+            if message.get_msgId() == mav.MAVLINK_MSG_ID_HEARTBEAT or message.get_msgId() in self._asked:
+                self._link.sendto(message.pack(self._mav), ("127.0.0.1", self._port))
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                self._hear(self._link.recv(4096, socket.MSG_DONTWAIT), line["timestamp"])
+
+    def _hear(self, data: bytes, t: float) -> None:
+        for message in mav.MAVLink(None).parse_buffer(data) or []:
+            if message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
+                self._asked[int(message.param1)] = message.param2
+            elif message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM and (message.param1, message.param2) == (1, 2989):
+                self.armed = t if self.armed is None else self.armed
+
+
+def _half_angles(roll: float, pitch: float, yaw: float) -> list[float]:
+    """The quaternion of half of each of three angles [rad]."""
+    (sr, sp, sy), (cr, cp, cy) = ([f(a) for a in (roll, pitch, yaw)] for f in (math.sin, math.cos))
+    return [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+
+
 class ArduPilot(threading.Thread):
     """ArduPilot's side: sends frames of servo outputs, and the next when it has been answered.
 
@@ -251,9 +321,11 @@ class ArduPilot(threading.Thread):
     (32 channels). With a ``pilot`` its throttle is up from the ``at``-th frame on.
     """
 
-    def __init__(self, behaviour: str = "", at: int = 0, pilot: Circle | None = None) -> None:
+    def __init__(
+        self, behaviour: str = "", at: int = 0, pilot: Circle | None = None, voice: Answering | None = None
+    ) -> None:
         super().__init__(daemon=True)
-        self.pilot = pilot
+        self.pilot, self.voice = pilot, voice
         self.port = free_port(socket.SOCK_DGRAM)
         self.behaviour, self.at = behaviour, at
         self.lines: list[bytes] = []
@@ -285,6 +357,8 @@ class ArduPilot(threading.Thread):
                         line = link.recv(4096)
                         if not self.lines or line != self.lines[-1]:
                             self.lines.append(line)
+                            if self.voice is not None:
+                                self.voice.say(json.loads(line))
                             if not (self.behaviour == "repeat" and count >= self.at):
                                 count += 1
 
