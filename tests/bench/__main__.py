@@ -15,7 +15,7 @@ os.environ.update({name: value for name, value in threads.ONE.items() if name no
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # so that this folder is the package `bench`
 
-from bench import filters, live, peers, runs
+from bench import filters, hour, live, peers, runs
 from bench.command import main
 
 MEASURES = {
@@ -32,6 +32,7 @@ MEASURES = {
         filters.ahrs_batch,
         filters.federated,
         filters.unscented_period,
+        hour.ins_hour,
         live.live,
         runs.start_up,
         runs.campaign_efficiency,
