@@ -85,6 +85,11 @@ class WindDoubt:
         if told or t > self._right:
             self._right, self._refused = max(self._right, t), None
 
+    @property
+    def pending(self) -> bool:
+        """Whether a report was refused of late."""
+        return self._refused is not None
+
     def lasting(self, t: float) -> float:
         """For how long [s] the wind may have been another."""
         return max(t - self._right, 0.0) if math.isfinite(self._right) else 0.0

@@ -9,17 +9,13 @@ from __future__ import annotations
 
 import heapq
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
-import numpy as np
-
+from nav.increments import COINCIDENT, Increments, Step, joined, share_of
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
-
-COINCIDENT = 1e-6  # two times this close are the same [s]
 
 
 class Estimator(Protocol):
@@ -58,6 +54,22 @@ class Estimator(Protocol):
         ...
 
 
+@runtime_checkable
+class TakesSteps(Protocol):
+    """An estimator that takes many steps at once, as one after the other would have been, but in less time."""
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether it does so now: from then on it listens, and accepts the same sensors, for ever."""
+        ...
+
+    def take(
+        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+    ) -> int:
+        """How many of the first ``steps`` it took, zero when the first of them must be taken by itself."""
+        ...
+
+
 class FusionHorizon:
     """Feeds one estimator in time order, ``lag_s`` [s] (the largest latency of its aids) behind the newest increment.
 
@@ -73,11 +85,7 @@ class FusionHorizon:
         self.lag_s = lag_s
         self.coning = coning
         self._raw: ImuSamples | None = None  # last raw increment, for the compensation of the next
-        self._imu = ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
-        self._ends: list[float] = []  # its times
-        self._next = 0  # first row of _imu that the estimator has not used
-        self._longest = 0.0  # of them [s]
-        self._t = -math.inf  # up to where the estimator has come
+        self._ahead = Increments()
         self._queue: list[tuple[float, str, int, Sample]] = []
         self._count = 0
 
@@ -100,14 +108,20 @@ class FusionHorizon:
             heapq.heappush(self._queue, (turn, sample.sensor, self._count, sample))
             self._count += 1
         if len(imu):
-            self._append(imu)
+            ready = compensate(imu, self._raw) if self.coning else imu
+            self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
+            self._ahead.append(ready)
         reports: list[UpdateReport] = []
-        estimates = []
+        estimates: list[Estimate] = []
+        estimator = self.estimator
+        if isinstance(estimator, TakesSteps) and estimator.in_steps and self._ahead.next:
+            self._take(estimator, times, reports, estimates)
+            return reports, estimates
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
-        if self._ends:
-            self._use(self._ends[-1], reports)
+        if self._ahead.ends:
+            self._use(self._ahead.ends[-1], reports)
         return reports, estimates
 
     def estimate_at(self, t: float) -> Estimate:
@@ -115,99 +129,85 @@ class FusionHorizon:
 
         Raises ValueError when ``t`` is a whole increment past the newest or before what the estimator has already used.
         """
-        if abs(t - self._t) <= COINCIDENT:
+        ahead = self._ahead
+        if abs(t - ahead.t) <= COINCIDENT:
             estimate = self.estimator.estimate()
             return replace(estimate, t=t) if math.isnan(estimate.t) else estimate  # it may have seen nothing yet
-        if t < self._t:
-            raise ValueError(f"the estimator is at {self._t} s already, it cannot tell the state at {t} s")
-        stop = self._row_after(t)
+        if t < ahead.t:
+            raise ValueError(f"the estimator is at {ahead.t} s already, it cannot tell the state at {t} s")
+        stop = ahead.row_after(t)
         if not stop:
             estimate = self.estimator.estimate()
             return estimate if estimate.t == t else replace(estimate, t=t)
-        front = _cut(self._imu, self._next, stop)
-        ahead = t - max(self._ends[stop - 1], self._t)
-        if ahead > self._longest + COINCIDENT:
+        front = ahead.rows(ahead.next, stop)
+        further = t - max(ahead.ends[stop - 1], ahead.t)
+        if further > ahead.longest + COINCIDENT:
             raise ValueError(f"no inertial samples up to {t} s")
-        if ahead > COINCIDENT:
-            front = _join(front, self._beyond(stop - 1, t, ahead))
+        if further > COINCIDENT:  # as the next increment would be if one's rates went on
+            last = ahead.rows(stop - 1, stop)
+            front = joined(front, share_of(last, further / last.dt[0], t))
         return self.estimator.predict(front)
+
+    def _take(
+        self, estimator: TakesSteps, times: Sequence[float], reports: list[UpdateReport], estimates: list[Estimate]
+    ) -> None:
+        """`track` of an estimator that takes steps, each that it can't take with others by itself."""
+        steps: list[Step] = []
+        ends, lag = self._ahead.ends, self.lag_s if self.estimator.listening else 0.0
+        for t in (*times, ends[-1]):
+            horizon = ends[self._ahead.row_after(t) - 1] - lag
+            while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
+                turn, _, _, sample = heapq.heappop(self._queue)
+                if self.estimator.accepts(sample):
+                    steps.append(Step(sample.t, turn, sample))
+            steps.append(Step(t, horizon))
+        steps[-1] = Step(math.nan, steps[-1].horizon)
+        while steps:
+            taken = estimator.take(steps, self._ahead, reports, estimates)
+            if not taken:
+                self._go(steps[0], reports, estimates)
+            del steps[: max(taken, 1)]
+
+    def _go(self, step: Step, reports: list[UpdateReport], estimates: list[Estimate]) -> None:
+        """Take one step by itself."""
+        if step.sample is not None:
+            self._apply(step.horizon, step.sample, reports)
+            return
+        self._propagate_to(step.horizon, reports)
+        if not math.isnan(step.t):
+            estimates.append(self.estimate_at(step.t))
 
     def _use(self, now: float, reports: list[UpdateReport]) -> None:
         """Bring the estimator to ``lag_s`` before the last increment by ``now``, with every sample up to there.
 
         An estimator that listens to no sample any more need not wait for any.
         """
-        stop = self._row_after(now)
+        stop = self._ahead.row_after(now)
         if not stop:
             return
-        horizon = self._ends[stop - 1] - (self.lag_s if self.estimator.listening else 0.0)
+        horizon = self._ahead.ends[stop - 1] - (self.lag_s if self.estimator.listening else 0.0)
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
             turn, _, _, sample = heapq.heappop(self._queue)
-            if not self.estimator.accepts(sample):
-                continue
-            t = sample.t if math.isfinite(sample.t) else turn
-            if turn > t:  # too late, wherever the blocks were cut
-                self._propagate_to(turn, reports)
-            if t < self._t - COINCIDENT:
-                reports += self.estimator.refuse(sample, f"{self._t - t:.3g} s too late")
-                continue
-            self._advance(t, reports)
-            reports += self.estimator.update(sample)
+            if self.estimator.accepts(sample):
+                self._apply(turn, sample, reports)
         self._propagate_to(horizon, reports)
 
-    def _append(self, imu: ImuSamples) -> None:
-        if self._t == -math.inf:
-            self._t = float(imu.t[0] - imu.dt[0])
-        ready = compensate(imu, self._raw) if self.coning else imu
-        self._raw = _cut(imu, len(imu) - 1, len(imu))
-        kept = max(self._next - 1, 0)  # the last one used as well: its rates lead on
-        self._imu = _join(_cut(self._imu, kept, len(self._imu)), ready)
-        self._ends = self._imu.t.tolist()
-        self._longest = max(self._longest, float(imu.dt.max()))
-        self._next -= kept
-
-    def _advance(self, t: float, reports: list[UpdateReport]) -> None:
-        """Bring the estimator to ``t``, splitting an increment in which it falls."""
+    def _apply(self, turn: float, sample: Sample, reports: list[UpdateReport]) -> None:
+        """Hand over a sample at its time; one whose ``turn`` is later is refused then."""
+        t = sample.t if math.isfinite(sample.t) else turn
+        if turn > t:  # too late, wherever the blocks were cut
+            self._propagate_to(turn, reports)
+        if t < self._ahead.t - COINCIDENT:
+            reports += self.estimator.refuse(sample, f"{self._ahead.t - t:.3g} s too late")
+            return
         self._propagate_to(t, reports)
-        if t > self._t + COINCIDENT and self._next < len(self._ends):
-            part = self._part(self._next, t)
-            for rest, used in ((self._imu.dt, part.dt), (self._imu.dtheta, part.dtheta), (self._imu.dv, part.dv)):
-                rest[self._next] -= used[0]
+        part = self._ahead.part(t)
+        if part is not None:
             reports += self.estimator.propagate(part) or ()
-            self._t = t
+        reports += self.estimator.update(sample)
 
     def _propagate_to(self, t: float, reports: list[UpdateReport]) -> None:
         """Hand over the whole increments that end by ``t``."""
-        stop = self._row_after(t)
-        if stop > self._next:
-            reports += self.estimator.propagate(_cut(self._imu, self._next, stop)) or ()
-            self._t = self._ends[stop - 1]
-            self._next = stop
-
-    def _row_after(self, t: float) -> int:
-        return bisect_right(self._ends, t + COINCIDENT, self._next)
-
-    def _part(self, row: int, t: float) -> ImuSamples:
-        """The part of one increment up to ``t``: rate and force are constant over an increment."""
-        whole = _cut(self._imu, row, row + 1)
-        share = 1 - (whole.t[0] - t) / whole.dt[0]
-        return ImuSamples(np.array([t]), share * whole.dt, share * whole.dtheta, share * whole.dv)
-
-    def _beyond(self, row: int, t: float, ahead: float) -> ImuSamples:
-        """What the next increment would be up to ``t``, ``ahead`` [s] long, if one's rates went on."""
-        last = _cut(self._imu, row, row + 1)
-        share = ahead / last.dt[0]
-        return ImuSamples(np.array([t]), share * last.dt, share * last.dtheta, share * last.dv)
-
-
-def _cut(imu: ImuSamples, start: int, stop: int) -> ImuSamples:
-    return ImuSamples(imu.t[start:stop], imu.dt[start:stop], imu.dtheta[start:stop], imu.dv[start:stop])
-
-
-def _join(first: ImuSamples, second: ImuSamples) -> ImuSamples:
-    return ImuSamples(
-        np.concatenate([first.t, second.t]),
-        np.concatenate([first.dt, second.dt]),
-        np.concatenate([first.dtheta, second.dtheta]),
-        np.concatenate([first.dv, second.dv]),
-    )
+        whole = self._ahead.whole(t)
+        if whole is not None:
+            reports += self.estimator.propagate(whole) or ()

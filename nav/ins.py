@@ -20,9 +20,11 @@ from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
+from nav.batch import Batch
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
+from nav.increments import Increments, Step
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
@@ -56,7 +58,7 @@ from nav.samples import (
     WindSample,
 )
 from nav.smoother import Smoother
-from nav.state import State
+from nav.state import Known, State
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
 
@@ -147,6 +149,10 @@ class Ins:
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
+        self._batch = Batch(self._filter, self._reference, self._is_plain)
+        plain = not (policies or fadings or config.smooth or config.scaling or course)
+        seen = field_n is not None or not any(isinstance(aid, MagnetometerAid) for aid in config.aids)
+        self._takes_steps = plain and seen
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]
 
     @property
@@ -192,6 +198,62 @@ class Ins:
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
         self.t = float(imu.t[-1])
 
+    @property
+    def in_steps(self) -> bool:
+        """Whether it takes many steps at once."""
+        return self._takes_steps and self._state is not None
+
+    def take(
+        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+    ) -> int:
+        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+        state = self._state
+        if state is None or self._doubt.any() or self._wind_doubt.pending:
+            return 0
+        plan = self._batch.plan(steps, self._monitor.last_fused)
+        if not len(plan):
+            return 0
+        done = self._batch.run(state, ahead, plan, self._last_bad)
+        self.t, self._last_bad = done.t, done.last_bad
+        reports += self._batch.reports(steps, done)
+        states = self._batch.states(done)
+        for t, _, sample in steps[: done.steps]:
+            if sample is not None:
+                self._took(sample)
+            elif not math.isnan(t):
+                then, last_bad, known = next(states)
+                self._wind_doubt.right(self._monitor.last_fused)
+                estimates.append(self._described(known, then, self._status(then, last_bad), self._doubt))
+        if not done.parts:
+            return done.steps
+        sample = steps[done.steps].sample
+        assert sample is not None
+        reports += self._finish(state, sample, done.parts)
+        return done.steps + 1
+
+    def _is_plain(self, fix: GnssSample, before: float) -> bool:
+        """Whether a fix, if it is inside the gate, is simply used when that of the time ``before`` was."""
+        return self._monitor.sure(fix.t, before) and not (self._winds is not None and self._winds.due(fix.t))
+
+    def _took(self, sample: Sample) -> None:
+        """A sample was used, at least the first part of it."""
+        if isinstance(sample, GnssSample):
+            if not sample.has_fix:
+                self._monitor.heard(sample.t)
+                return
+            self._monitor.judge(sample, sample.v_n, sample.sigma_velocity_n, inside_gate=True)
+        elif sample.sensor in self._refusals:
+            self._refusals[sample.sensor].taken()
+        self._filter.stand_in(sample)
+
+    def _finish(self, state: State, sample: Sample, first: int) -> list[UpdateReport]:
+        """Use the parts from the ``first`` on of a sample whose others were used."""
+        self._took(sample)
+        aid = self._filter.aids[sample.sensor]
+        if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
+            return self._update_gnss_further(state, sample, aid, None)
+        return self._update_part_by_part(state, sample, aid, first)
+
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample is of an aid, or can still serve the alignment."""
         if self._state is None:
@@ -234,9 +296,9 @@ class Ins:
             self._smoother.pause(self.t, state)
         return reports
 
-    def _update_part_by_part(self, state: State, sample: Sample, aid: Aid) -> list[UpdateReport]:
+    def _update_part_by_part(self, state: State, sample: Sample, aid: Aid, first: int = 0) -> list[UpdateReport]:
         reports = []
-        for part, _ in aid.parts:
+        for part, _ in aid.parts[first:]:
             measurement = self._filter.measure(self._reference, state, aid, part, sample)
             if measurement is not None:
                 report = self._filter.fuse(self._reference, state, sample, part, measurement)
@@ -319,7 +381,7 @@ class Ins:
         if self._smoother is None:
             raise ValueError("this filter was not told to keep what smoothing needs: see InsConfig.smooth")
         for t, state in self._smoother.states(times):
-            yield self._described(state, t, Status.ALIGNED, np.zeros(MOTION))
+            yield self._described(state.known, t, Status.ALIGNED, np.zeros(MOTION))
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
@@ -376,8 +438,15 @@ class Ins:
             assert wide is not None
             S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
         withheld = None if ruling.weight else without_position(ruling)
-        reports = [report_on(sample, "gnss_position", nu, S, nis, threshold, ruling)]
-        if use_velocity:
+        position = report_on(sample, "gnss_position", nu, S, nis, threshold, ruling)
+        return [position, *self._update_gnss_further(state, sample, aid, withheld)]
+
+    def _update_gnss_further(
+        self, state: State, sample: GnssSample, aid: GnssAid, withheld: Ruling | None
+    ) -> list[UpdateReport]:
+        """Velocity and course of a fix whose position was used, or ``withheld``."""
+        reports = []
+        if has_velocity(sample) and aid.use_velocity:
             velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None
             reports.append(self._filter.fuse(self._reference, state, sample, "gnss_velocity", velocity, withheld))
@@ -407,18 +476,21 @@ class Ins:
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        status = Status.ALIGNING if state is None else FUSED if self._aided(t) else UNAIDED
-        if t - last_bad <= BAD_SAMPLE_S:
-            status |= Status.BAD_SAMPLE
+        status = self._status(t, last_bad)
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
         self._wind_doubt.right(self._monitor.last_fused)
-        return self._described(state, t, status, self._doubt + self._wind_doubt.off(t))
+        return self._described(state.known, t, status, self._doubt + self._wind_doubt.off(t))
 
-    def _described(self, state: State, t: float, status: Status, doubt: Array) -> Estimate:
+    def _status(self, t: float, last_bad: float) -> Status:
+        """What it says of itself at ``t``."""
+        status = Status.ALIGNING if self._state is None else FUSED if self._aided(t) else UNAIDED
+        return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status
+
+    def _described(self, state: Known, t: float, status: Status, doubt: Array) -> Estimate:
         """The estimate of a settled state, with a ``doubt`` (9,) of its motion."""
-        P, x = state.P[0], state.x[0].copy()
+        P, x = state.P, state.x.copy()
         x[: len(state.imu)] = state.imu
         covariance, sigma = spread(doubted(P, doubt), self.config.mounting_sigma**2)
         extra = {name: (x[where], sigma[where]) for name, where in self._extra}

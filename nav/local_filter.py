@@ -70,13 +70,13 @@ class LocalFilter:
         self.fadings: Mapping[str, Fading] = {}
         self.smoother: Smoother | None = None  # told of each update of a closed filter, if there is one
         self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
-        self._starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
+        self.starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
         self._scatters = {aid.sensor: Scatter() for aid in aids if isinstance(aid, BarometerAid) and aid.scatters}
         self._contradictions = {
             aid.sensor: Contradiction(aid.largest_jump) for aid in aids if isinstance(aid, GnssAid) and aid.largest_jump
         }
-        self._silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
+        self.silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
         """Monitor each part of a sensor's samples, from a clean record."""
@@ -106,7 +106,7 @@ class LocalFilter:
 
     def stand_in(self, sample: Sample) -> Sample | None:
         """What stands in for a pitot tube that has fallen silent, once a sound ``sample`` of any sensor was used."""
-        return None if self._silence is None else self._silence.stand_in(sample)
+        return None if self.silence is None else self.silence.stand_in(sample)
 
     def remember_wind(self, memory: WindMemory | None, state: State, t: float) -> None:
         """Put the mean wind into the ``memory``, if there is one."""
@@ -171,7 +171,7 @@ class LocalFilter:
         measurement = self.measure_at_nominal(reference, state, aid, part, sample)
         if measurement is None:
             return None
-        starts = self._starts[aid.sensor]
+        starts = self.starts[aid.sensor]
         root = unscented.factor(state.P[self.row], CURVED)
         points = unscented.points(state.q_nb, state.v_n, state.lla, self._whole(state), root, self.scaling.spread)
         if aid.sensor in self._at_points:
@@ -192,7 +192,7 @@ class LocalFilter:
         self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample
     ) -> Measurement | None:
         """One part of a sample at the nominal state and the filter's own errors of aids, its R as learned."""
-        here = OperatingPoint(reference, state, state.x[self.row], self._starts[aid.sensor], state.P[self.row])
+        here = OperatingPoint(reference, state, state.x[self.row], self.starts[aid.sensor], state.P[self.row])
         measurement = aid.measure(part, sample, here)
         noise = self._noise(aid.sensor, part)
         if measurement is not None and isinstance(sample, BarometerSample) and aid.sensor in self._scatters:

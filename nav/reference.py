@@ -14,7 +14,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.alignment import Alignment, InitialState
-from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, sensor_errors
+from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors
 from nav.rotation import (
     dcm_from_quat,
     left_jacobian_solve,
@@ -24,7 +24,7 @@ from nav.rotation import (
     rotvec_from_quat,
 )
 from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
-from nav.state import State, inject, propagate, sigma_step, working
+from nav.state import Known, State, inject, propagate, sigma_step, working
 from nav.unscented import Scaling, carry, scratch
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
@@ -74,8 +74,7 @@ class Reference:
         self.size = max(model.size for model in models)
         self.has_field = field_n is not None
         self._field_model = field_n
-        self._field_at = (math.nan, math.nan, math.nan)
-        self._field_value = np.zeros(3)
+        self.field = np.full(6, math.nan)  # where the field was looked up, and what it was
         filters, n = len(models), self.size
         self._decay_rate, self._noise = np.zeros((filters, n)), np.zeros((filters, n))
         for i, model in enumerate(models):
@@ -94,6 +93,13 @@ class Reference:
         each = np.array(shares)[:, None]
         self._variance_rate[:, : self.common] = self._noise[:, : self.common] / each
         self._in_motion[:] = np.array([model.imu.in_motion for model in self.models]) / each
+
+    @property
+    def moving(self) -> tuple[Indices, Array, Array, Array, Array, Array, int]:
+        """What `nav.state.propagate` is told beside a state, up to the period."""
+        return (
+            self.driven, self._decay_rate, self._variance_rate, self._in_motion, self._room, self._work, self.period
+        )  # fmt: skip
 
     def start(self, initial: InitialState, names: Sequence[Mapping[str, str]] | None = None) -> State:
         """A given state with its covariance, not yet shared; ``names[i]`` renames correlated blocks for filter i."""
@@ -207,13 +213,21 @@ class Reference:
     def field_n(self, lla: Array) -> Array:
         """The reference field, looked up again only after the place has changed."""
         assert self._field_model is not None
-        (lat, lon, h), (lat0, lon0, h0) = lla.tolist(), self._field_at
-        if not (
-            abs(lat - lat0) < FIELD_PATCH_RAD and abs(lon - lon0) < FIELD_PATCH_RAD and abs(h - h0) < FIELD_PATCH_M
-        ):
-            self._field_at = (lat, lon, h)
-            self._field_value = np.array(self._field_model(lat, lon, h), dtype=float)
-        return self._field_value
+        if not is_near(lla, self.field):
+            lat, lon, h = lla.tolist()
+            self.field = np.array([lat, lon, h, *self._field_model(lat, lon, h)])
+        return self.field[3:]
+
+
+@njit
+def is_near(lla: Array, field: Array) -> bool:
+    """Whether the reference ``field`` (6,), latitude, longitude, height and what it is there, is that of a place."""
+    near: bool = (
+        abs(lla[0] - field[0]) < FIELD_PATCH_RAD
+        and abs(lla[1] - field[1]) < FIELD_PATCH_RAD
+        and abs(lla[2] - field[2]) < FIELD_PATCH_M
+    )
+    return near
 
 
 def _turn(x: Array) -> Array:
@@ -251,8 +265,8 @@ def nothing_known(t: float, status: Status) -> Estimate:
 
 
 def describe(
-    state: State, x: Array, P: Array, model: ErrorModel, t: float, status: Status, covariance: Array, sigma: Array,
-    extra: dict[str, tuple[Array, Array]],
+    state: State | Known, x: Array, P: Array, model: ErrorModel, t: float, status: Status, covariance: Array,
+    sigma: Array, extra: dict[str, tuple[Array, Array]],
 ) -> Estimate:  # fmt: skip
     """The estimate of a nominal state with estimated sensor errors ``x`` and covariance ``P``, laid out as ``model``.
 

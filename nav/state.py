@@ -6,6 +6,7 @@ A kernel is handed the whole of a `State` as one array, and finds its parts in i
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -64,9 +65,34 @@ class State:
         made.take(self)
         return made
 
+    @property
+    def known(self) -> Known:
+        """What it says of the motion, of the inertial sensors and of its first filter."""
+        return known(self.whole, *self.shape)
+
     def __deepcopy__(self, memo: object) -> State:
         """A deep copy of views would be arrays each by itself."""
         return self.copy()
+
+
+class Known(NamedTuple):
+    """What a `State` says of the motion, of the inertial sensors and of its first filter: the same names."""
+
+    q_nb: Array
+    v_n: Array
+    lla: Array
+    imu: Array
+    x: Array  # (n,)
+    P: Array  # (n, n)
+
+
+def known(whole: Array, common: int, filters: int, n: int) -> Known:
+    """Views of the ``whole`` of a `State`."""
+    x = FIXED + common
+    P = x + filters * n
+    return Known(
+        whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x : x + n], whole[P : P + n * n].reshape(n, n)
+    )
 
 
 @njit

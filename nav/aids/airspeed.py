@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import Measurement, OperatingPoint, Ruling, range_problem
+from nav.aids.base import Kind, Measurement, OperatingPoint, Ruling, range_problem
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.error_model import PHI, POS, VEL, Block, markov
 from nav.rotation import cross, dcm_from_quat, dot
@@ -21,6 +21,7 @@ STANDING = Ruling(Outcome.OUT_OF_RANGE, "standing, and blown upon")
 STANDING_SPEED = 2.0  # over ground: what blows at a vehicle at rest tells of gusts near the ground only [m/s]
 SILENT_S, SILENT_INTERVALS = 1.0, 3.0  # without a sample for longer than both, a pitot tube has fallen silent
 TIME_TOLERANCE = 1e-4  # [s]
+_NONE = (0.0,) * 11
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,15 @@ class AirspeedAid:
     def _R(self) -> tuple[Array, Array]:
         return np.array([self.sigma**2]), np.array([(self.sideslip_sigma or 0.0) ** 2])
 
+    @property
+    def plain(self) -> tuple[Kind, tuple[float, ...]]:
+        """See `PlainAid`: its two variances, and below what it tells nothing."""
+        return Kind.AIRSPEED, (self._R[0][0], self._R[1][0], self.minimum)
+
+    def numbers(self, sample: AirspeedSample) -> tuple[float, ...]:
+        """See `PlainAid`."""
+        return (sample.eas, *_NONE)
+
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, AirspeedSample)
@@ -73,9 +83,9 @@ class AirspeedAid:
             if part == "airspeed":
                 return None
             eas = -float(airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, 0.0)[0][0])
-        slow = None if eas >= self.minimum else TOO_SLOW
-        if slow is None and float(state.v_n @ state.v_n) < STANDING_SPEED**2:
-            slow = STANDING
+        slow = None
+        if is_slow(eas, state.v_n, self.minimum):
+            slow = STANDING if eas >= self.minimum else TOO_SLOW
         if part == "airspeed":
             nu, H = airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, sample.eas)
             return Measurement(nu, H, self._R[0], slow)
@@ -115,6 +125,12 @@ class Silence:
 def problem(sample: AirspeedSample) -> str:
     """See `nav.aids.problem`."""
     return range_problem("airspeed", sample.eas, AIRSPEED_LIMITS)
+
+
+@njit
+def is_slow(eas: float, v_n: Array, minimum: float) -> bool:
+    """Whether a pitot tube says nothing of the air that is flown through: below its minimum, or at rest."""
+    return not eas >= minimum or dot(v_n, v_n) < STANDING_SPEED**2
 
 
 @njit

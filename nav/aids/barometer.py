@@ -9,13 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import Measurement, OperatingPoint, range_problem
+from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.earth import pressure_altitude
 from nav.error_model import POS, Block, markov
 from nav.samples import Array, BarometerSample, Sample
 
 CLOSE_S = 0.25  # between neighbours: 10 m/s^2 bend the line by 0.1 m then [s]
 SCATTER_SAMPLES, OUTLYING = 100, 10.0  # that are averaged; times the mean square that one of them counts at most
+_NONE = (0.0,) * 11
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly report [Pa]
 
 
@@ -51,6 +52,15 @@ class BarometerAid:
     @cached_property
     def _R(self) -> Array:
         return np.array([self.sigma**2])
+
+    @property
+    def plain(self) -> tuple[Kind, tuple[float]] | None:
+        """See `PlainAid`: its variance."""
+        return None if self.scatters else (Kind.BAROMETER, (self._R[0],))
+
+    def numbers(self, sample: BarometerSample) -> tuple[float, ...]:
+        """See `PlainAid`."""
+        return (sample.pressure, *_NONE)
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

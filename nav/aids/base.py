@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias, runtime_checkable
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -100,6 +101,34 @@ class AidAtPoints(Protocol):
 
     def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
         """The innovations (N, m) of one part of a sound sample; None where they are to be had one by one only."""
+        ...
+
+
+class Kind(IntEnum):
+    """The aids that `nav.batch` knows."""
+
+    BAROMETER = 0
+    MAGNETOMETER = 1
+    AIRSPEED = 2
+    GNSS = 3
+
+
+@runtime_checkable
+class PlainAid(Protocol):
+    """An aid whose sound samples need no more than its kernels, so that many can be taken at once (`nav.batch`)."""
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """See `Aid`."""
+        ...
+
+    @property
+    def plain(self) -> tuple[Kind, Sequence[float]] | None:
+        """What it is, and up to twelve numbers of its own; None where it needs more than that."""
+        ...
+
+    def numbers(self, sample: Any) -> Sequence[float]:
+        """Twelve numbers of a sound sample."""
         ...
 
 

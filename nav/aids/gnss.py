@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Measurement, OperatingPoint, position_problem, put_skew
+from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Kind, Measurement, OperatingPoint, position_problem, put_skew
 from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross, dcm_from_quat, quat_rotate
@@ -91,13 +91,25 @@ class GnssAid:
     def _correlated(self) -> tuple[Array, Array]:
         return np.array(self.position_error_sigma) ** 2, np.array(self.velocity_error_sigma) ** 2
 
+    @property
+    def plain(self) -> tuple[Kind, tuple[float, ...]] | None:
+        """See `PlainAid`: the variances of its slow errors, of position and velocity, and the arm."""
+        if self.course is not None or self.latency_sigma or self.velocity_lag:
+            return None
+        return Kind.GNSS, (*self._correlated[0], *self._correlated[1], *self.arm)
+
+    def numbers(self, sample: GnssSample) -> tuple[float, ...]:
+        """See `PlainAid`."""
+        sigma_p, sigma_v = sample.sigma_position_n.tolist(), sample.sigma_velocity_n.tolist()
+        return (sample.lat, sample.lon, sample.h, *sample.v_n.tolist(), *sigma_p, *sigma_v)
+
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, GnssSample)
         state, latency = at.state, at.starts[2]
         if part == "gnss_position":
             nu, H = gnss_position(state.q_nb, state.lla, at.x, self.arm, at.starts[0], sample.lat, sample.lon, sample.h)
-            R = _white(sample.sigma_position_n, self._correlated[0])
+            R = white(sample.sigma_position_n, self._correlated[0])
             if latency >= 0:
                 older = float(at.x[latency])
                 nu += older * state.v_n
@@ -114,7 +126,7 @@ class GnssAid:
             self.arm, at.starts[1], sample.v_n,
         )  # fmt: skip
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
-        R = _white(sample.sigma_velocity_n, self._correlated[1])
+        R = white(sample.sigma_velocity_n, self._correlated[1])
         if latency >= 0 or self.velocity_lag:
             acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
             if state.rates[1].any():
@@ -151,10 +163,14 @@ class GnssAid:
         return Measurement(nu, H, np.array([(sigma2 + self.course.slip**2) / speed2]))
 
 
-def _white(sigma: Array, correlated_variance: Array) -> Array:
+@njit
+def white(sigma: Array, correlated_variance: Array) -> Array:
     """The white part of a receiver's reported variance, when the correlated part is a state of the filter."""
-    reported = sigma * sigma
-    return np.maximum(reported - correlated_variance, WHITE_SHARE * reported)
+    R = np.empty(len(sigma))
+    for i in range(len(sigma)):
+        reported = sigma[i] * sigma[i]
+        R[i] = max(reported - correlated_variance[i], WHITE_SHARE * reported)
+    return R
 
 
 @dataclass

@@ -9,11 +9,12 @@ from functools import cached_property
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import Measurement, OperatingPoint, range_problem
+from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.error_model import PHI, Block, markov
 from nav.rotation import dcm_from_quat
 from nav.samples import Array, MagnetometerSample, Sample
 
+_NONE = (0.0,) * 9
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Earth's is 22 to 67 uT [T]
 
@@ -60,6 +61,15 @@ class MagnetometerAid:
     @cached_property
     def _R(self) -> Array:
         return np.full(3, self.sigma**2)
+
+    @property
+    def plain(self) -> tuple[Kind, tuple[float, ...]] | None:
+        """See `PlainAid`: its variances."""
+        return None if self.doubt else (Kind.MAGNETOMETER, tuple(self._R.tolist()))
+
+    def numbers(self, sample: MagnetometerSample) -> tuple[float, ...]:
+        """See `PlainAid`."""
+        return (*sample.field_b.tolist(), *_NONE)
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

@@ -82,6 +82,10 @@ class GnssMonitor:
             self._was_aided = True
         return verdict
 
+    def sure(self, t: float, before: float) -> bool:
+        """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""
+        return self._was_aided and t - before <= self.outage_s
+
     def _longest_gap(self) -> float:
         """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""
         return max(self.outage_s, 2 * self._interval) if math.isfinite(self._interval) else self.outage_s

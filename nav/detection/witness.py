@@ -27,9 +27,13 @@ class WindMemory:
     gust: float  # [m/s]
     _winds: deque[tuple[float, Array, Array]] = field(default_factory=deque)
 
+    def due(self, t: float) -> bool:
+        """Whether `remember` would keep a wind of ``t`` [s]: one in `STEP_S`."""
+        return not (self._winds and t - self._winds[-1][0] < STEP_S)
+
     def remember(self, t: float, wind: Array, variance: Array) -> None:
-        """The mean wind (2,) [m/s], NE, and its variance (2,), at ``t`` [s]; one in `STEP_S` is kept."""
-        if self._winds and t - self._winds[-1][0] < STEP_S:
+        """The mean wind (2,) [m/s], NE, and its variance (2,), at ``t`` [s], if one is `due`."""
+        if not self.due(t):
             return
         self._winds.append((t, wind.copy(), variance.copy()))
         while t - self._winds[0][0] > MEMORY_S:

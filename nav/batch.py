@@ -1,0 +1,285 @@
+"""Many steps of a filter in one kernel: increments, plain samples, and what it knows on the way.
+
+A call of a kernel from Python costs as much as the update that it does, and what is done in Python about a sample costs
+several times that. Most samples are plain: of a sensor that needs no more than its kernel (`nav.aids.base.PlainAid`),
+sound, and inside their gate. `follow` takes them one after the other, just as they would be taken one by one, until one
+is not what it seemed to be; that is left to the filter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from typing import NamedTuple
+
+import numpy as np
+
+from nav._jit import njit
+from nav.aids import problem
+from nav.aids.airspeed import airspeed, is_slow, sideslip
+from nav.aids.barometer import barometer
+from nav.aids.base import FUSED, Kind, PlainAid, report_on
+from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
+from nav.aids.magnetometer import magnetometer
+from nav.earth import pressure_altitude
+from nav.error_model import Indices
+from nav.increments import COINCIDENT, Increments, Step
+from nav.local_filter import LocalFilter
+from nav.reference import NEVER, PREDICTED_PERIODS, Reference, is_near
+from nav.samples import Array, GnssSample, UpdateReport
+from nav.state import Known, State, absorb, known, parts, propagate
+
+# What a step is, in place of the number of an aid; and where its numbers begin.
+ESTIMATE, ADVANCE, SPLIT = -1, -2, -3
+TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
+WIDTH = NUMBERS + 12
+NOTHING = (0.0,) * 12
+REPORT = 15  # step, part, nis, innovation (3,), S (9,)
+
+
+class Done(NamedTuple):
+    """How far `follow` came: steps, and parts of the next one that were used; of increments the first row that is left,
+    and the time; when one was not usable for the last time; reports and estimates that were written.
+    """
+
+    steps: int
+    parts: int
+    row: int
+    t: float
+    last_bad: float
+    reports: int
+    estimates: int
+
+
+class Batch:
+    """Takes the plain steps of one closed filter.
+
+    ``trusted`` says of a fix, given the time of the one before, whether it is used if it is inside its gate.
+    """
+
+    def __init__(
+        self, filter_: LocalFilter, reference: Reference, trusted: Callable[[GnssSample, float], bool]
+    ) -> None:
+        self._filter, self._reference, self._trusted = filter_, reference, trusted
+        self._aids: dict[str, tuple[int, PlainAid]] = {}
+        kinds: list[list[int]] = []
+        told: list[list[float]] = []
+        for sensor, aid in filter_.aids.items():
+            plain = aid.plain if isinstance(aid, PlainAid) else None
+            if plain is not None and isinstance(aid, PlainAid):
+                self._aids[sensor] = len(kinds), aid
+                starts = filter_.starts[sensor]
+                kinds.append([plain[0], len(aid.parts), *starts, *[-1] * (8 - 2 - len(starts))])
+                told.append([*plain[1], *[0.0] * (12 - len(plain[1]))])
+        self._kinds = np.array(kinds, np.int64).reshape(-1, 8)
+        self._told = np.array(told).reshape(-1, 12)
+
+    def plan(self, steps: Sequence[Step], last_fix: float) -> Array:
+        """The first of the ``steps`` that look plain, as rows for `follow`; the last fix was used at ``last_fix``."""
+        flat: list[float] = []
+        silence = copy(self._filter.silence)
+        for t, horizon, sample in steps:
+            if sample is None:
+                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
+                continue
+            if t != horizon or sample.sensor not in self._aids:  # too late, or not known when
+                break
+            index, aid = self._aids[sample.sensor]
+            if isinstance(sample, GnssSample):
+                if not sample.has_fix:
+                    flat += (t, t, SPLIT, *NOTHING)
+                    continue
+                if problem(sample) or not (has_velocity(sample) and self._trusted(sample, last_fix)):
+                    break
+                last_fix = t
+            elif problem(sample):
+                break
+            if silence is not None and silence.stand_in(sample) is not None:
+                break
+            flat += (t, t, index, *aid.numbers(sample))
+        return np.array(flat).reshape(-1, WIDTH)
+
+    def run(self, state: State, ahead: Increments, plan: Array, last_bad: float) -> Done:
+        """`follow` a ``plan``, and move ``ahead`` along."""
+        imu, (common, filters, n) = ahead.imu, state.shape
+        self._reports = np.empty((2 * len(plan), REPORT))
+        self._estimates = np.empty((np.count_nonzero(plan[:, WHAT] == ESTIMATE), 2 + len(state.whole)))
+        done = Done(
+            *follow(
+                state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
+                ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
+                np.array(self._filter.gate.thresholds), self._reports, self._estimates,
+            )
+        )  # fmt: skip
+        ahead.next, ahead.t = done.row, done.t
+        return done
+
+    def reports(self, steps: Sequence[Step], done: Done) -> Iterator[UpdateReport]:
+        """The reports on what was just done."""
+        rows = self._reports[: done.reports]
+        for row, (step, part, nis) in zip(rows, rows[:, :3].tolist(), strict=True):
+            sample = steps[int(step)].sample
+            assert sample is not None
+            name, m = self._aids[sample.sensor][1].parts[int(part)]
+            nu, S = row[3 : 3 + m], row[6 : 6 + m * m].reshape(m, m)
+            yield report_on(sample, name, nu, S, nis, self._filter.gate.threshold(m), FUSED)
+
+    def states(self, done: Done) -> Iterator[tuple[float, float, Known]]:
+        """At each time at which an estimate was asked for: the time, that of the last bad increment, the state."""
+        shape = self._reference.common, len(self._reference.models), self._reference.size
+        for row, (t, last_bad) in zip(self._estimates, self._estimates[: done.estimates, :2].tolist(), strict=False):
+            yield t, last_bad, known(row[2:], *shape)
+
+
+@njit
+def row_after(t: Array, time: float, first: int) -> int:
+    """`Increments.row_after`."""
+    while first < len(t) and t[first] <= time + COINCIDENT:
+        first += 1
+    return first
+
+
+@njit
+def follow(
+    whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
+    in_motion: Array, room: Array, work: Array, period: int,
+    t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
+    steps: Array, kinds: Indices, told: Array, field: Array, thresholds: Array,
+    reports: Array, estimates: Array,
+) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
+    """Take ``steps`` (K, WIDTH) as far as they are plain: see `Done`. In place on all that is handed over.
+
+    The state and how it moves as of `nav.state.propagate`, the increments of `nav.increments.Increments`; ``kinds`` (A,
+    8) and ``told`` (A, 12) of the aids (`Table`), the last place of the reference ``field`` (6,), ``thresholds`` of the
+    gate by dimension. Into ``reports`` (_, `REPORT`) and ``estimates`` (_, 2 + whole): time, last bad increment, state.
+    """
+    q_nb, v_n, lla, _, x, _, errors, _, _, rates, _ = parts(whole, common, filters, n)
+    one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
+    written = drafted = 0
+    for k in range(len(steps)):
+        time, what = steps[k, TIME], int(steps[k, WHAT])
+        stop = row_after(t, steps[k, HORIZON], row)
+        if stop > row:
+            bad = propagate(
+                whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
+                dtheta[row:stop], dv[row:stop], dt[row:stop], False,
+            )  # fmt: skip
+            if bad >= 0:
+                last_bad = max(last_bad, t[row + bad])
+            row, now = stop, t[stop - 1]
+        if what == ADVANCE:
+            continue
+        if what == ESTIMATE:
+            if time < now - COINCIDENT:
+                return k, 0, row, now, last_bad, written, drafted
+            stop = row if abs(time - now) <= COINCIDENT else row_after(t, time, row)
+            further = 0.0 if abs(time - now) <= COINCIDENT else time - max(t[stop - 1], now)
+            if further > longest + COINCIDENT:
+                return k, 0, row, now, last_bad, written, drafted
+            draft, bad_then, then = estimates[drafted, 2:], last_bad, now if stop == row else t[stop - 1]
+            for i in range(len(whole)):
+                draft[i] = whole[i]
+            bad = propagate(
+                draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
+                period * PREDICTED_PERIODS, dtheta[row:stop], dv[row:stop], dt[row:stop], further <= COINCIDENT,
+            )  # fmt: skip
+            if bad >= 0:
+                bad_then = max(bad_then, t[row + bad])
+            if further > COINCIDENT:
+                _share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
+                bad = propagate(
+                    draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
+                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, True,
+                )  # fmt: skip
+                then = time
+                if bad >= 0:
+                    bad_then = max(bad_then, time)
+            estimates[drafted, 0], estimates[drafted, 1] = then, bad_then
+            drafted += 1
+            continue
+        if time > now + COINCIDENT and row < len(t):
+            _share(one_dt, one_angle, one_push, dt, dtheta, dv, row, 1 - (t[row] - time) / dt[row])
+            dt[row] -= one_dt[0]
+            for i in range(3):
+                dtheta[row, i] -= one_angle[0, i]
+                dv[row, i] -= one_push[0, i]
+            bad = propagate(
+                whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
+                one_push, one_dt, False,
+            )  # fmt: skip
+            if bad >= 0:
+                last_bad = max(last_bad, time)
+            now = time
+        if what == SPLIT:
+            continue
+        propagate(
+            whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, NEVER,
+            dtheta[:0], dv[:0], dt[:0], True,
+        )  # fmt: skip
+        for part in range(kinds[what, 1]):
+            plain, nu, H, R = _measure(
+                kinds[what], part, told[what], steps[k, NUMBERS:], q_nb, v_n, lla, x[0], rates, errors, driven, field
+            )
+            if not plain:
+                return k, part, row, now, last_bad, written, drafted
+            m = len(nu)
+            S, nis = absorb(whole, common, filters, n, 0, driven, nu, H, R, thresholds[m - 1], True)
+            if not nis <= thresholds[m - 1]:
+                return k, part, row, now, last_bad, written, drafted
+            _report(reports[written], k, part, nu, S, nis)
+            written += 1
+    return len(steps), 0, row, now, last_bad, written, drafted
+
+
+@njit
+def _share(
+    one_dt: Array, one_angle: Array, one_push: Array, dt: Array, dtheta: Array, dv: Array, row: int, share: float
+) -> None:
+    """`nav.increments.share_of` one row, in place."""
+    one_dt[0] = share * dt[row]
+    for i in range(3):
+        one_angle[0, i], one_push[0, i] = share * dtheta[row, i], share * dv[row, i]
+
+
+@njit
+def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float) -> None:
+    """Write down what became of a part."""
+    m = len(nu)
+    report[0], report[1], report[2] = k, part, nis
+    for i in range(m):
+        report[3 + i] = nu[i]
+        for j in range(m):
+            report[6 + m * i + j] = S[i, j]
+
+
+@njit
+def _measure(
+    kind: Indices, part: int, told: Array, numbers: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, rates: Array,
+    errors: Array, driven: Indices, field: Array,
+) -> tuple[bool, Array, Array, Array]:  # fmt: skip
+    """Whether one part of a sample is plain, and its innovation (m,), Jacobian (m, n), variances (m,).
+
+    ``kind`` (8,) has what it is, how many parts there are, and from the third on where states begin; ``told`` (12,) the
+    numbers of the aid, ``numbers`` (12,) those of the sample.
+    """
+    if kind[0] == Kind.BAROMETER:
+        nu, H = barometer(lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))
+        return True, nu, H, told[:1]
+    if kind[0] == Kind.MAGNETOMETER:
+        nu, H = magnetometer(q_nb, x, kind[2], kind[4], kind[3], kind[5], field[3:], numbers[:3])
+        return is_near(lla, field), nu, H, told[:3]
+    if kind[0] == Kind.AIRSPEED:
+        plain = not is_slow(numbers[0], v_n, told[2])
+        if part == 0:
+            nu, H = airspeed(q_nb, v_n, lla, x, kind[2], kind[3], kind[4], numbers[0])
+            return plain, nu, H, told[:1]
+        nu, H = sideslip(q_nb, v_n, x, kind[2], kind[3])
+        return plain, nu, H, told[1:2]
+    arm = told[6:9]
+    if part == 0:
+        nu, H = gnss_position(q_nb, lla, x, arm, kind[2], numbers[0], numbers[1], numbers[2])
+        return True, nu, H, white(numbers[6:9], told[:3])
+    swings = arm[0] != 0.0 or arm[1] != 0.0 or arm[2] != 0.0
+    known = rates[0, 0] != 0.0 or rates[0, 1] != 0.0 or rates[0, 2] != 0.0
+    nu, H = gnss_velocity(q_nb, v_n, lla, x, rates[0], errors, driven, arm, kind[3], numbers[3:6])
+    return known or not swings, nu, H, white(numbers[9:12], told[3:6])

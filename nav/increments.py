@@ -1,0 +1,95 @@
+"""Increments on their way into an estimator, which takes them up to the times of samples, splitting one if need be."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from nav.samples import ImuSamples, Sample
+
+COINCIDENT = 1e-6  # two times this close are the same [s]
+
+
+class Step(NamedTuple):
+    """What an estimator is to do next: go on to ``horizon`` [s] and say what it knows of ``t`` [s], later or the same.
+
+    With a ``sample`` it is to use that, which is valid at ``t``; a ``t`` of NaN asks for nothing.
+    """
+
+    t: float
+    horizon: float
+    sample: Sample | None = None
+
+
+@dataclass
+class Increments:
+    """Increments that an estimator has not used, from row ``next`` on, and some that it has.
+
+    It stands at ``t`` [s], which may be within an increment: of that the rest is left. ``longest`` [s] is the longest
+    that there was.
+    """
+
+    imu: ImuSamples = field(
+        default_factory=lambda: ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+    )
+    next: int = 0
+    t: float = -np.inf
+    longest: float = 0.0
+    ends: list[float] = field(default_factory=list)  # the times of the increments, for `row_after`
+
+    def append(self, imu: ImuSamples) -> None:
+        """More increments, which follow on the last; of those used one is kept, whose rates lead on."""
+        if self.t == -np.inf:
+            self.t = float(imu.t[0] - imu.dt[0])
+        kept = max(self.next - 1, 0)
+        self.imu = joined(self.rows(kept, len(self.imu)), imu)
+        self.ends = self.imu.t.tolist()
+        self.longest = max(self.longest, float(imu.dt.max()))
+        self.next -= kept
+
+    def row_after(self, t: float) -> int:
+        """The first row, of those not used, that ends after ``t`` [s]."""
+        return bisect_right(self.ends, t + COINCIDENT, self.next)
+
+    def rows(self, start: int, stop: int) -> ImuSamples:
+        """Some rows, as views."""
+        imu = self.imu
+        return ImuSamples(imu.t[start:stop], imu.dt[start:stop], imu.dtheta[start:stop], imu.dv[start:stop])
+
+    def whole(self, t: float) -> ImuSamples | None:
+        """The whole increments that end by ``t`` [s], which are used with that; None without any."""
+        stop = self.row_after(t)
+        if stop <= self.next:
+            return None
+        taken = self.rows(self.next, stop)
+        self.t, self.next = self.ends[stop - 1], stop
+        return taken
+
+    def part(self, t: float) -> ImuSamples | None:
+        """What the next increment has up to ``t`` [s], which is used with that; None where ``t`` is not within it."""
+        if not (t > self.t + COINCIDENT and self.next < len(self.ends)):
+            return None
+        imu, row = self.imu, self.next
+        taken = share_of(self.rows(row, row + 1), 1 - (imu.t[row] - t) / imu.dt[row], t)
+        for rest, used in ((imu.dt, taken.dt), (imu.dtheta, taken.dtheta), (imu.dv, taken.dv)):
+            rest[row] -= used[0]
+        self.t = t
+        return taken
+
+
+def share_of(one: ImuSamples, share: float, t: float) -> ImuSamples:
+    """A share of one increment, whose rates are constant, that ends at ``t`` [s]."""
+    return ImuSamples(np.array([t]), share * one.dt, share * one.dtheta, share * one.dv)
+
+
+def joined(first: ImuSamples, second: ImuSamples) -> ImuSamples:
+    """One after the other, in arrays of their own."""
+    return ImuSamples(
+        np.concatenate([first.t, second.t]),
+        np.concatenate([first.dt, second.dt]),
+        np.concatenate([first.dtheta, second.dtheta]),
+        np.concatenate([first.dv, second.dv]),
+    )

@@ -1,0 +1,181 @@
+"""Many steps at once: the same bits as one after the other, whatever the samples are."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from worlds.ins import CONSUMER, DT, FIELD_N, airspeed, barometer, flight, gnss, imu, magnetometer
+
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, PositionFixAid
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.samples import FixType, ImuSamples, PositionSample
+
+ARM = (0.5, 0.1, -0.3)
+AIDS = (
+    GnssAid(arm_b=ARM, position_error_sigma=(1.0, 1.0, 2.0), velocity_error_sigma=(0.02, 0.02, 0.03)),
+    BarometerAid(),
+    MagnetometerAid(soft_iron_sigma=0.005),
+    AirspeedAid(gust_sigma=0.5, scale_sigma=0.01),
+)
+DURATION = 90
+
+
+class OneByOne:
+    """An estimator of which nobody knows that it takes many steps at once."""
+
+    def __init__(self, estimator):
+        self.estimator = estimator
+        for name in ("propagate", "accepts", "update", "refuse", "estimate", "predict"):
+            setattr(self, name, getattr(estimator, name))
+
+    @property
+    def listening(self):
+        return self.estimator.listening
+
+
+def sound(offset_s=0.0):
+    truth, rng = flight(DURATION), np.random.default_rng(1)
+    increments, _, _ = imu(truth, CONSUMER, rng)
+    samples = [
+        *gnss(truth, rng, 5.0, 1.5, 0.1, ARM, offset_s, latency_s=0.1),
+        *barometer(truth, rng),
+        *magnetometer(truth, rng),
+        *airspeed(truth, rng),
+    ]
+    return increments, samples
+
+
+def within(sample, kind, first, last):
+    return sample.sensor == kind and first <= sample.t <= last
+
+
+def rough(increments, samples):
+    """Whatever may go wrong, one after the other."""
+    made = []
+    for sample in samples:
+        change = {}
+        if within(sample, "gnss", 20, 20.5):
+            change = {"lat": sample.lat + 1e-4}
+        elif within(sample, "gnss", 24, 24.3):
+            change = {"v_n": sample.v_n + 9.0}
+        elif within(sample, "gnss", 26, 28):
+            change = {"v_n": np.full(3, np.nan)}
+        elif within(sample, "gnss", 30, 44):
+            change = {"fix_type": FixType.NO_FIX, "lat": np.nan, "v_n": np.full(3, np.nan)}
+        elif within(sample, "gnss", 48, 48.5):
+            change = {"t_arrival": sample.t + 1.5}
+        elif within(sample, "gnss", 50, 50.5):
+            change = {"sigma_position_n": np.zeros(3)}
+        elif within(sample, "barometer", 52, 53):
+            change = {"pressure": sample.pressure + 500}
+        elif within(sample, "barometer", 54, 54.5):
+            change = {"pressure": np.nan}
+        elif within(sample, "magnetometer", 56, 56.5):
+            change = {"field_b": sample.field_b * 0.8}
+        elif within(sample, "airspeed", 58, 59):
+            change = {"eas": sample.eas - 20}
+        elif within(sample, "airspeed", 60, 60.5):
+            change = {"eas": 3.0}
+        elif within(sample, "airspeed", 62, 70):
+            continue
+        elif within(sample, "magnetometer", 71, 71.3):
+            change = {"t": np.nan}
+        made.append(dataclasses.replace(sample, **change))
+    for k in (round(75 / DT), round(75.01 / DT)):
+        increments.dtheta[k] = np.nan
+    return made
+
+
+def run(one_by_one, config, increments, samples, block_s, times):
+    """Reports, estimates and the last state, pushed in blocks of `block_s`."""
+    ins = Ins(config, lambda lat, lon, h: FIELD_N * (1 + 1e-3 * (lat - 0.83)))
+    horizon = FusionHorizon(OneByOne(ins) if one_by_one else ins, lag_s=0.1)
+    samples = sorted(samples, key=lambda s: s.t_arrival)
+    reports, estimates, taken, size = [], [], 0, round(block_s / DT)
+    for start in range(0, len(increments), size):
+        rows = slice(start, start + size)
+        block = ImuSamples(*(getattr(increments, name)[rows] for name in ("t", "dt", "dtheta", "dv")))
+        arrived = []
+        while taken < len(samples) and samples[taken].t_arrival <= block.t[-1] + 1e-9:
+            arrived.append(samples[taken])
+            taken += 1
+        asked = [t for t in times if block.t[0] - DT + 1e-9 < t <= block.t[-1] + 1e-9]
+        some, told = horizon.track(block, arrived, asked)
+        reports += some
+        estimates += told
+    return reports, estimates, ins
+
+
+def same(a, b):
+    """Whether two values are the same bit by bit, arrays, numbers, texts and what is made of them."""
+    if dataclasses.is_dataclass(a):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, dict):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, np.ndarray | float):
+        return np.array_equal(a, b, equal_nan=True)
+    return a == b
+
+
+@pytest.mark.parametrize(
+    ("change", "offset_s", "spoilt"),
+    [
+        ({}, 0.0, False),
+        ({}, 0.0123, True),
+        ({"covariance_period": 3}, 0.0, True),
+        ({"aids": (*AIDS, PositionFixAid())}, 0.0, False),
+        ({"aids": AIDS[:2]}, 0.0, True),
+        ({"aids": ()}, 0.0, False),
+        ({"false_rejection": 0.0}, 0.0, False),
+    ],
+)
+def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
+    config = dataclasses.replace(InsConfig(CONSUMER, AIDS), **change)
+    if "aids" in change:
+        config = dataclasses.replace(config, alignment_aids=tuple(a for a in AIDS if a not in change["aids"]))
+    times = np.arange(0.1, DURATION - 1, 0.1).tolist()
+    results = []
+    for one_by_one, block_s in ((True, 1.0), (False, 1.0), (False, 7.3)):
+        increments, samples = sound(offset_s)
+        if spoilt:
+            samples = rough(increments, samples)
+        truth = flight(DURATION)
+        samples += [
+            PositionSample(t, t, truth.lat[k], truth.lon[k], truth.h[k])
+            for k, t in ((k, k * DT) for k in range(round(20 / DT), round(60 / DT), round(1 / DT)))
+        ]
+        results.append(run(one_by_one, config, increments, samples, block_s, times))
+    (reports, estimates, ins), *others = results
+    assert ins.aligned
+    assert len({report.outcome for report in reports}) >= (4 if spoilt else min(1, len(config.aids)))
+    for some, told, other in others:
+        assert len(some) == len(reports)
+        assert all(map(same, reports, some))
+        assert all(map(same, estimates, told))
+        assert np.array_equal(ins._state.whole, other._state.whole)
+        assert same(ins._monitor, other._monitor)
+
+
+def test_most_of_a_sound_flight_is_taken_at_once():
+    increments, samples = sound()
+    ins = Ins(InsConfig(CONSUMER, AIDS), lambda lat, lon, h: FIELD_N)
+    horizon, updates, steps = FusionHorizon(ins, lag_s=0.1), [], []
+    update, take = ins.update, ins.take
+    ins.update = lambda sample: updates.append(sample) or update(sample)
+
+    def counted(given, *rest):
+        steps.append(take(given, *rest))
+        return steps[-1]
+
+    ins.take = counted
+    cut = round(30 / DT)
+    for rows in (slice(0, cut), slice(cut, None)):
+        block = ImuSamples(*(getattr(increments, name)[rows] for name in ("t", "dt", "dtheta", "dv")))
+        horizon.push(block, [s for s in samples if block.t[0] - DT < s.t <= block.t[-1]])
+        updates_of_block = len(updates)
+        updates.clear()
+    assert sum(steps) > 0.9 * len([s for s in samples if s.t > 30])
+    assert updates_of_block < 0.1 * len(samples)
