@@ -160,7 +160,8 @@ def covariances(P: Array, along: Iterable[Step]) -> Iterator[Array]:
         diagonal += 0.5 * variance
         moved = Phi @ P
         P[moving:, moving:] *= np.outer(decay[moving:], decay[moving:])
-        P[:moving, :moving] = moved @ Phi.T
+        block = moved @ Phi.T
+        P[:moving, :moving] = 0.5 * (block + block.T)  # nothing observes what is not symmetric: it would grow for hours
         P[:moving, moving:] = moved[:, moving:] * decay[moving:]
         P[moving:, :moving] = P[:moving, moving:].T
         diagonal += 0.5 * variance

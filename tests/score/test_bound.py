@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -62,6 +63,16 @@ def test_it_is_the_covariance_of_a_kalman_filter_and_the_inverse_of_tichavskys_i
         J = D22 - D12.T @ np.linalg.inv(J + D11) @ D12
         np.testing.assert_allclose(got, P, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(got, np.linalg.inv(J), rtol=1e-6, atol=1e-8)
+
+
+def test_it_stays_a_covariance_for_hours_with_a_mode_that_grows() -> None:
+    rng = np.random.default_rng(6)
+    axes = np.linalg.qr(rng.normal(size=(9, 9)))[0]
+    Phi = np.hstack([axes @ np.diag(np.linspace(1.0, 1.01, 9)) @ axes.T, np.zeros((9, 3))])
+    step = Phi, np.ones(12), np.full(12, 1e-6), rng.normal(size=(5, 12))
+    *_, P = (P.copy() for P in bound.covariances(np.eye(12), itertools.repeat(step, 10_000)))
+    np.testing.assert_array_equal(P, P.T)
+    assert np.linalg.eigvalsh(P)[0] > 0
 
 
 # --- the model, by finite differences of motion and measurements
