@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import mmap
 import multiprocessing
 import os
 import signal
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from testbed.motion.table import MotionSource, TruthBlock
+import numpy as np
 
-PIPE_BYTES = (
-    1 << 20
-)  # the most that Linux gives anybody: three blocks of 1000 rows, so that neither side waits for the other
+from testbed.motion.table import COLUMNS, MotionSource, TruthBlock
+
+SLOTS = 3  # blocks flown ahead, so that neither side waits for the other
+ROW = sum(column.width for column in COLUMNS.values())  # numbers
 
 
 class Ahead:
@@ -30,12 +33,11 @@ class Ahead:
         self._block = TruthBlock.empty(0, 0)
         self._used = 0
         self._ended = False
-        import fcntl  # of Linux, as is the rest
-
+        self._shared = _Shared(chunk)
         context = multiprocessing.get_context("fork")
-        self._blocks, theirs = context.Pipe(duplex=False)
-        fcntl.fcntl(theirs.fileno(), fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        self._process = context.Process(target=_fly, args=(make, chunk, ticks, theirs, self._blocks), daemon=True)
+        self._blocks, theirs = context.Pipe()
+        flight = (make, self._shared, ticks, theirs, self._blocks)
+        self._process = context.Process(target=_fly, args=flight, daemon=True)
         with warnings.catch_warnings():
             # Python warns of forks beside other threads, whose locks the child might wait for: this one takes none.
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -68,27 +70,61 @@ class Ahead:
     def _receive(self) -> None:
         try:
             received = self._blocks.recv()
-        except EOFError:
+        except (EOFError, ConnectionResetError):
             raise RuntimeError("the process that flies has died") from None
         if isinstance(received, Exception):
             raise received
-        self._block, self._activity, self.failure = received
+        number, tick, rows, self._activity, self.failure = received
+        self._block = self._shared.take(number, tick, rows)
+        with suppress(OSError):  # it has sent its last
+            self._blocks.send_bytes(b"taken")
         self._used = 0
-        self._ended = len(self._block) == 0
+        self._ended = rows == 0
 
 
-def _fly(make: Callable[[], MotionSource], chunk: int, ticks: int, blocks: Connection, other_end: Connection) -> None:
-    """Send (block, activity, failure) until an empty block has been sent, or an exception, or nobody listens."""
+class _Shared:
+    """Memory for `SLOTS` blocks of up to ``chunk`` rows, which a process shares with those that it forks."""
+
+    def __init__(self, chunk: int) -> None:
+        self.chunk = chunk
+        self._slots = np.frombuffer(mmap.mmap(-1, SLOTS * chunk * ROW * 8)).reshape(SLOTS, chunk * ROW)
+
+    def put(self, number: int, block: TruthBlock) -> None:
+        """Write the block of this number, column after column."""
+        columns = [getattr(block, name).reshape(-1) for name in COLUMNS]
+        np.concatenate(columns, out=self._slots[number % SLOTS, : ROW * len(block)])
+
+    def take(self, number: int, tick: int, rows: int) -> TruthBlock:
+        """The block of this number, whose first row is ``tick``, as a copy."""
+        flat, columns, at = self._slots[number % SLOTS, : ROW * rows].copy(), {}, 0
+        for name, column in COLUMNS.items():
+            values = flat[at : at + rows * column.width]
+            columns[name] = values if column.width == 1 else values.reshape(rows, column.width)
+            at += len(values)
+        return TruthBlock(tick, **columns)
+
+
+def _fly(
+    make: Callable[[], MotionSource], shared: _Shared, ticks: int, blocks: Connection, other_end: Connection
+) -> None:
+    """Share blocks and send (number, tick, rows, activity, failure) of each, until one is empty or nobody listens.
+
+    Or an exception in place of that. The last blocks but `SLOTS` have been taken when the next is written.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # who asked for the motion decides what an interrupt means
     other_end.close()
     try:
-        source, rows = make(), 1
+        source, rows, number = make(), 1, 0
         while rows:
-            block = source.advance(min(chunk, ticks))
+            block = source.advance(min(shared.chunk, ticks))
             rows = len(block)
             ticks -= rows
-            blocks.send((block, source.activity(), source.failure))
-    except BrokenPipeError:
+            if number >= SLOTS:
+                blocks.recv_bytes()
+            shared.put(number, block)
+            blocks.send((number, block.tick, rows, source.activity(), source.failure))
+            number += 1
+    except (BrokenPipeError, ConnectionResetError, EOFError):
         pass
     except Exception as error:
         error.add_note(traceback.format_exc())
