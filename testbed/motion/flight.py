@@ -182,8 +182,8 @@ class Flight:
 
     def true_feedback(self) -> Feedback:
         """The true state at the newest row."""
-        lat, lon, h, *v, roll, pitch, heading, p, q, r, w_north, w_east, w_down = self._row[:15]
-        north, east, down = (FOOT * component for component in v)
+        lat, lon, h, north, east, down, roll, pitch, heading, p, q, r, w_north, w_east, w_down = self._row[:15]
+        north, east, down = FOOT * north, FOOT * east, FOOT * down
         airspeed = math.dist((north, east, down), (FOOT * w_north, FOOT * w_east, FOOT * w_down))
         return Feedback(lat, lon, FOOT * h, north, east, down, roll, pitch, heading, p, q, r, airspeed)
 

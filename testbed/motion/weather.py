@@ -26,7 +26,8 @@ class Weather:
 
     Velocity = base wind, or that it becomes by a front, times the boundary layer's factor; plus random walk and
     Gauss-Markov part; plus gradient times distance; plus updrafts. What is drawn depends on seed and step alone.
-    Raises UserError where the file of a table can't be read.
+    ``changes`` says whether it may ever be another than at the start. Raises UserError where the file of a table can't
+    be read.
     """
 
     def __init__(self, wind: Wind, start: Start, seed: int, period_s: float) -> None:
@@ -40,12 +41,7 @@ class Weather:
         updrafts = wind.updrafts
         self._updrafts = UpdraftField(updrafts.w_star_mps, updrafts.depth_m, seed) if updrafts else None
         self._steps = 0
-
-    @property
-    def changes(self) -> bool:
-        """Whether the velocity may ever be another than at the start."""
-        air = not self._wind.one or self._drawn or self._updrafts is not None or self._gradient.any()
-        return bool(air) or self._asked is not None
+        self.changes = not wind.one or bool(self._drawn) or updrafts is not None or bool(self._gradient.any())
 
     def start(self) -> tuple[float, float]:
         """Horizontal velocity [m/s] at the start, which is no step yet."""
@@ -68,7 +64,7 @@ class Weather:
 
     def blow(self, from_deg: float, speed_mps: float) -> None:
         """Let the base wind, where there is one, become this with a time constant of `WIND_CHANGE_S`."""
-        self._asked = blowing(from_deg, speed_mps)
+        self._asked, self.changes = blowing(from_deg, speed_mps), True
 
     def _horizontal(self, t: float, h: float, north: float, east: float) -> tuple[float, float]:
         """Velocity north, east at a time [s], a height [m], and metres north and east of the start."""

@@ -96,6 +96,15 @@ def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:
     return list(children["innovations"].children) if "innovations" in children else []
 
 
+def alignment(dataset: xarray.DataTree, estimator: str) -> tuple[Array, float | None]:
+    """Times (N,) [s] of the estimates of which the truth is known, and the first at which it was aligned, if any."""
+    own = f"estimators/{estimator}"
+    rows, _ = _common(column(dataset, f"{own}/time"), column(dataset, "truth/time"))
+    t, status = column(dataset, f"{own}/time")[rows], column(dataset, f"{own}/status")[rows]
+    aligned = (status & Status.ALIGNED) != 0
+    return t, float(t[np.argmax(aligned)]) if aligned.any() else None
+
+
 def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLING_S) -> Errors:
     """Errors of one estimator of a recorded run."""
     own = f"estimators/{estimator}"
@@ -107,7 +116,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     def true(name: str) -> Array:
         return np.asarray(column(dataset, f"truth/{name}")[at], np.float64)
 
-    t = estimated("time")
+    t, aligned_s = alignment(dataset, estimator)
     position = earth.position_difference_n(
         estimated("lat"), estimated("lon"), estimated("h"), true("lat"), true("lon"), true("h")
     )
@@ -123,7 +132,6 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     status = column(dataset, f"{own}/status")[rows]
     aligned = (status & Status.ALIGNED) != 0
     attitude_only = bool(np.any(aligned & ((status & Status.ATTITUDE_ONLY) != 0)))
-    aligned_s = float(t[np.argmax(aligned)]) if aligned.any() else None
     judged = slice(6 if attitude_only else 0, 9)
     said = np.column_stack([estimated(name) for name in ("lat", "lon", "h", "v_n", "q_nb")])
     finite = np.isfinite(said[:, 6 if attitude_only else 0 :]).all(axis=1)

@@ -66,6 +66,7 @@ from testbed.score.accuracy import (
     Mask,
     Window,
     aids,
+    alignment,
     column,
     errors,
     euler,
@@ -148,13 +149,13 @@ def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[s
     """What is missing among the metrics, and why: a sentence each."""
     told = left_out(dataset)
     for name in names(dataset):
-        e = errors(dataset, name, settling_s)
-        if e.aligned_s is None:
+        t, aligned_s = alignment(dataset, name)
+        if aligned_s is None:
             told.append(f"{name}: its errors are not scored: it was never aligned (its status never said ALIGNED)")
-        elif e.t[-1] < e.aligned_s + settling_s:
+        elif t[-1] < aligned_s + settling_s:
             told.append(
                 f"{name}: its errors are not scored: they count from {settling_s:g} s after its alignment, "
-                f"{e.aligned_s + settling_s:.1f} s, and the run ends at {e.t[-1]:.1f} s"
+                f"{aligned_s + settling_s:.1f} s, and the run ends at {t[-1]:.1f} s"
             )
     return told
 
