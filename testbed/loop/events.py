@@ -69,6 +69,8 @@ class EventWatch:
 
     def report(self, estimator: str, report: UpdateReport) -> None:
         """An unsound sample is an event; the gate turns a sound one away now and then, so only a run of those is."""
+        if report.weight > 0.0 and not self.refusals:
+            return  # as most are: nothing ends by it
         what = report.aid if report.aid.startswith(report.sensor) else f"{report.aid} of {report.sensor}"
         key = (estimator, what)
         if report.weight > 0.0:

@@ -207,6 +207,7 @@ class _Passage:
         self.told = Listeners(setup.links, setup.progress, scenario.duration_s, self.recorder.event)
         self.recorder.attributes |= self.feed.origin
         self.watch = EventWatch.of(self.told.emit, self.feed.faults.truth, scenario)
+        self.leg_names = scenario.leg_names
         plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)
         director.begin(Executor(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
         self.latest = _Latest()
@@ -305,7 +306,7 @@ class _Passage:
         for sample in self.arrived:
             self.watch.sample(sample)
         self.arrived.clear()
-        self.watch.row(t, leg, self.scenario.leg_names)
+        self.watch.row(t, leg, self.leg_names)
         for name, estimate in now:
             self.watch.estimate(name, estimate)
             for report in self.backlog[name].read_until(t):

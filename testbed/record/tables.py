@@ -123,7 +123,7 @@ class Table:
 
 
 def _scalars(objects: Sequence[Any], name: str, dtype: str = "<f8") -> Data:
-    return np.array(list(map(attrgetter(name), objects)), dtype)
+    return np.fromiter(map(attrgetter(name), objects), dtype, len(objects))
 
 
 def _vectors(objects: Sequence[Any], name: str) -> Data:
@@ -174,7 +174,8 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     """What became of the samples of one aid."""
     block: Block = {"sample_time": _scalars(reports, "t")}
     variables = dict(REPORT)
-    sizes = {len(r.innovation) for r in reports}
+    innovations = list(map(attrgetter("innovation"), reports))
+    sizes = set(map(len, innovations))
     m = max(sizes)
     if m:
         unit, dims = AIDS.get(aid, ("unknown", ("component",)))
@@ -183,7 +184,7 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
             f"({unit})^2", "innovation covariance before the update", ("component", "component_column")
         )
         if sizes == {m}:
-            block["innovation"], block["S"] = _vectors(reports, "innovation"), _vectors(reports, "S")
+            block["innovation"], block["S"] = _joined(innovations), _vectors(reports, "S")
         else:  # broken samples are refused before an innovation is formed
             block["innovation"] = np.full((len(reports), m), np.nan)
             block["S"] = np.full((len(reports), m, m), np.nan)
@@ -193,9 +194,9 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     for name in ("nis", "threshold", "weight"):
         block[name] = _scalars(reports, name)
     block["outcome"] = _scalars(reports, "outcome", REPORT["outcome"].dtype)
-    sensors = {r.sensor for r in reports}
-    names = sensors if len(sensors) == 1 else [r.sensor for r in reports]
-    block["sensor"] = np.resize(_text(list(names), REPORT["sensor"].dtype), len(reports))
+    sensors = list(map(attrgetter("sensor"), reports))
+    names = set(sensors)
+    block["sensor"] = np.resize(_text([*names] if len(names) == 1 else sensors, REPORT["sensor"].dtype), len(reports))
     block["reason"] = _text(list(map(attrgetter("reason"), reports)), REPORT["reason"].dtype)
     return block, variables
 

@@ -125,8 +125,8 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator])
     if arm_b.any():
         lying = np.where(np.isfinite(true("q_nb")), true("q_nb"), estimated("q_nb"))  # as near as anybody knows
-        position -= _rotate(lying, np.broadcast_to(arm_b, position.shape))
-        velocity -= _rotate(lying, np.cross(true("omega_b"), arm_b))
+        position -= rotated(lying, np.broadcast_to(arm_b, position.shape))
+        velocity -= rotated(lying, np.cross(true("omega_b"), arm_b))
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
     status = column(dataset, f"{own}/status")[rows]
@@ -169,7 +169,7 @@ def _common(t: Array, t_true: Array) -> tuple[npt.NDArray[np.intp], npt.NDArray[
     return rows, at[rows]
 
 
-def _rotate(q: Array, v: Array) -> Array:
+def rotated(q: Array, v: Array) -> Array:
     """Vectors (N, 3) in the axes that quaternions (N, 4) take them to."""
     twice = 2 * np.cross(q[:, 1:], v)
     turned: Array = v + q[:, :1] * twice + np.cross(q[:, 1:], twice)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nav.samples import Array
-from testbed.score.accuracy import column
+from testbed.score.accuracy import column, rotated
 
 if TYPE_CHECKING:
     import xarray
@@ -52,8 +52,6 @@ class Way:
 
 def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
     """The true way of a recorded run in steps of about ``step_s``, at least a row of truth each."""
-    from scipy.ndimage import uniform_filter1d  # as long to load as the rest of the scores, for runs with an outage
-    from scipy.spatial.transform import Rotation
 
     def true(name: str) -> Array:
         return np.asarray(column(dataset, f"truth/{name}"), float)
@@ -64,7 +62,8 @@ def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
     steps = (len(t) - 1) // every
     ends = every * np.arange(1, steps + 1)
     rows = slice(1, every * steps + 1)
-    C_nb = Rotation.from_quat(np.roll(true("q_nb"), -1, axis=-1)).as_matrix()  # the scalar last
+    q_nb = true("q_nb")
+    C_nb = np.stack([rotated(q_nb, np.broadcast_to(axis, (len(t), 3))) for axis in np.eye(3)], axis=-1)
     C_ns = (0.5 * (C_nb[1:] + C_nb[:-1]) @ C_sb.T)[: rows.stop - 1]
     dt, dtheta_s, dv_s = np.diff(t)[: rows.stop - 1], true("dtheta")[rows] @ C_sb.T, true("dv")[rows] @ C_sb.T
     starts = every * np.arange(steps)
@@ -73,7 +72,7 @@ def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
         return np.add.reduceat(values, starts, axis=0)
 
     wind_n, airspeed, warmer = true("wind_n"), true("airspeed"), true("temperature") - true("temperature")[0]
-    mean_wind_n = uniform_filter1d(wind_n, max(1, round(MEAN_WIND_S / row_s)), axis=0, mode="nearest")
+    mean_wind_n = _running_mean(wind_n, max(1, round(MEAN_WIND_S / row_s)))
     return Way(
         t=t[ends], T=summed(dt), turned=summed(C_ns * dt[:, None, None]),
         turned_rate=summed(C_ns[:, :, :, None] * dtheta_s[:, None, None, :]),
@@ -85,3 +84,12 @@ def way(dataset: xarray.DataTree, C_sb: Array, step_s: float) -> Way:
         current=true("current")[ends], temperature=0.5 * (warmer[starts] + warmer[ends]),
         airspeed=airspeed[ends], slip=airspeed * np.sin(true("beta")), row_s=row_s,
     )  # fmt: skip
+
+
+def _running_mean(values: Array, n: int) -> Array:
+    """Of ``n`` rows about each row; the first and the last stand for what would be beyond them."""
+    padded = np.pad(values, ((n // 2 + 1, (n - 1) // 2), (0, 0)), mode="edge")
+    padded[0] = 0.0
+    sums = np.cumsum(padded, axis=0)
+    mean: Array = (sums[n:] - sums[:-n]) / n
+    return mean
