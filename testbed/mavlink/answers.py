@@ -205,8 +205,8 @@ class Answers:
     def frame(self, stream: Stream) -> bytes | None:
         """The newest of a stream; None when there is nothing to say."""
         with np.errstate(all="ignore"):  # an estimate may be anything; the encoder copes
-            fields = stream.fields(self.snapshot) if self.snapshot else None
-        return self.encoder.frame(stream.message, fields) if fields else None
+            payload = stream.payload(self.snapshot) if self.snapshot else None
+        return self.encoder.wrap(stream.message, payload) if payload else None
 
     def _say(self, talk: Talk, name: str, fields: Fields) -> None:
         talk.due.append(self.encoder.frame(name, fields))

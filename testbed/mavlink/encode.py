@@ -13,14 +13,18 @@ import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from operator import itemgetter
 from typing import Any, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as dialect  # type: ignore[import-untyped]
 
+from nav.samples import Array
 from testbed.mavlink.signing import SIGNED, Signing
 
-Value: TypeAlias = float | bytes | Sequence[float]
+Value: TypeAlias = float | bytes | Sequence[float] | Array
 Fields: TypeAlias = Mapping[str, Value]
 
 _MARKER = bytes([dialect.PROTOCOL_MARKER_V2])
@@ -37,6 +41,18 @@ _RANGE: dict[str, tuple[float, float]] = {
     "uint64_t": (0, 2**64 - 1),
     "int64_t": (-(2**63), 2**63 - 1),
     "float": (-_FLOAT_MAX, _FLOAT_MAX),
+}
+_TYPES = {
+    "uint8_t": "u1",
+    "int8_t": "i1",
+    "uint16_t": "<u2",
+    "int16_t": "<i2",
+    "uint32_t": "<u4",
+    "int32_t": "<i4",
+    "uint64_t": "<u8",
+    "int64_t": "<i8",
+    "float": "<f4",
+    "double": "<f8",
 }
 # What an integer field says when its number is NaN; 0 where the message defines nothing. Floats carry NaN themselves.
 _UNKNOWN: dict[tuple[str, str], int] = {
@@ -84,6 +100,16 @@ def longitude_e7(lon: float) -> float:
     return math.degrees(math.remainder(lon, 2 * math.pi)) * 1e7 if math.isfinite(lon) else math.nan
 
 
+def latitudes_e7(lat: Array) -> Array:
+    """`latitude_e7` of many."""
+    return np.clip(np.degrees(lat) * 1e7, -90e7, 90e7)
+
+
+def longitudes_e7(lon: Array) -> Array:
+    """`longitude_e7` of many."""
+    return np.degrees(lon - 2 * math.pi * np.rint(lon / (2 * math.pi))) * 1e7
+
+
 @dataclass(frozen=True, slots=True)
 class _Number:
     """One number (or text, without limits) on the wire."""
@@ -102,8 +128,24 @@ class _Number:
         bounded = max(low, min(high, value))
         return round(bounded) if self.is_integer else bounded
 
+    def fill(self, column: NDArray[Any], values: Any) -> None:
+        """Put values into a column of their type, each as `saturate` has it."""
+        if self.limits is None:
+            column[...] = values
+            return
+        kept = np.rint(values) if self.is_integer else np.asarray(values, float)
+        low, high = self.limits
+        fits = (low <= kept) & (kept <= min(high, 2.0**62))  # a float does not hold the last of 64 bits
+        if not self.is_integer:
+            fits |= ~np.isfinite(kept)
+        if fits.all():
+            column[...] = kept
+        else:
+            slow = [self.saturate(value) for value in np.broadcast_to(kept, column.shape).ravel().tolist()]
+            column[...] = np.array(slow, column.dtype).reshape(column.shape)
 
-class _Layout:
+
+class Layout:
     """How one message lies on the wire."""
 
     def __init__(self, name: str) -> None:
@@ -115,6 +157,7 @@ class _Layout:
         names = message.ordered_fieldnames
         self._values = itemgetter(*names) if len(names) > 1 else lambda fields: (fields[names[0]],)
         self._numbers: list[_Number] = []
+        self._columns: dict[str, _Number] = {}
         self._arrays: list[int] = []  # positions among the fields, the last first: each is replaced by its numbers
         for position, (field, length) in enumerate(zip(message.ordered_fieldnames, message.array_lengths, strict=True)):
             kind = types[field]
@@ -123,14 +166,21 @@ class _Layout:
                 is_integer=kind not in ("float", "char"),
                 unknown=_UNKNOWN.get((name, field), 0),
             )
+            self._columns[field] = number
             is_array = length > 0 and kind != "char"
             self._numbers += [number] * (length if is_array else 1)
             if is_array:
                 self._arrays.insert(0, position)
         self._integers = [i for i, number in enumerate(self._numbers) if number.is_integer]
+        self._row = np.dtype(
+            [
+                (field, f"S{n}" if types[field] == "char" else (_TYPES[types[field]], (n,) if n else ()))
+                for field, n in zip(names, message.array_lengths, strict=True)
+            ]
+        )
 
     def payload(self, fields: Fields) -> bytes:
-        """The fields as bytes, without the trailing zeros that MAVLink 2 leaves out."""
+        """The fields as bytes."""
         values: list[Any] = list(self._values(fields))
         for position in self._arrays:
             values[position : position + 1] = values[position]
@@ -140,7 +190,23 @@ class _Layout:
             packed = self._pack(*values)
         except (struct.error, OverflowError, ValueError):  # out of range or not a number: rare, so the slow way
             packed = self._pack(*[number.saturate(v) for v, number in zip(values, self._numbers, strict=True)])
-        return packed.rstrip(b"\0") or b"\0"
+        return bytes(packed)
+
+    def payloads(self, fields: Fields, count: int) -> NDArray[np.uint8]:
+        """What `payload` gives for each of ``count`` rows, (count, size).
+
+        A field is one value for all rows, or an array of them.
+        """
+        rows = np.zeros(count, self._row)
+        for field, number in self._columns.items():
+            number.fill(rows[field], fields[field])
+        return rows.view(np.uint8).reshape(count, -1)
+
+
+@cache
+def layout(message: str) -> Layout:
+    """How a message of that name lies on the wire."""
+    return Layout(message)
 
 
 class Encoder:
@@ -150,7 +216,6 @@ class Encoder:
         self.system = system
         self._component = component
         self._sequence = 0
-        self._layouts: dict[str, _Layout] = {}
 
     def frame(self, message: str, values: Fields) -> bytes:
         """One frame of ``message`` (its name in the dialect) with every field of it given, in the field's unit.
@@ -158,13 +223,15 @@ class Encoder:
         Numbers may be any float: integer fields are rounded and saturate, NaN becomes the field's unknown value;
         float fields keep NaN and infinities and saturate at the largest float32.
         """
-        layout = self._layouts.get(message)
-        if layout is None:
-            layout = self._layouts[message] = _Layout(message)
-        payload = layout.payload(values)
-        said = _HEADER.pack(len(payload), 0, 0, self._sequence, self.system, self._component) + layout.id + payload
+        return self.wrap(message, layout(message).payload(values))
+
+    def wrap(self, message: str, payload: bytes) -> bytes:
+        """One frame of a ``message`` whose fields are bytes already; the zeros at their end are left out."""
+        own = layout(message)
+        payload = payload.rstrip(b"\0") or b"\0"
+        said = _HEADER.pack(len(payload), 0, 0, self._sequence, self.system, self._component) + own.id + payload
         self._sequence = (self._sequence + 1) % 256
-        return _MARKER + said + _checksum(said + layout.crc_extra)
+        return _MARKER + said + _checksum(said + own.crc_extra)
 
 
 _CRC_EXTRA = {

@@ -9,12 +9,11 @@ from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from nav.earth import SEA_LEVEL_DENSITY, STANDARD_GRAVITY, pressure_altitude
 from nav.rotation import dcm_from_quat, skew
-from nav.samples import Status
-from testbed.mavlink.encode import Fields, centidegrees, latitude_e7, longitude_e7
-from testbed.mavlink.snapshot import ATTITUDE, POSITION, VELOCITY, Snapshot, floats, known_euler, known_point, root
+from nav.samples import Array, Status
+from testbed.mavlink.encode import Fields, latitudes_e7, longitudes_e7
+from testbed.mavlink.snapshot import ATTITUDE, POSITION, VELOCITY, Rows, Snapshot, root
 
 TERRAIN_UNKNOWN = -10000.0  # ALTITUDE: below -1000 means unknown
-NO_OFFSET = [0.0, 0.0, 0.0, 0.0]  # ATTITUDE_QUATERNION: no other attitude for display
 _UPPER = np.flatnonzero(np.triu(np.ones((6, 6))))  # upper right triangle of 6 x 6, row by row
 _RATES = [21, 28, 35]  # the last three of its diagonal
 
@@ -22,86 +21,69 @@ _RATES = [21, 28, 35]  # the last three of its diagonal
 # The estimate
 
 
-def attitude(s: Snapshot) -> Fields | None:
+def attitude(r: Rows) -> Fields:
     """Estimated attitude and angular rate."""
-    if s.euler is None:
-        return None
-    roll, pitch, yaw = s.euler
-    p, q, r = s.rates
     return {
-        "time_boot_ms": s.boot_ms,
-        "roll": roll,
-        "pitch": pitch,
-        "yaw": yaw,
-        "rollspeed": p,
-        "pitchspeed": q,
-        "yawspeed": r,
+        "time_boot_ms": r.boot_ms,
+        "roll": r.euler[:, 0],
+        "pitch": r.euler[:, 1],
+        "yaw": r.euler[:, 2],
+        **_rates(r.rates),
     }
 
 
-def attitude_quaternion(s: Snapshot) -> Fields | None:
+def attitude_quaternion(r: Rows) -> Fields:
     """Estimated attitude and angular rate."""
-    if s.euler is None:
-        return None
-    w, x, y, z = floats(s.estimate.q_nb)
-    p, q, r = s.rates
+    w, x, y, z = r.q_nb.T
+    no_offset = np.zeros((len(r), 4))  # no other attitude for display
     return {
-        "time_boot_ms": s.boot_ms,
+        "time_boot_ms": r.boot_ms,
         "q1": w,
         "q2": x,
         "q3": y,
         "q4": z,
-        "rollspeed": p,
-        "pitchspeed": q,
-        "yawspeed": r,
-        "repr_offset_q": NO_OFFSET,
+        **_rates(r.rates),
+        "repr_offset_q": no_offset,
     }
 
 
-def global_position_int(s: Snapshot) -> Fields | None:
+def _rates(rates: Array) -> dict[str, Array]:
+    return {"rollspeed": rates[:, 0], "pitchspeed": rates[:, 1], "yawspeed": rates[:, 2]}
+
+
+def global_position_int(r: Rows) -> Fields:
     """Estimated position, velocity and heading."""
-    if s.point is None or s.local_n is None:
-        return None
-    lat, lon, h = s.point
+    lat, lon, h = r.point.T
+    north, east, down = r.v_n.T
     return {
-        "time_boot_ms": s.boot_ms,
-        "lat": latitude_e7(lat),
-        "lon": longitude_e7(lon),
+        "time_boot_ms": r.boot_ms,
+        "lat": latitudes_e7(lat),
+        "lon": longitudes_e7(lon),
         "alt": h * 1e3,
-        "relative_alt": -s.local_n[2] * 1e3,
-        "vx": s.v_n[0] * 100,
-        "vy": s.v_n[1] * 100,
-        "vz": s.v_n[2] * 100,
-        "hdg": centidegrees(s.euler[2]) if s.euler else math.nan,
+        "relative_alt": -r.local_n[:, 2] * 1e3,
+        "vx": north * 100,
+        "vy": east * 100,
+        "vz": down * 100,
+        "hdg": np.rint(np.degrees(r.euler[:, 2]) * 100) % 36000,
     }
 
 
-def local_position_ned(s: Snapshot) -> Fields | None:
+def local_position_ned(r: Rows) -> Fields:
     """Estimated position from home, and velocity."""
-    if s.local_n is None:
-        return None
-    return {
-        "time_boot_ms": s.boot_ms,
-        "x": s.local_n[0],
-        "y": s.local_n[1],
-        "z": s.local_n[2],
-        "vx": s.v_n[0],
-        "vy": s.v_n[1],
-        "vz": s.v_n[2],
-    }
+    x, y, z = r.local_n.T
+    vx, vy, vz = r.v_n.T
+    return {"time_boot_ms": r.boot_ms, "x": x, "y": y, "z": z, "vx": vx, "vy": vy, "vz": vz}
 
 
-def vfr_hud(s: Snapshot) -> Fields | None:
+def vfr_hud(r: Rows) -> Fields:
     """What a pilot looks at; airspeed is the equivalent airspeed measured, throttle what is commanded."""
-    if s.point is None or s.euler is None:
-        return None
     return {
-        "airspeed": s.eas,
-        "groundspeed": s.groundspeed,
-        "heading": round(math.degrees(s.euler[2])) % 360,
-        "throttle": 100 * float(s.truth.controls[0, 3]),
-        "alt": s.point[2],
-        "climb": -s.v_n[2],
+        "airspeed": r.eas,
+        "groundspeed": np.hypot(r.v_n[:, 0], r.v_n[:, 1]),
+        "heading": np.rint(np.degrees(r.euler[:, 2])) % 360,
+        "throttle": 100 * r.truth("controls")[:, 3],
+        "alt": r.point[:, 2],
+        "climb": -r.v_n[:, 2],
     }
 
 
@@ -138,45 +120,40 @@ def wind_cov(s: Snapshot) -> Fields | None:
     }
 
 
-def odometry(s: Snapshot) -> Fields | None:
+def odometry(r: Rows) -> Fields:
     """Pose in local NED; velocity, rates and their covariance in body axes, as REP 147 has it.
 
     Rotation uncertainty is about the fixed axes n. An attitude estimate is off by the rotation -phi, so its cross terms
     change sign. Velocity: v_b = C_nb' v_n gives dv_b = C_nb' (dv_n - v_n x phi).
     """
-    if s.local_n is None or s.euler is None:
-        return None
-    P = s.estimate.covariance
-    C_bn = dcm_from_quat(s.estimate.q_nb).T
-    x, y, z = s.local_n
-    vx, vy, vz = floats(C_bn @ s.estimate.v_n)
-    p, q, r = s.rates
-    pose = np.empty((6, 6))
-    pose[:3, :3] = P[POSITION, POSITION]
-    pose[:3, 3:] = -P[POSITION, ATTITUDE]
-    pose[3:, 3:] = P[ATTITUDE, ATTITUDE]
-    J = np.empty((3, 6))
-    J[:, :3] = C_bn
-    J[:, 3:] = -C_bn @ skew(s.estimate.v_n)
-    velocity = np.zeros((6, 6))
-    velocity[:3, :3] = J @ P[VELOCITY.start :, VELOCITY.start :] @ J.T
-    velocity.flat[_RATES] = s.estimate.sigma_gyro_bias * s.estimate.sigma_gyro_bias
+    P = r.covariance
+    C_bn = np.array([dcm_from_quat(q).T for q in r.q_nb])
+    pose = np.empty((len(r), 6, 6))
+    pose[:, :3, :3] = P[:, POSITION, POSITION]
+    pose[:, :3, 3:] = -P[:, POSITION, ATTITUDE]
+    pose[:, 3:, 3:] = P[:, ATTITUDE, ATTITUDE]
+    J = np.empty((len(r), 3, 6))
+    J[:, :, :3] = C_bn
+    J[:, :, 3:] = -C_bn @ np.array([skew(v) for v in r.v_n])
+    velocity = np.zeros((len(r), 6, 6))
+    velocity[:, :3, :3] = J @ P[:, VELOCITY.start :, VELOCITY.start :] @ J.transpose(0, 2, 1)
+    velocity.reshape(-1, 36)[:, _RATES] = r.gyro_bias_variance
+    x, y, z = r.local_n.T
+    vx, vy, vz = (C_bn @ r.v_n[:, :, None])[:, :, 0].T
     return {
-        "time_usec": s.usec,
+        "time_usec": r.usec,
         "frame_id": mav.MAV_FRAME_LOCAL_NED,
         "child_frame_id": mav.MAV_FRAME_BODY_FRD,
         "x": x,
         "y": y,
         "z": z,
-        "q": floats(s.estimate.q_nb),
+        "q": r.q_nb,
         "vx": vx,
         "vy": vy,
         "vz": vz,
-        "rollspeed": p,
-        "pitchspeed": q,
-        "yawspeed": r,
-        "pose_covariance": floats(pose.take(_UPPER)),
-        "velocity_covariance": floats(velocity.take(_UPPER)),
+        **_rates(r.rates),
+        "pose_covariance": pose.reshape(-1, 36)[:, _UPPER],
+        "velocity_covariance": velocity.reshape(-1, 36)[:, _UPPER],
         "reset_counter": 0,
         "estimator_type": mav.MAV_ESTIMATOR_TYPE_AUTOPILOT,
         "quality": 0,  # unset
@@ -240,112 +217,93 @@ def ekf_status_report(s: Snapshot) -> Fields:
 # The truth
 
 
-def hil_state_quaternion(s: Snapshot) -> Fields:
+def hil_state_quaternion(r: Rows) -> Fields:
     """Truth, in the message that clients read as ground truth; accelerations are specific force."""
-    p, q, r = floats(s.truth.omega_b[0])
-    lat, lon, h = s.true_point
-    north, east, down = floats(s.truth.v_n[0])
-    tas = float(s.truth.airspeed[0])
-    xacc, yacc, zacc = s.specific_force
-    milli_g = 1e3 / STANDARD_GRAVITY
+    north, east, down = r.truth("v_n").T
+    tas = r.truth("airspeed")
+    xacc, yacc, zacc = r.specific_force.T * (1e3 / STANDARD_GRAVITY)  # thousandths of g
     return {
-        "time_usec": s.usec,
-        "attitude_quaternion": floats(s.truth.q_nb[0]),
-        "rollspeed": p,
-        "pitchspeed": q,
-        "yawspeed": r,
-        "lat": latitude_e7(lat),
-        "lon": longitude_e7(lon),
-        "alt": h * 1e3,
+        "time_usec": r.usec,
+        "attitude_quaternion": r.truth("q_nb"),
+        **_rates(r.truth("omega_b")),
+        "lat": latitudes_e7(r.truth("lat")),
+        "lon": longitudes_e7(r.truth("lon")),
+        "alt": r.truth("h") * 1e3,
         "vx": north * 100,
         "vy": east * 100,
         "vz": down * 100,
-        "ind_airspeed": 100 * tas * math.sqrt(max(0.0, float(s.truth.density[0])) / SEA_LEVEL_DENSITY),
+        "ind_airspeed": 100 * tas * np.sqrt(np.maximum(0.0, r.truth("density")) / SEA_LEVEL_DENSITY),
         "true_airspeed": 100 * tas,
-        "xacc": xacc * milli_g,
-        "yacc": yacc * milli_g,
-        "zacc": zacc * milli_g,
-    }
-
-
-def simstate(s: Snapshot) -> Fields:
-    """Truth, as MAVProxy draws it on the map."""
-    roll, pitch, yaw = s.true_euler
-    xacc, yacc, zacc = s.specific_force
-    xgyro, ygyro, zgyro = floats(s.truth.omega_b[0])
-    return {
-        "roll": roll,
-        "pitch": pitch,
-        "yaw": yaw,
         "xacc": xacc,
         "yacc": yacc,
         "zacc": zacc,
-        "xgyro": xgyro,
-        "ygyro": ygyro,
-        "zgyro": zgyro,
-        "lat": latitude_e7(s.true_point[0]),
-        "lng": longitude_e7(s.true_point[1]),
     }
 
 
-def sim_state(s: Snapshot) -> Fields:
-    """Truth, with more digits."""
-    w, x, y, z = floats(s.truth.q_nb[0])
-    north, east, down = floats(s.truth.v_n[0])
-    body = dict(simstate(s))
-    lat, lon = body.pop("lat"), body.pop("lng")
+def simstate(r: Rows) -> Fields:
+    """Truth, as MAVProxy draws it on the map."""
     return {
-        **body,
+        **_true_motion(r),
+        "lat": latitudes_e7(r.truth("lat")),
+        "lng": longitudes_e7(r.truth("lon")),
+    }
+
+
+def _true_motion(r: Rows) -> dict[str, Array]:
+    names = "roll", "pitch", "yaw", "xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro"
+    columns = (*r.true_euler.T, *r.specific_force.T, *r.truth("omega_b").T)
+    return dict(zip(names, columns, strict=True))
+
+
+def sim_state(r: Rows) -> Fields:
+    """Truth, with more digits."""
+    w, x, y, z = r.truth("q_nb").T
+    north, east, down = r.truth("v_n").T
+    lat, lon = r.truth("lat"), r.truth("lon")
+    return {
+        **_true_motion(r),
         "q1": w,
         "q2": x,
         "q3": y,
         "q4": z,
-        "lat": math.degrees(s.true_point[0]),
-        "lon": math.degrees(s.true_point[1]),
-        "alt": s.true_point[2],
+        "lat": np.degrees(lat),
+        "lon": np.degrees(lon),
+        "alt": r.truth("h"),
         "std_dev_horz": 0,
         "std_dev_vert": 0,
         "vn": north,
         "ve": east,
         "vd": down,
-        "lat_int": lat,
-        "lon_int": lon,
+        "lat_int": latitudes_e7(lat),
+        "lon_int": longitudes_e7(lon),
     }
 
 
-def error(name: str, s: Snapshot) -> Fields | None:
-    """NAMED_VALUE_FLOAT of one of `Snapshot.errors`; MAVLink allows names of ten characters."""
-    if name not in s.errors:
-        return None
-    return {"time_boot_ms": s.boot_ms, "name": name.encode(), "value": s.errors[name]}
+def error(name: str, r: Rows) -> Fields:
+    """NAMED_VALUE_FLOAT of one of `Rows.errors`; MAVLink allows names of ten characters."""
+    return {"time_boot_ms": r.boot_ms, "name": name.encode(), "value": r.errors[name]}
 
 
 # The other estimators
 
 
-def _other(s: Snapshot, index: int) -> dict[str, float] | None:
-    if index >= len(s.others):
-        return None
-    estimate = s.others[index][1]
-    point, euler = known_point(estimate), known_euler(estimate)
-    if point is None or euler is None:
-        return None
+def _other(pose: Array) -> dict[str, Array]:
+    roll, pitch, yaw, lat, lon, h = pose.T
     return {
-        "roll": euler[0],
-        "pitch": euler[1],
-        "yaw": euler[2],
-        "altitude": point[2],
-        "lat": latitude_e7(point[0]),
-        "lng": longitude_e7(point[1]),
+        "roll": roll,
+        "pitch": pitch,
+        "yaw": yaw,
+        "altitude": h,
+        "lat": latitudes_e7(lat),
+        "lng": longitudes_e7(lon),
     }
 
 
-def ahrs2(s: Snapshot) -> Fields | None:
+def ahrs2(r: Rows) -> Fields:
     """The second estimator, as MAVProxy draws it on the map."""
-    return _other(s, 0)
+    return _other(r.second)
 
 
-def ahrs3(s: Snapshot) -> Fields | None:
+def ahrs3(r: Rows) -> Fields:
     """The third estimator."""
-    fields = _other(s, 1)
-    return None if fields is None else {**fields, "v1": 0, "v2": 0, "v3": 0, "v4": 0}
+    return {**_other(r.third), "v1": 0, "v2": 0, "v3": 0, "v4": 0}

@@ -23,7 +23,6 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
-import struct
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -33,7 +32,6 @@ from typing import Protocol
 from testbed.errors import UserError
 
 CONNECT_TIMEOUT_S = 5.0
-_STAMP = struct.Struct(">Q")
 MOST_STATIONS = 16  # on one port; more are not let in
 FORGET_S = 30.0  # a station on udpin that is silent for longer has gone: they all send heartbeats
 BAUD = 57600
@@ -136,11 +134,10 @@ class TelemetryLog:
             reason = getattr(error, "strerror", None) or error
             raise UserError(f"{url}: the log can't be written there ({reason}); choose another path") from None
 
-    def send(self, time_us: int, frames: Sequence[bytes]) -> None:
-        """Append the frames. Raises UserError when the disk takes no more."""
-        stamp = _STAMP.pack(max(0, min(2**64 - 1, time_us)))
+    def write(self, data: bytes) -> None:
+        """Append stamps and frames. Raises UserError when the disk takes no more."""
         try:
-            self._file.write(b"".join([stamp + frame for frame in frames]))
+            self._file.write(data)
         except OSError as error:
             raise UserError(f"{self._url}: the log can't be written any further ({error.strerror})") from None
 

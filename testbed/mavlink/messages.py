@@ -1,4 +1,5 @@
-"""What each message on the vehicle and its sensors says: one function per message, from a snapshot to its fields.
+"""What each message on the vehicle and its sensors says: one function per message, from a snapshot to its fields;
+of those that go out often from `Rows`, to columns of them.
 
 A function returns None when what its message is about is not known; a single unknown number is NaN, and the encoder
 turns it into the field's own "unknown". Heights are above the WGS84 ellipsoid, also where MAVLink says mean sea level:
@@ -11,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from nav.earth import SEA_LEVEL_DENSITY, pressure_altitude
@@ -23,7 +25,7 @@ from nav.samples import (
 )
 from testbed.mavlink.encode import Fields, centidegrees, latitude_e7, longitude_e7, microseconds
 from testbed.mavlink.identity import Identity
-from testbed.mavlink.snapshot import Snapshot, floats, root
+from testbed.mavlink.snapshot import Rows, Snapshot, floats, root
 from testbed.motion.table import CLIMBING_OUT
 
 # The vehicle
@@ -74,7 +76,7 @@ def health(s: Snapshot) -> int:
     Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
     """
     bits = _ALWAYS
-    if all(map(math.isfinite, (*floats(s.gyro), *floats(s.accel)))):
+    if all(map(math.isfinite, s.gyro.tolist() + s.accel.tolist())):
         bits |= _INERTIAL
     if s.aligned:
         bits |= _ALIGNED
@@ -239,46 +241,35 @@ def gnss_integrity(s: Snapshot) -> Fields | None:
     }
 
 
-def _pressures(s: Snapshot) -> tuple[float, float]:
-    """Static and differential pressure [hPa]."""
-    return s.pressure / 100, 0.5 * SEA_LEVEL_DENSITY * s.eas * s.eas / 100
+_READINGS = (
+    *("xacc", "yacc", "zacc", "xgyro", "ygyro", "zgyro", "xmag", "ymag", "zmag"),
+    *("abs_pressure", "diff_pressure", "pressure_alt", "temperature"),
+)
 
 
-def highres_imu(s: Snapshot) -> Fields:
+def highres_imu(r: Rows) -> Fields:
     """Inertial, magnetic and pressure readings; the bits say which of them there are."""
-    sample = s.newest(MagnetometerSample)
-    static, differential = _pressures(s)
-    xacc, yacc, zacc = floats(s.accel)
-    xgyro, ygyro, zgyro = floats(s.gyro)
-    xmag, ymag, zmag = floats(sample.field_b * 1e4) if sample else (math.nan,) * 3
-    numbers = {
-        "xacc": xacc,
-        "yacc": yacc,
-        "zacc": zacc,
-        "xgyro": xgyro,
-        "ygyro": ygyro,
-        "zgyro": zgyro,
-        "xmag": xmag,
-        "ymag": ymag,
-        "zmag": zmag,
-        "abs_pressure": static,
-        "diff_pressure": differential,
-        "pressure_alt": pressure_altitude(s.pressure) if s.pressure > 0 else math.nan,
-        "temperature": math.nan,
-    }
-    updated = sum(1 << bit for bit, number in enumerate(numbers.values()) if number == number)
-    return {"time_usec": s.usec, **numbers, "fields_updated": updated, "id": 0}
+    columns = (
+        *r.accel.T,
+        *r.gyro.T,
+        *(r.field_b * 1e4).T,
+        r.pressure / 100,
+        0.5 * SEA_LEVEL_DENSITY * r.eas * r.eas / 100,
+        np.array([pressure_altitude(p) if p > 0 else math.nan for p in r.pressure.tolist()]),
+        np.full(len(r), math.nan),
+    )
+    updated = sum((column == column).astype(float) * 2**bit for bit, column in enumerate(columns))
+    return {"time_usec": r.usec, **dict(zip(_READINGS, columns, strict=True)), "fields_updated": updated, "id": 0}
 
 
 def scaled_pressure(s: Snapshot) -> Fields | None:
     """Static and differential pressure."""
-    static, differential = _pressures(s)
-    if static != static:
+    if s.pressure != s.pressure:
         return None
     return {
         "time_boot_ms": s.boot_ms,
-        "press_abs": static,
-        "press_diff": differential,
+        "press_abs": s.pressure / 100,
+        "press_diff": 0.5 * SEA_LEVEL_DENSITY * s.eas * s.eas / 100,
         "temperature": 0,
         "temperature_press_diff": 0,
     }

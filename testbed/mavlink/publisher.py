@@ -6,7 +6,7 @@ import contextlib
 import datetime
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -17,7 +17,8 @@ from testbed.loop.requests import Request
 from testbed.loop.settings import settings
 from testbed.mavlink import estimates, messages, mission
 from testbed.mavlink.answers import Answers, Talk, Vehicle
-from testbed.mavlink.encode import Encoder, microseconds
+from testbed.mavlink.encode import Fields, microseconds
+from testbed.mavlink.history import History
 from testbed.mavlink.identity import identity_of
 from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
 from testbed.mavlink.parameters import Parameters
@@ -79,12 +80,11 @@ class MavlinkPublisher:
         }
         self._streams = BESIDE_VEHICLES if vehicles else STREAMS
         self._schedule = Schedule(self._streams)
-        self._encoder = Encoder()
+        self._history = History()
         self._long_texts = 0
         self._vehicles = vehicles
         self._beside: list[Answers] = []  # truth and the other estimators, when they are vehicles
         self._beside_schedule = Schedule(VEHICLE_STREAMS)
-        self._beside_encoders: list[Encoder] = []
         self._heartbeat_at = -math.inf
         self._quiet: dict[str, float] = {}
         self._talks: WeakKeyDictionary[Station, Talk] = WeakKeyDictionary()
@@ -115,6 +115,7 @@ class MavlinkPublisher:
         self._ratios: dict[str, float] = {}
         self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
         self._isolated: set[tuple[str, str]] = set()
+        self._shut_out: tuple[frozenset[str], frozenset[str]] = (frozenset(), frozenset())  # sensors, of both
         self._told: frozenset[str] = frozenset()  # isolations
         vehicle = Vehicle(self._identity, self._parameters, self._items, self._streams)
         self._main = Answers(vehicle, self._scenario, self._readonly)
@@ -145,6 +146,11 @@ class MavlinkPublisher:
             self._read_imu(imu, t)
             for report in reports:
                 self._read_report(report)
+            if reports:
+                self._shut_out = (
+                    frozenset(sensor for sensor, _ in self._isolated),
+                    frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
+                )
             if self._home is None:
                 self._home = known_point(estimate)
             snapshot = Snapshot(
@@ -156,17 +162,16 @@ class MavlinkPublisher:
                 others,
                 self._home,
                 self._start_us,
-                self._ratios,
+                dict(self._ratios),
                 self._identity,
                 self._legs,
                 self._silent_s,
-                frozenset(sensor for sensor, _ in self._isolated),
-                frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
+                *self._shut_out,
             )
             self._tell_isolations(t, snapshot.isolated)
             self._main.snapshot = snapshot
-            events = [*self._reached(snapshot), *self._health_changed(snapshot)]
-            self._send(t, self._due(self._encoder, self._main, snapshot, self._schedule, events))
+            said = [*self._reached(snapshot), *self._health_changed(snapshot)]
+            self._send(t, said, self._main, self._schedule)
             if self._vehicles:
                 self._send_beside(snapshot)
         self._calls += 1
@@ -206,14 +211,14 @@ class MavlinkPublisher:
         """Say ``text`` as STATUSTEXT; severity is info, warning or error."""
         chunks = messages.statustext(severity, text, self._long_texts)
         self._long_texts += len(chunks) > 1
-        frames = [self._encoder.frame("STATUSTEXT", chunk) for chunk in chunks]
-        self._send(t, lambda rates: frames)
+        self._send(t, [("STATUSTEXT", chunk) for chunk in chunks], self._main)
 
     def close(self) -> None:
-        """Close every link; harmless when done twice."""
+        """Write the rest of the logs and close every link; harmless when done twice."""
         with contextlib.ExitStack() as stack:
             for close in [link.close for link in self._links] + [log.close for log in self._logs]:
                 stack.callback(close)
+            self._write()
 
     def _talk(self, station: Station) -> Talk:
         talk = self._talks.get(station)
@@ -221,47 +226,36 @@ class MavlinkPublisher:
             talk = self._talks[station] = Talk(self._signing)
         return talk
 
-    def _due(
-        self,
-        encoder: Encoder,
-        vehicle: Answers,
-        snapshot: Snapshot,
-        schedule: Schedule,
-        events: Sequence[bytes] = (),
-    ) -> Callable[[Mapping[str, float]], list[bytes]]:
-        """What gives the frames due now at given rates. Each is made once; those at usual rates by ``encoder``."""
-        made: dict[int, bytes | None] = {}
+    def _send(
+        self, t: float, said: Sequence[tuple[str, Fields]], vehicle: Answers, schedule: Schedule | None = None
+    ) -> None:
+        """Send what a vehicle has ``said``, and with a ``schedule`` what is due of its snapshot.
 
-        def frame(stream: Stream, maker: Encoder) -> bytes | None:
-            key = id(stream)
-            if key in made:
-                return made[key]
-            fields = stream.fields(snapshot)
-            one = made[key] = None if fields is None else maker.frame(stream.message, fields)
-            return one
-
-        def frames(rates: Mapping[str, float]) -> list[bytes]:
-            maker = vehicle.encoder if rates else encoder
-            due = [frame(stream, maker) for stream in schedule.due(self._calls, rates)]
-            return [*events, *(one for one in due if one is not None)]
-
-        return frames
-
-    def _send(self, t: float, due: Callable[[Mapping[str, float]], list[bytes]], system: int = 1) -> None:
-        """Send what ``system`` says to logs, which come first so that their numbers are the run's alone, and stations.
-
-        ``due`` gives its frames at the rates [Hz] asked for, by message.
+        Logs have the usual rates and numbers that are the run's alone, stations what they have asked for.
         """
         self._sent_us = max(self._sent_us, self._start_us + microseconds(t))  # events tell of times before the last row
         if self._logs:
-            frames = due({})
-            for log in self._logs:
-                log.send(self._sent_us, frames)
+            due = schedule.due(self._calls, {}) if schedule else ()
+            if self._history.add(self._sent_us, vehicle.encoder.system, said, vehicle.snapshot, due):
+                self._write()
+        made: dict[Stream, bytes | None] = {}
+        first = [vehicle.encoder.frame(message, fields) for message, fields in said if self._links]
         for link in self._links:
             for station in link.stations:
                 talk = self._talk(station)
-                rates = talk.rates[system]
-                talk.flush(station, due({**rates, **self._quiet} if self._quiet else rates))
+                rates = {**talk.rates[vehicle.encoder.system], **self._quiet}
+                streams = schedule.due(self._calls, rates) if schedule else ()
+                for stream in streams:
+                    if stream not in made:
+                        made[stream] = vehicle.frame(stream)
+                talk.flush(station, [*first, *(one for stream in streams if (one := made[stream]) is not None)])
+
+    def _write(self) -> None:
+        """Hand the logs what was kept for them."""
+        with np.errstate(all="ignore"):
+            data = self._history.take()
+        for log in self._logs if data else ():
+            log.write(data)
 
     def _beats(self) -> None:
         """See to it that no heartbeat follows one by the wall clock at once."""
@@ -282,9 +276,8 @@ class MavlinkPublisher:
                 parameters = Parameters(facts, {}, self._identity.byte_wise)
                 vehicle = Vehicle(self._identity, parameters, streams=VEHICLE_STREAMS, system=system)
                 self._beside.append(Answers(vehicle, readonly=True))
-                self._beside_encoders.append(Encoder(system))
                 self.event(shown.t, "info", f"system {system} is {name}")
-        for beside, encoder, (_, estimate) in zip(self._beside, self._beside_encoders, estimates, strict=True):
+        for beside, (_, estimate) in zip(self._beside, estimates, strict=True):
             before = beside.snapshot
             home = before.home if before is not None and before.t <= shown.t else None
             beside.snapshot = replace(
@@ -295,8 +288,7 @@ class MavlinkPublisher:
                 home=home or known_point(estimate),
                 legs=0,
             )
-            due = self._due(encoder, beside, beside.snapshot, self._beside_schedule)
-            self._send(shown.t, due, encoder.system)
+            self._send(shown.t, [], beside, self._beside_schedule)
 
     def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
         """Say which sensors the shown estimator has shut out since the last call, and which it has let in again."""
@@ -306,23 +298,23 @@ class MavlinkPublisher:
         for sensor in sorted(before - isolated):
             self.event(t, "info", f"{sensor} no longer isolated")
 
-    def _reached(self, snapshot: Snapshot) -> list[bytes]:
+    def _reached(self, snapshot: Snapshot) -> list[tuple[str, Fields]]:
         """MISSION_ITEM_REACHED when a leg has ended."""
         before, self._leg = self._leg, float(snapshot.truth.leg[0])
         if before == self._leg or not 0 <= before < self._legs:
             return []
         number = int(before) + self._identity.home_first
-        return [self._encoder.frame("MISSION_ITEM_REACHED", {"seq": number})]
+        return [("MISSION_ITEM_REACHED", {"seq": number})]
 
-    def _health_changed(self, snapshot: Snapshot) -> list[bytes]:
+    def _health_changed(self, snapshot: Snapshot) -> list[tuple[str, Fields]]:
         """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
         before, self._health = self._health, (messages.health(snapshot), estimates.ekf_flags(snapshot))
         if before in (None, self._health):
             return []
         self._heartbeat_at = -math.inf
         return [
-            self._encoder.frame("SYS_STATUS", messages.sys_status(snapshot)),
-            self._encoder.frame("EKF_STATUS_REPORT", estimates.ekf_status_report(snapshot)),
+            ("SYS_STATUS", messages.sys_status(snapshot)),
+            ("EKF_STATUS_REPORT", estimates.ekf_status_report(snapshot)),
         ]
 
     def _read_report(self, report: UpdateReport) -> None:

@@ -10,7 +10,7 @@ from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from nav.earth import displacement_n
+from nav.earth import displacement_n, position_difference_n
 from nav.rotation import euler_from_quat, quat_conjugate, quat_multiply, rotvec_from_quat
 from nav.samples import (
     AirspeedSample,
@@ -63,15 +63,9 @@ class Snapshot:
     refused: frozenset[str]
 
     def __post_init__(self) -> None:
-        """What every call needs: time [s, ms, us], what goes out most often, and what health depends on."""
+        """What changes before a snapshot is read: time [s], and the newest sample of each sensor."""
         self.t = float(self.truth.t[0])
-        self.boot_ms = boot_ms(self.t)
-        self.usec = microseconds(self.t)
         self.aligned = Status.ALIGNED in self.estimate.status
-        # Estimated roll, pitch, heading [rad].
-        self.euler = known_euler(self.estimate)
-        # Angular rate [rad/s], body: the gyro less its estimated bias; Earth rate and transport rate are left in.
-        self.rates = floats(self.gyro - self.estimate.gyro_bias)
         # The newest sample of the first sensor of each kind, and those of them that have not fallen silent.
         self.first: dict[type[Sample], Sample] = {}
         self._heard: dict[type[Sample], Sample] = {}
@@ -84,13 +78,38 @@ class Snapshot:
                 self.first[kind] = sample
                 if speaks:
                     self._heard[kind] = sample
-            places = isinstance(sample, PositionSample) or (isinstance(sample, GnssSample) and sample.has_fix)
-            self.fixed |= speaks and places
-        barometer, pitot, receiver = self.newest(BarometerSample), self.newest(AirspeedSample), self.newest(GnssSample)
-        # Measured static pressure [Pa] and equivalent airspeed [m/s]; the receiver's newest epoch if it has a fix.
-        self.pressure = float(barometer.pressure) if barometer else math.nan
-        self.eas = float(pitot.eas) if pitot else math.nan
+            if speaks and not self.fixed:
+                self.fixed = kind is PositionSample or (isinstance(sample, GnssSample) and sample.has_fix)
+        receiver = self.newest(GnssSample)
+        # The receiver's newest epoch if it has a fix.
         self.gnss_fix = receiver if receiver and receiver.has_fix else None
+
+    @cached_property
+    def alone(self) -> Rows:
+        """The same as one row."""
+        return Rows((self,))
+
+    @cached_property
+    def boot_ms(self) -> int:
+        """Time since boot [ms]."""
+        return boot_ms(self.t)
+
+    @cached_property
+    def usec(self) -> int:
+        """Time since boot [us]."""
+        return microseconds(self.t)
+
+    @property
+    def pressure(self) -> float:
+        """Measured static pressure [Pa], NaN when it is not known."""
+        barometer = self.newest(BarometerSample)
+        return float(barometer.pressure) if barometer else math.nan
+
+    @property
+    def eas(self) -> float:
+        """Measured equivalent airspeed [m/s], NaN when it is not known."""
+        pitot = self.newest(AirspeedSample)
+        return float(pitot.eas) if pitot else math.nan
 
     @cached_property
     def point(self) -> Point | None:
@@ -130,48 +149,6 @@ class Snapshot:
         speeds = [speed for speed in (self.eas, self.groundspeed) if math.isfinite(speed)]
         return max(speeds) > FLYING_MPS if speeds else None
 
-    @cached_property
-    def specific_force(self) -> list[float]:
-        """True specific force over the last tick [m/s^2], body."""
-        dt = self.t / self.truth.tick if self.truth.tick else math.inf
-        return floats(self.truth.dv[0] / dt)
-
-    @cached_property
-    def true_point(self) -> Point:
-        """True (lat, lon, h)."""
-        return float(self.truth.lat[0]), float(self.truth.lon[0]), float(self.truth.h[0])
-
-    @cached_property
-    def true_euler(self) -> list[float]:
-        """True roll, pitch, heading [rad]."""
-        return floats(euler_from_quat(self.truth.q_nb[0]))
-
-    @cached_property
-    def errors(self) -> dict[str, float]:
-        """Estimate less truth, and the estimator's own idea of it, of what is estimated."""
-        if self.euler is None:
-            return {}
-        turn = floats(rotvec_from_quat(quat_multiply(self.estimate.q_nb, quat_conjugate(self.truth.q_nb[0]))))
-        of_attitude = {
-            "err_tilt": math.degrees(math.hypot(turn[0], turn[1])),
-            "err_head": math.degrees(turn[2]),
-            "sig_tilt": math.degrees(self.sigma(ATTITUDE, 2)),
-            "sig_head": math.degrees(self.sigma(HEADING)),
-        }
-        if self.point is None:
-            return of_attitude
-        north, east, down = floats(displacement_n(*self.point, *self.true_point))
-        speed = floats(self.estimate.v_n - self.truth.v_n[0])
-        return {
-            "err_horiz": math.hypot(north, east),
-            "err_down": down,
-            "err_vel": math.hypot(*speed),
-            **of_attitude,
-            "sig_horiz": self.sigma(POSITION, 2),
-            "sig_down": self.sigma(DOWN),
-            "sig_vel": self.sigma(VELOCITY),
-        }
-
     def newest(self, kind: type[S]) -> S | None:
         """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
         return cast("S | None", self._heard.get(kind))
@@ -205,15 +182,178 @@ def floats(x: Array) -> list[float]:
     return values
 
 
-def known_euler(estimate: Estimate) -> list[float] | None:
-    """Roll, pitch, heading [rad] of an estimate, None while it has no attitude."""
-    if Status.ALIGNED not in estimate.status:
-        return None
-    euler = floats(euler_from_quat(estimate.q_nb))
-    return euler if math.isfinite(euler[0] + euler[1] + euler[2]) else None
-
-
 def root(variances: Array) -> float:
     """Root of summed variances, NaN where their sum is negative."""
     total = float(variances.sum())
     return math.sqrt(total) if total >= 0 else math.nan
+
+
+class Rows:
+    """Several instants of a run at once, for messages that go out often: each number is an array, a row an instant.
+
+    What is not known is NaN; a vector is known or not as a whole.
+    """
+
+    def __init__(self, snapshots: Sequence[Snapshot]) -> None:
+        self.snapshots = snapshots
+        self._estimates = [one.estimate for one in snapshots]
+        self._truths = [one.truth for one in snapshots]
+
+    def __len__(self) -> int:
+        return len(self.snapshots)
+
+    @cached_property
+    def boot_ms(self) -> Array:
+        """Time since boot [ms]."""
+        return np.array([one.boot_ms for one in self.snapshots], float)
+
+    @cached_property
+    def usec(self) -> Array:
+        """Time since boot [us]."""
+        return np.array([one.usec for one in self.snapshots], float)
+
+    # The estimate
+
+    @cached_property
+    def q_nb(self) -> Array:
+        """Estimated attitude (N, 4)."""
+        return np.array([one.q_nb for one in self._estimates])
+
+    @cached_property
+    def euler(self) -> Array:
+        """Estimated roll, pitch, heading (N, 3) [rad]."""
+        return _eulers(self._estimates)
+
+    @cached_property
+    def rates(self) -> Array:
+        """Angular rate (N, 3) [rad/s], body: the gyro less its estimated bias; Earth and transport rate are left in."""
+        bias: Array = np.array([one.gyro_bias for one in self._estimates])
+        return self.gyro - bias
+
+    @cached_property
+    def point(self) -> Array:
+        """Estimated lat, lon [rad], h [m] (N, 3)."""
+        return np.array([one.point or _NOWHERE for one in self.snapshots])
+
+    @cached_property
+    def local_n(self) -> Array:
+        """Estimated position from home (N, 3) [m], NED."""
+        home = np.array([one.home or _NOWHERE for one in self.snapshots])
+        return position_difference_n(*self.point.T, *home.T)
+
+    @cached_property
+    def v_n(self) -> Array:
+        """Estimated velocity (N, 3) [m/s], NED."""
+        return np.array([one.v_n for one in self._estimates])
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Of position, velocity and attitude (N, 9, 9)."""
+        return np.array([one.covariance for one in self._estimates])
+
+    @cached_property
+    def gyro_bias_variance(self) -> Array:
+        """Of the gyro's bias (N, 3) [rad^2/s^2]."""
+        return np.array([one.sigma_gyro_bias for one in self._estimates]) ** 2
+
+    @cached_property
+    def second(self) -> Array:
+        """Roll, pitch, heading, lat, lon [rad], h [m] (N, 6) of the second estimator."""
+        return self._other(0)
+
+    @cached_property
+    def third(self) -> Array:
+        """The same of the third."""
+        return self._other(1)
+
+    def _other(self, index: int) -> Array:
+        others = [one.others[index][1] if index < len(one.others) else None for one in self.snapshots]
+        points = np.array([known_point(one) or _NOWHERE if one else _NOWHERE for one in others])
+        return np.hstack([_eulers(others), points])
+
+    # Samples
+
+    @cached_property
+    def gyro(self) -> Array:
+        """Newest angular rate measured (N, 3) [rad/s]."""
+        return np.array([one.gyro for one in self.snapshots])
+
+    @cached_property
+    def accel(self) -> Array:
+        """Newest specific force measured (N, 3) [m/s^2]."""
+        return np.array([one.accel for one in self.snapshots])
+
+    @cached_property
+    def field_b(self) -> Array:
+        """Newest magnetic field measured (N, 3) [T]."""
+        found = [one.newest(MagnetometerSample) for one in self.snapshots]
+        return np.array([_NOWHERE if one is None else one.field_b for one in found])
+
+    @cached_property
+    def pressure(self) -> Array:
+        """Static pressure measured [Pa]."""
+        return np.array([one.pressure for one in self.snapshots])
+
+    @cached_property
+    def eas(self) -> Array:
+        """Equivalent airspeed measured [m/s]."""
+        return np.array([one.eas for one in self.snapshots])
+
+    # The truth
+
+    def truth(self, name: str) -> Array:
+        """A column of truth, (N,) or (N, width)."""
+        return np.concatenate([getattr(one, name) for one in self._truths])
+
+    @cached_property
+    def true_euler(self) -> Array:
+        """True roll, pitch, heading (N, 3) [rad]."""
+        return np.array([euler_from_quat(one.q_nb[0]) for one in self._truths])
+
+    @cached_property
+    def specific_force(self) -> Array:
+        """True specific force over the last tick (N, 3) [m/s^2], body."""
+        ticks = np.array([one.tick for one in self._truths], float)
+        dt = np.where(ticks == 0, math.inf, self.truth("t") / ticks)
+        return self.truth("dv") / dt[:, None]
+
+    @cached_property
+    def errors(self) -> dict[str, Array]:
+        """Estimate less truth, and the estimator's own idea of it."""
+        true = np.column_stack([self.truth(name) for name in ("lat", "lon", "h")])
+        position = position_difference_n(*self.point.T, *true.T)
+        velocity = self.v_n - self.truth("v_n")
+        pairs = zip(self._estimates, self._truths, strict=True)
+        turns = [rotvec_from_quat(quat_multiply(one.q_nb, quat_conjugate(true.q_nb[0]))) for one, true in pairs]
+        turn = np.array(turns)
+        return {
+            "err_tilt": np.degrees(np.hypot(turn[:, 0], turn[:, 1])),
+            "err_head": np.degrees(turn[:, 2]),
+            "sig_tilt": np.degrees(self._sigma(ATTITUDE, 2)),
+            "sig_head": np.degrees(self._sigma(HEADING)),
+            "err_horiz": np.hypot(position[:, 0], position[:, 1]),
+            "err_down": position[:, 2],
+            "err_vel": np.linalg.norm(velocity, axis=1),
+            "sig_horiz": self._sigma(POSITION, 2),
+            "sig_down": self._sigma(DOWN),
+            "sig_vel": self._sigma(VELOCITY),
+        }
+
+    def _sigma(self, block: slice, dimensions: int = 3) -> Array:
+        """As `Snapshot.sigma`."""
+        return np.array([one.sigma(block, dimensions) for one in self.snapshots])
+
+
+_NOWHERE = (math.nan, math.nan, math.nan)
+
+
+def _eulers(estimates: Sequence[Estimate | None]) -> Array:
+    """Roll, pitch, heading (N, 3) [rad] of estimates that have an attitude."""
+    found = np.array(
+        [
+            euler_from_quat(one.q_nb) if one is not None and Status.ALIGNED in one.status else _NOWHERE
+            for one in estimates
+        ]
+    )
+    found[~np.isfinite(found).all(axis=1)] = math.nan
+    return found

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
 from testbed.mavlink import estimates, messages
-from testbed.mavlink.encode import Fields
-from testbed.mavlink.snapshot import Snapshot
+from testbed.mavlink.encode import Fields, layout
+from testbed.mavlink.snapshot import Rows, Snapshot
 
 PUBLISH_HZ = 25
 OTHERS_HZ = 5  # of the estimators beside the shown one
@@ -23,17 +25,47 @@ _HUD = mav.MAV_DATA_STREAM_EXTRA2
 _REST = mav.MAV_DATA_STREAM_EXTRA3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Stream:
     """A message, its mean rate [Hz], the function that fills it, and the group that it is in for ArduPilot's stations.
 
-    Group 0 is in none.
+    Group 0 is in none. ``needs`` are the attributes of `Rows` without which there is nothing to say; the function is
+    then one of rows. Without ``needs`` it is one of a `Snapshot`, and says itself when there is nothing.
     """
 
     message: str
     rate_hz: float
-    fields: Callable[[Snapshot], Fields | None]
+    fields: Callable[[Snapshot], Fields | None] | Callable[[Rows], Fields]
     group: int = 0
+    needs: Sequence[str] | None = None
+
+    def payloads(self, rows: Rows) -> Payloads:
+        """What it says of those rows of which there is something to say."""
+        own = layout(self.message)
+        if self.needs is None:
+            said = [self.fields(one) for one in rows.snapshots]  # type: ignore[arg-type]
+            found = {k: own.payload(fields) for k, fields in enumerate(said) if fields is not None}
+            sizes = np.array([len(one) for one in found.values()], int)
+            return Payloads(np.array([*found], int), sizes, np.frombuffer(b"".join(found.values()), np.uint8))
+        told = np.ones(len(rows), bool)
+        for need in self.needs:
+            told &= np.isfinite(getattr(rows, need)).all(axis=1)
+        payloads = own.payloads(self.fields(rows), len(rows))[told]  # type: ignore[arg-type]
+        return Payloads(np.flatnonzero(told), np.full(len(payloads), payloads.shape[1]), payloads.reshape(-1))
+
+    def payload(self, snapshot: Snapshot) -> bytes | None:
+        """What it says of one instant, None when there is nothing to say."""
+        own = self.payloads(snapshot.alone)
+        return own.data.tobytes() if len(own.rows) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Payloads:
+    """Fields of one message as bytes: ``rows`` (N,) that say something, their ``sizes`` (N,), all bytes in a row."""
+
+    rows: NDArray[np.intp]
+    sizes: NDArray[np.intp]
+    data: NDArray[np.uint8]
 
 
 STREAMS = (
@@ -43,28 +75,32 @@ STREAMS = (
     Stream("EXTENDED_SYS_STATE", 1, messages.extended_sys_state, _STATUS),
     Stream("MISSION_CURRENT", 1, messages.mission_current, _STATUS),
     Stream("HOME_POSITION", 0.5, messages.home_position),
-    Stream("ATTITUDE", 25, estimates.attitude, _ATTITUDE),
-    Stream("ATTITUDE_QUATERNION", 10, estimates.attitude_quaternion, _ATTITUDE),
-    Stream("GLOBAL_POSITION_INT", 10, estimates.global_position_int, _POSITION),
-    Stream("LOCAL_POSITION_NED", 10, estimates.local_position_ned, _POSITION),
-    Stream("VFR_HUD", 5, estimates.vfr_hud, _HUD),
-    Stream("ODOMETRY", 5, estimates.odometry, _POSITION),
+    Stream("ATTITUDE", 25, estimates.attitude, _ATTITUDE, needs=("euler",)),
+    Stream("ATTITUDE_QUATERNION", 10, estimates.attitude_quaternion, _ATTITUDE, needs=("euler",)),
+    Stream("GLOBAL_POSITION_INT", 10, estimates.global_position_int, _POSITION, needs=("point", "local_n")),
+    Stream("LOCAL_POSITION_NED", 10, estimates.local_position_ned, _POSITION, needs=("local_n",)),
+    Stream("VFR_HUD", 5, estimates.vfr_hud, _HUD, needs=("point", "euler")),
+    Stream("ODOMETRY", 5, estimates.odometry, _POSITION, needs=("local_n", "euler")),
     Stream("ALTITUDE", 2, estimates.altitude, _POSITION),
     Stream("WIND_COV", 1, estimates.wind_cov, _REST),
     Stream("ESTIMATOR_STATUS", 2, estimates.estimator_status, _REST),
     Stream("EKF_STATUS_REPORT", 1, estimates.ekf_status_report, _REST),
     Stream("GPS_RAW_INT", 5, messages.gps_raw_int, _STATUS),
     Stream("GNSS_INTEGRITY", 1, messages.gnss_integrity, _STATUS),
-    Stream("HIGHRES_IMU", 10, messages.highres_imu, _RAW),
+    Stream("HIGHRES_IMU", 10, messages.highres_imu, _RAW, needs=()),
     Stream("SCALED_PRESSURE", 1, messages.scaled_pressure, _RAW),
-    Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE),
-    Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE),
-    Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE),
-    Stream("AHRS2", OTHERS_HZ, estimates.ahrs2, _ATTITUDE),
-    Stream("AHRS3", OTHERS_HZ, estimates.ahrs3, _ATTITUDE),
+    Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE, needs=()),
+    Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE, needs=()),
+    Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE, needs=()),
+    Stream("AHRS2", OTHERS_HZ, estimates.ahrs2, _ATTITUDE, needs=("second",)),
+    Stream("AHRS3", OTHERS_HZ, estimates.ahrs3, _ATTITUDE, needs=("third",)),
     *(
-        Stream("NAMED_VALUE_FLOAT", 1, partial(estimates.error, name), _REST)
-        for name in (f"{kind}_{error}" for error in ("horiz", "down", "vel", "tilt", "head") for kind in ("err", "sig"))
+        Stream("NAMED_VALUE_FLOAT", 1, partial(estimates.error, f"{kind}_{error}"), _REST, needs)
+        for error, needs in (
+            *((motion, ("euler", "point")) for motion in ("horiz", "down", "vel")),
+            *((attitude, ("euler",)) for attitude in ("tilt", "head")),
+        )
+        for kind in ("err", "sig")
     ),
 )
 
@@ -78,9 +114,7 @@ _VEHICLE = (
     "VFR_HUD",
 )
 # What truth or another estimator says as a vehicle of its own, and what the first one says then.
-VEHICLE_STREAMS = tuple(
-    Stream(one.message, min(one.rate_hz, 10), one.fields, one.group) for one in STREAMS if one.message in _VEHICLE
-)
+VEHICLE_STREAMS = tuple(replace(one, rate_hz=min(one.rate_hz, 10)) for one in STREAMS if one.message in _VEHICLE)
 BESIDE_VEHICLES = tuple(one for one in STREAMS if not one.message.startswith("AHRS"))
 
 

@@ -23,6 +23,7 @@ from nav.samples import (
 )
 from testbed import Scenario
 from testbed.mavlink import MavlinkPublisher, encode, messages
+from testbed.mavlink.history import History
 from testbed.mavlink.stream import STREAMS
 from testbed.motion.table import COLUMNS, TruthBlock
 
@@ -116,6 +117,44 @@ def test_same_bytes_as_pymavlink(name):
         peer.seq = (peer.seq + 1) % 256
 
 
+def recorded(said, system=3):
+    """Frames of messages with their fields as a log has them."""
+    history = History()
+    for k, one in enumerate(said):
+        history.add(k, system, [one])
+    frames = list(logged(history.take()))
+    assert [stamp for stamp, _ in frames] == list(range(len(said)))
+    return [frame for _, frame in frames]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_log_has_the_same_bytes_as_one_frame_after_the_other(name):
+    encoder, values = encode.Encoder(system=3), []
+    for k in range(300):  # the number wraps, and trailing zeros come and go
+        values.append({})
+        for field, kind, length in shape(name):
+            number = k % 100 + 0.5 * (kind == "float") if k % 3 else 0
+            values[-1][field] = b"text" * (k % 3) if kind == "char" else [number] * length if length else number
+    assert recorded([(name, one) for one in values]) == [encoder.frame(name, one) for one in values]
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=settings.default.max_examples // 6)
+@given(data=st.data())
+def test_many_payloads_are_those_of_one_after_the_other(name, data):
+    rows = [data.draw(fields(name)) for _ in range(3)]
+    columns = {
+        field: rows[0][field] if kind == "char" else np.array([row[field] for row in rows])
+        for field, kind, _ in shape(name)
+    }
+    for row in rows:
+        row.update({field: rows[0][field] for field, kind, _ in shape(name) if kind == "char"})
+    own = encode.layout(name)
+    found = [bytes(payload) for payload in own.payloads(columns, 3)]
+    assert [encode.Encoder().wrap(name, one) for one in found] == [encode.Encoder().frame(name, row) for row in rows]
+
+
 def test_fields_must_be_complete():
     with pytest.raises(KeyError, match="pitch"):
         encode.Encoder().frame("ATTITUDE", {"time_boot_ms": 0, "roll": 0.0})
@@ -165,6 +204,14 @@ def test_time_wraps():
     assert encode.microseconds(math.inf) == 0
 
 
+def logged(data):
+    """Stamps [us] and frames in the bytes of a log."""
+    while data:
+        size = 8 + 12 + data[9]
+        yield int.from_bytes(data[:8], "big"), data[8:size]
+        data = data[size:]
+
+
 class Deal:
     """Deals out the numbers of an array, one or a few at a time, over and over."""
 
@@ -179,13 +226,13 @@ class Deal:
 
 
 class Collector:
-    """A link that keeps what is sent."""
+    """A log that keeps the frames that it is given."""
 
     def __init__(self):
         self.frames = []
 
-    def send(self, time_us, frames):
-        self.frames += frames
+    def write(self, data):
+        self.frames += [frame for _, frame in logged(data)]
 
     def close(self):
         pass
@@ -257,9 +304,11 @@ def test_no_state_can_stop_the_stream(vehicles, state, before, status, fix):
     publisher = MavlinkPublisher([], SCENARIO, vehicles=vehicles)
     publisher._logs.append(link)
     publisher.publish(*broken_run(Deal(before), status, fix))  # whatever came first, home and IMU included
+    publisher._write()
     publisher._calls = 0  # every stream is due
     link.frames.clear()
     publisher.publish(*broken_run(Deal(state), status, fix))
+    publisher._write()
     names = [decode(frame).get_type() for frame in link.frames]
     assert {"HEARTBEAT", "SYS_STATUS", "GPS_RAW_INT", "HIGHRES_IMU", "HIL_STATE_QUATERNION"} <= set(names)
     if status == Status.ALIGNING and not vehicles:
