@@ -22,14 +22,14 @@ from worlds import synthetic_run
 from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import ImuSamples, Outcome, UpdateReport
+from nav.samples import Estimate, ImuSamples, Outcome, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record
 from testbed.record.columns import AXES
 from testbed.record.reader import load
 from testbed.record.recorder import Recorder
-from testbed.record.tables import Table
+from testbed.record.tables import Table, pack_estimates
 
 TWO = {"ins": Errors(), "dead_reckoning": Errors(drift_mps=5.0)}
 DENIED = ((20.0, 40.0),)
@@ -287,6 +287,18 @@ def test_a_record_without_spare_moments_is_written_all_the_same(
     recorder.truth(circle(10.0))
     assert load(tmp_path / "run.nc")["truth"].sizes["time"] == 101
     recorder.close()
+
+
+def test_arrays_of_any_kind_are_recorded_by_their_values() -> None:
+    """As a user's estimator may give them: whole numbers, every other number of more, rows stored as columns."""
+    spread, turned = np.arange(8.0), np.asfortranarray(np.arange(81.0).reshape(9, 9))
+    plain = Estimate.of(1.0, lla=np.zeros(3), v_n=np.arange(3.0), q_nb=spread[:4], covariance=np.ones((9, 9)))
+    odd = replace(plain, v_n=np.array([4, 5, 6]), q_nb=spread[::2], covariance=turned)
+    block, _ = pack_estimates([plain, odd, plain])
+    np.testing.assert_array_equal(block["v_n"], [[0, 1, 2], [4, 5, 6], [0, 1, 2]])
+    np.testing.assert_array_equal(block["q_nb"], [[0, 1, 2, 3], [0, 2, 4, 6], [0, 1, 2, 3]])
+    np.testing.assert_array_equal(block["covariance"], [np.ones((9, 9)), turned, np.ones((9, 9))])
+    assert {block[name].dtype for name in ("v_n", "q_nb", "covariance")} == {np.dtype(float)}
 
 
 def test_long_text_is_cut_at_a_whole_character() -> None:
