@@ -8,33 +8,37 @@ is not what it seemed to be; that is left to the filter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from copy import copy
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from nav._jit import njit
-from nav.aids import problem
+from nav.aids import MagnetometerAid, problem
 from nav.aids.airspeed import airspeed, is_slow, sideslip
 from nav.aids.barometer import barometer
 from nav.aids.base import FUSED, Kind, PlainAid, report_on
 from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
 from nav.aids.magnetometer import magnetometer
+from nav.detection import whiten
 from nav.earth import pressure_altitude
 from nav.error_model import Indices
 from nav.increments import COINCIDENT, Increments, Step
-from nav.local_filter import LocalFilter
+from nav.local_filter import LocalFilter, own_innovation
+from nav.monitor import shown_limit
 from nav.reference import NEVER, PREDICTED_PERIODS, Reference, is_near
-from nav.samples import Array, GnssSample, UpdateReport
-from nav.state import Known, State, absorb, known, parts, propagate
+from nav.samples import Array, Estimate, GnssSample, Sample, UpdateReport
+from nav.state import State, absorb, parts, propagate
 
 # What a step is, in place of the number of an aid; and where its numbers begin.
 ESTIMATE, ADVANCE, SPLIT = -1, -2, -3
 TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
 WIDTH = NUMBERS + 12
 NOTHING = (0.0,) * 12
-REPORT = 15  # step, part, nis, innovation (3,), S (9,)
+LIMITS = 10  # where the limits of an aid's two parts are among its numbers
+REPORT = 16  # step, part, nis, statistic, innovation (3,), S (9,)
 
 
 class Done(NamedTuple):
@@ -51,84 +55,137 @@ class Done(NamedTuple):
     estimates: int
 
 
-class Batch:
-    """Takes the plain steps of one closed filter.
+class Taker(Protocol):
+    """An estimator whose plain steps a `Batch` takes."""
 
-    ``trusted`` says of a fix, given the time of the one before, whether it is used if it is inside its gate.
+    def trusted(self, fix: GnssSample, before: float) -> bool:
+        """Whether a sound fix, if it is inside its gate, is simply used when the one of the time ``before`` was."""
+        ...
+
+    def pauses(self, t: float) -> bool:
+        """Whether there is something to do after a sample of the time ``t`` [s] and before the next step."""
+        ...
+
+    def took(self, sample: Sample) -> None:
+        """A sample was used, at least the first part of it, or said that there is no fix."""
+        ...
+
+    def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
+        """Use the parts from the ``first`` on of a sample whose others were used."""
+        ...
+
+    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
+        """The estimate at ``t`` of a settled state, the ``whole`` of which may be changed."""
+        ...
+
+
+class Batch:
+    """Takes the plain steps of an estimator that has these ``filters``, `LocalFilter.row` by row.
+
+    A filter that is not ``closed`` is corrected by itself; then nothing but its own states changes.
     """
 
-    def __init__(
-        self, filter_: LocalFilter, reference: Reference, trusted: Callable[[GnssSample, float], bool]
-    ) -> None:
-        self._filter, self._reference, self._trusted = filter_, reference, trusted
-        self._aids: dict[str, tuple[int, PlainAid]] = {}
+    def __init__(self, filters: Sequence[LocalFilter], reference: Reference) -> None:
+        self._filters, self._reference = filters, reference
+        self._aids: dict[str, tuple[int, PlainAid, LocalFilter]] = {}
         kinds: list[list[int]] = []
         told: list[list[float]] = []
-        for sensor, aid in filter_.aids.items():
-            plain = aid.plain if isinstance(aid, PlainAid) else None
-            if plain is not None and isinstance(aid, PlainAid):
-                self._aids[sensor] = len(kinds), aid
-                starts = filter_.starts[sensor]
-                kinds.append([plain[0], len(aid.parts), *starts, *[-1] * (8 - 2 - len(starts))])
-                told.append([*plain[1], *[0.0] * (12 - len(plain[1]))])
-        self._kinds = np.array(kinds, np.int64).reshape(-1, 8)
-        self._told = np.array(told).reshape(-1, 12)
+        sensors = [sensor for filter_ in filters for sensor in filter_.aids]
+        for filter_ in filters:
+            for sensor, aid in filter_.aids.items():
+                plain = aid.plain if isinstance(aid, PlainAid) and sensors.count(sensor) == 1 else None
+                field = reference.has_field or not isinstance(aid, MagnetometerAid)
+                if plain is not None and isinstance(aid, PlainAid) and field:
+                    self._aids[sensor] = len(kinds), aid, filter_
+                    starts = filter_.starts[sensor]
+                    kinds.append([plain[0], len(aid.parts), *starts, *[-1] * (5 - len(starts)), filter_.row])
+                    told.append([*plain[1], *[0.0] * (LIMITS + 2 - len(plain[1]))])
+        self._kinds, self._told = np.array(kinds, np.int64).reshape(-1, 8), np.array(told).reshape(-1, LIMITS + 2)
 
-    def plan(self, steps: Sequence[Step], last_fix: float) -> Array:
-        """The first of the ``steps`` that look plain, as rows for `follow`; the last fix was used at ``last_fix``."""
-        flat: list[float] = []
-        silence = copy(self._filter.silence)
-        for t, horizon, sample in steps:
-            if sample is None:
-                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
-                continue
-            if t != horizon or sample.sensor not in self._aids:  # too late, or not known when
-                break
-            index, aid = self._aids[sample.sensor]
-            if isinstance(sample, GnssSample):
-                if not sample.has_fix:
-                    flat += (t, t, SPLIT, *NOTHING)
-                    continue
-                if problem(sample) or not (has_velocity(sample) and self._trusted(sample, last_fix)):
-                    break
-                last_fix = t
-            elif problem(sample):
-                break
-            if silence is not None and silence.stand_in(sample) is not None:
-                break
-            flat += (t, t, index, *aid.numbers(sample))
-        return np.array(flat).reshape(-1, WIDTH)
+    def take(
+        self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Sequence[Step], ahead: Increments,
+        reports: list[UpdateReport], estimates: list[Estimate],
+    ) -> tuple[int, float]:  # fmt: skip
+        """Take the first of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
 
-    def run(self, state: State, ahead: Increments, plan: Array, last_bad: float) -> Done:
-        """`follow` a ``plan``, and move ``ahead`` along."""
+        The last fix that was used was of the time ``last_fix``.
+        """
+        plan = self._plan(taker, steps, last_fix)
+        if not len(plan):
+            return 0, last_bad
         imu, (common, filters, n) = ahead.imu, state.shape
-        self._reports = np.empty((2 * len(plan), REPORT))
-        self._estimates = np.empty((np.count_nonzero(plan[:, WHAT] == ESTIMATE), 2 + len(state.whole)))
+        told = np.empty((2 * len(plan), REPORT))
+        states = np.empty((np.count_nonzero(plan[:, WHAT] == ESTIMATE), 2 + len(state.whole)))
         done = Done(
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
                 ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
-                np.array(self._filter.gate.thresholds), self._reports, self._estimates,
+                self._filters[0].closed, told, states,
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
-        return done
+        reports += self._reports(steps, told[: done.reports])
+        drafted = 0
+        for t, _, sample in steps[: done.steps]:
+            if sample is not None:
+                taker.took(sample)
+            elif t == t:
+                then, bad = states[drafted, :2].tolist()
+                estimates.append(taker.told(states[drafted, 2:], then, bad))
+                drafted += 1
+        if not done.parts:
+            return done.steps, done.last_bad
+        sample = steps[done.steps].sample
+        assert sample is not None
+        reports += taker.finish(sample, done.parts)
+        return done.steps + 1, done.last_bad
 
-    def reports(self, steps: Sequence[Step], done: Done) -> Iterator[UpdateReport]:
+    def _plan(self, taker: Taker, steps: Sequence[Step], last_fix: float) -> Array:
+        """The first of the ``steps`` that look plain, as rows for `follow`."""
+        flat: list[float] = []
+        silences = [copy(filter_.silence) for filter_ in self._filters if filter_.silence is not None]
+        known: dict[str, tuple[int, PlainAid]] = {}
+        for sensor, (index, aid, filter_) in self._aids.items():
+            limits = filter_.limits(sensor)
+            if limits is not None:
+                known[sensor] = index, aid
+                self._told[index, LIMITS : LIMITS + len(limits)] = limits
+        for t, horizon, sample in steps:
+            if sample is None:
+                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
+                continue
+            if t != horizon or sample.sensor not in known:  # too late, or not known when
+                break
+            index, aid = known[sample.sensor]
+            if isinstance(sample, GnssSample):
+                if not sample.has_fix:
+                    flat += (t, t, SPLIT, *NOTHING)
+                    continue
+                if problem(sample) or not (has_velocity(sample) and taker.trusted(sample, last_fix)):
+                    break
+                last_fix = t
+            elif problem(sample):
+                break
+            if any(silence.stand_in(sample) is not None for silence in silences):
+                break
+            flat += (t, t, index, *aid.numbers(sample))
+            if taker.pauses(t):
+                break
+        return np.array(flat).reshape(-1, WIDTH)
+
+    def _reports(self, steps: Sequence[Step], rows: Array) -> Iterator[UpdateReport]:
         """The reports on what was just done."""
-        rows = self._reports[: done.reports]
-        for row, (step, part, nis) in zip(rows, rows[:, :3].tolist(), strict=True):
+        for row, (step, part, nis, statistic) in zip(rows, rows[:, :4].tolist(), strict=True):
             sample = steps[int(step)].sample
             assert sample is not None
-            name, m = self._aids[sample.sensor][1].parts[int(part)]
-            nu, S = row[3 : 3 + m], row[6 : 6 + m * m].reshape(m, m)
-            yield report_on(sample, name, nu, S, nis, self._filter.gate.threshold(m), FUSED)
-
-    def states(self, done: Done) -> Iterator[tuple[float, float, Known]]:
-        """At each time at which an estimate was asked for: the time, that of the last bad increment, the state."""
-        shape = self._reference.common, len(self._reference.models), self._reference.size
-        for row, (t, last_bad) in zip(self._estimates, self._estimates[: done.estimates, :2].tolist(), strict=False):
-            yield t, last_bad, known(row[2:], *shape)
+            index, aid, filter_ = self._aids[sample.sensor]
+            name, m = aid.parts[int(part)]
+            limit = float(self._told[index, LIMITS + int(part)])
+            monitor = filter_.monitors.get((sample.sensor, name))
+            if monitor is not None:
+                monitor.passed(statistic, limit, sample.t)
+                limit = shown_limit(limit, statistic, nis)
+            yield report_on(sample, name, row[4 : 4 + m], row[7 : 7 + m * m].reshape(m, m), nis, limit, FUSED)
 
 
 @njit
@@ -144,17 +201,20 @@ def follow(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int,
     t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
-    steps: Array, kinds: Indices, told: Array, field: Array, thresholds: Array,
+    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool,
     reports: Array, estimates: Array,
 ) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
     """Take ``steps`` (K, WIDTH) as far as they are plain: see `Done`. In place on all that is handed over.
 
     The state and how it moves as of `nav.state.propagate`, the increments of `nav.increments.Increments`; ``kinds`` (A,
-    8) and ``told`` (A, 12) of the aids (`Table`), the last place of the reference ``field`` (6,), ``thresholds`` of the
-    gate by dimension. Into ``reports`` (_, `REPORT`) and ``estimates`` (_, 2 + whole): time, last bad increment, state.
+    8) and ``told`` (A, 12) of the aids (`_measure`), the last place of the reference ``field`` (6,), and whether the
+    filters are ``closed``. Into ``reports`` (_, `REPORT`) and ``estimates`` (_, 2 + whole): time, last bad increment,
+    state.
     """
-    q_nb, v_n, lla, _, x, _, errors, _, _, rates, _ = parts(whole, common, filters, n)
+    q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
+    # No literals: for each of them numba would compile `propagate` anew.
+    yes, no, never = len(steps) >= 0, len(steps) < 0, max(period, NEVER)
     written = drafted = 0
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
@@ -162,7 +222,7 @@ def follow(
         if stop > row:
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
-                dtheta[row:stop], dv[row:stop], dt[row:stop], False,
+                dtheta[row:stop], dv[row:stop], dt[row:stop], no,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, t[row + bad])
@@ -189,7 +249,7 @@ def follow(
                 _share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
                 bad = propagate(
                     draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
-                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, True,
+                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, yes,
                 )  # fmt: skip
                 then = time
                 if bad >= 0:
@@ -205,7 +265,7 @@ def follow(
                 dv[row, i] -= one_push[0, i]
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
-                one_push, one_dt, False,
+                one_push, one_dt, no,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, time)
@@ -213,20 +273,27 @@ def follow(
         if what == SPLIT:
             continue
         propagate(
-            whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, NEVER,
-            dtheta[:0], dv[:0], dt[:0], True,
+            whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, never,
+            dtheta[:0], dv[:0], dt[:0], yes,
         )  # fmt: skip
         for part in range(kinds[what, 1]):
+            f, limit = kinds[what, 7], told[what, LIMITS + part]
             plain, nu, H, R = _measure(
-                kinds[what], part, told[what], steps[k, NUMBERS:], q_nb, v_n, lla, x[0], rates, errors, driven, field
+                kinds[what], part, told[what], steps[k, NUMBERS:], q_nb, v_n, lla, x[f], rates, errors, driven, field
             )
             if not plain:
                 return k, part, row, now, last_bad, written, drafted
-            m = len(nu)
-            S, nis = absorb(whole, common, filters, n, 0, driven, nu, H, R, thresholds[m - 1], True)
-            if not nis <= thresholds[m - 1]:
-                return k, part, row, now, last_bad, written, drafted
-            _report(reports[written], k, part, nu, S, nis)
+            if not closed:
+                nu, S, statistic = own_innovation(P[f], x[f], common, H, R, nu)
+                statistic = whiten(nu, S)[1]
+                if not statistic <= limit:
+                    return k, part, row, now, last_bad, written, drafted
+            S, nis = absorb(whole, common, filters, n, f, driven, nu, H, R, limit if closed else math.inf, closed)
+            if closed:
+                statistic = nis
+                if not nis <= limit:
+                    return k, part, row, now, last_bad, written, drafted
+            _report(reports[written], k, part, nu, S, nis, statistic)
             written += 1
     return len(steps), 0, row, now, last_bad, written, drafted
 
@@ -242,14 +309,14 @@ def _share(
 
 
 @njit
-def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float) -> None:
+def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float, statistic: float) -> None:
     """Write down what became of a part."""
     m = len(nu)
-    report[0], report[1], report[2] = k, part, nis
+    report[0], report[1], report[2], report[3] = k, part, nis, statistic
     for i in range(m):
-        report[3 + i] = nu[i]
+        report[4 + i] = nu[i]
         for j in range(m):
-            report[6 + m * i + j] = S[i, j]
+            report[7 + m * i + j] = S[i, j]
 
 
 @njit
@@ -259,8 +326,8 @@ def _measure(
 ) -> tuple[bool, Array, Array, Array]:  # fmt: skip
     """Whether one part of a sample is plain, and its innovation (m,), Jacobian (m, n), variances (m,).
 
-    ``kind`` (8,) has what it is, how many parts there are, and from the third on where states begin; ``told`` (12,) the
-    numbers of the aid, ``numbers`` (12,) those of the sample.
+    ``kind`` (8,) has what it is, how many parts there are, where states begin (5,), and whose filter's it is; ``told``
+    (12,) the numbers of the aid and the limits of its parts, ``numbers`` (12,) those of the sample.
     """
     if kind[0] == Kind.BAROMETER:
         nu, H = barometer(lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))

@@ -44,6 +44,18 @@ class Doubts:
         """A position was fused, or the filters gave in."""
         self._refusals.taken()
 
+    def trusted(self, fix: GnssSample, before: float) -> bool:
+        """Whether a fix, if it is not refused, is simply used when that of the time ``before`` was."""
+        sure = self._receivers[fix.sensor].sure(fix.t, before)
+        return sure and not (self._winds is not None and self._winds.due(fix.t))
+
+    def used(self, fix: GnssSample) -> None:
+        """A `trusted` fix with velocity was used."""
+        self._refusals.taken()
+        self._receivers[fix.sensor].judge(fix, fix.v_n, fix.sigma_velocity_n, inside_gate=True)
+        for other in self._receivers.values():
+            other.last_fused = fix.t
+
     def overruled(self, state: State, sample: Sample, nu: Array, report: UpdateReport) -> bool:
         """Whether to believe a fix against the filters, given its innovation ``nu`` (3,) and what became of it."""
         lasting = report.weight == 0 and self._refusals.too_long(sample.t)

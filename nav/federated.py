@@ -11,6 +11,7 @@ How information is shared, what is done about faults, and what speaks for which 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,30 +20,28 @@ from nav import aids
 from nav.aids import Aid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Measurement, Ruling, refusals, report_on, without_position
 from nav.alignment import Alignment, InitialState
+from nav.batch import Batch
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
-from nav.fusion import Master, blend, combine, reset, weights_by_covariance
+from nav.fusion import reset
+from nav.increments import Increments, Step
 from nav.local_filter import LocalFilter
-from nav.monitor import Change, Isolation, Monitor
+from nav.master import LEAST_SHARE, MasterFilter, noise_shares
+from nav.monitor import Change, Isolation, Monitor, shown_limit
 from nav.reference import (
     BAD_SAMPLE_S,
     FUSED,
     PREDICTED_PERIODS,
     RECENT_S,
-    REPORTED,
     TIME_TOLERANCE,
     UNAIDED,
     FieldModel,
     Reference,
     align,
-    describe,
-    doubted,
     forget,
     nothing_known,
-    spread,
-    turned,
 )
 from nav.samples import (
     NO_SENSOR,
@@ -55,13 +54,12 @@ from nav.samples import (
     Status,
     UpdateReport,
 )
-from nav.state import State, inject
+from nav.state import State
 from nav.weighting import InOrder, Policy, Weight
 
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
 LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
-LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
 
 class Federated:
@@ -76,7 +74,6 @@ class Federated:
         self.config, self.field_n = config, field_n
         self.t = math.nan
         self.events: list[Isolation] = []
-        self.shares = config.shares
         gate = ChiSquareGate(1e-3)
         self.locals = [
             LocalFilter(config.imu, [w.aid for w in local.sensors], gate, row, closed=False, scaling=local.scaling)
@@ -90,7 +87,8 @@ class Federated:
         # Rows of the state: the filters, then, with a recall, their younger shadows and their older ones.
         self._copies = 1 if config.recall_s is None else 3
         self._reference = Reference(
-            [f.model for f in self.locals] * self._copies, self._noise_shares(), config.covariance_period, field_n,
+            [f.model for f in self.locals] * self._copies, noise_shares(config, config.shares, self._copies),
+            config.covariance_period, field_n,
             scalings=[local.scaling for local in config.locals] * self._copies,
         )  # fmt: skip
         self.model = self.locals[0].model
@@ -102,7 +100,8 @@ class Federated:
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
-        self._extra = self._extras()
+        self._batch = Batch(self.locals, self._reference)
+        self._master = MasterFilter(config, self.locals, self._reference, self._copies)
 
     def _alignment_aids(self) -> dict[str, Aid]:
         """The first receiver and the first magnetometer."""
@@ -112,19 +111,10 @@ class Federated:
                 found[aid.sensor] = aid
         return found
 
-    def _extras(self) -> list[tuple[str, int, slice]]:
-        """(name, row, where) of the further states in an estimate: a name that two filters have gets the filter's."""
-        own = [
-            (name, row, where)
-            for row, filter_ in enumerate(self.locals)
-            for name, where in filter_.model.slices.items()
-            if where.start >= self._common
-        ]
-        names = [name for name, _, _ in own]
-        return [
-            (f"{self.config.locals[row].name}_{name}" if names.count(name) > 1 else name, row, where)
-            for name, row, where in own
-        ]
+    @property
+    def shares(self) -> Array:
+        """The share of each local filter, adding up to one."""
+        return self._master.shares
 
     @property
     def aligned(self) -> bool:
@@ -154,7 +144,7 @@ class Federated:
         """Begin at a given state instead of aligning."""
         state = self._reference.start(initial, [self._alignment.names] * len(self._reference.models))
         common = self._common
-        for row, share in enumerate(self._noise_shares()):
+        for row, share in enumerate(self._master.noise_shares()):
             reset(state.x[row], state.P[row], np.zeros(common), state.P[row, :common, :common] / share)
         self._state, self._draft = state, state.copy()
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
@@ -196,16 +186,71 @@ class Federated:
         for filter_ in self.locals:
             if (silent := filter_.stand_in(sample)) is not None:
                 reports += [replace(report, sensor=NO_SENSOR) for report in self._use(state, filter_, silent)]
-        config = self.config
-        if sample.t - self._fused_at >= config.fusion_period_s - TIME_TOLERANCE:
-            if config.cross_check:
-                self._cross_check(state, sample.t)
-            self._fuse(state)
-            self._fused_at = sample.t
-            if config.recall_s is not None and sample.t - self._remembered_at >= config.recall_s - TIME_TOLERANCE:
-                self._remember(state)
-                self._remembered_at = sample.t
+        if self.pauses(sample.t):
+            self._pause(state, sample.t)
         return reports
+
+    def pauses(self, t: float) -> bool:
+        """See `nav.batch.Taker`: whether a fusion is due."""
+        return t - self._fused_at >= self.config.fusion_period_s - TIME_TOLERANCE
+
+    def _pause(self, state: State, t: float) -> None:
+        """Fuse."""
+        config = self.config
+        if config.cross_check:
+            self._cross_check(state, t)
+        self._master.fuse(state)
+        self._fused_at = t
+        if config.recall_s is not None and t - self._remembered_at >= config.recall_s - TIME_TOLERANCE:
+            self._remember(state)
+            self._remembered_at = t
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether it takes many steps at once."""
+        return self._state is not None and self.config.weighting == "none" and not self._reference.scalings
+
+    def take(
+        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+    ) -> int:
+        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+        if self._state is None or self._doubts.off.any():
+            return 0
+        taken, self._last_bad = self._batch.take(
+            self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates
+        )
+        self.t = ahead.t
+        last = steps[taken - 1].sample if taken else None
+        used = last is not None and not (isinstance(last, GnssSample) and not last.has_fix)
+        if last is not None and used and self.pauses(last.t):
+            self._pause(self._state, last.t)
+        return taken
+
+    def trusted(self, fix: GnssSample, before: float) -> bool:
+        """See `nav.batch.Taker`."""
+        return self._doubts.trusted(fix, before)
+
+    def took(self, sample: Sample) -> None:
+        """See `nav.batch.Taker`."""
+        if isinstance(sample, GnssSample):
+            if not sample.has_fix:
+                return
+            self._last_fused = sample.t
+            self._doubts.used(sample)
+        for filter_ in self.locals:
+            filter_.stand_in(sample)
+
+    def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
+        """See `nav.batch.Taker`."""
+        assert self._state is not None
+        self.took(sample)
+        return self._use(self._state, self._users[sample.sensor][0], sample, first)
+
+    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
+        """See `nav.batch.Taker`."""
+        assert self._state is not None
+        state = State(*self._state.shape, whole)
+        return self._master.told(state, t, self._status(t, last_bad), self._doubts.off)
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN), as `update` would give."""
@@ -243,11 +288,11 @@ class Federated:
 
     # --- one sample in one local filter
 
-    def _use(self, state: State, filter_: LocalFilter, sample: Sample) -> list[UpdateReport]:
+    def _use(self, state: State, filter_: LocalFilter, sample: Sample, first: int = 0) -> list[UpdateReport]:
         aid = filter_.aids[sample.sensor]
         reports: list[UpdateReport] = []
         withheld: Ruling | None = None
-        for part, _ in aid.parts:
+        for part, _ in aid.parts[first:]:
             measurement = filter_.measure(self._reference, state, aid, part, sample)
             if measurement is None:
                 continue
@@ -298,7 +343,7 @@ class Federated:
             ruling = isolated._replace(weight=ruling.weight)
         elif decision.alarm and withheld is None:
             ruling = OUTSIDE._replace(weight=ruling.weight)
-        threshold = decision.threshold if math.isclose(decision.statistic, nis, rel_tol=1e-6) else math.nan
+        threshold = shown_limit(decision.threshold, decision.statistic, nis)
         return report_on(sample, part, nu, S, nis, threshold, ruling)
 
     def _policy(self, filter_: LocalFilter, monitor: Monitor) -> Policy | None:
@@ -324,10 +369,10 @@ class Federated:
         """
         everyone = np.ones(len(self.locals))
         healthy = everyone if self.config.recall_s is not None else self._healthy()
-        master = self._combine(state, healthy if healthy.any() else everyone)
+        master = self._master.combine(state, healthy if healthy.any() else everyone)
         measurement = filter_.measure_at_nominal(self._reference, state, filter_.aids[sample.sensor], part, sample)
         assert measurement is not None
-        x, P, common = state.x[filter_.row].copy(), self._charted(state, filter_.row), self._common
+        x, P, common = state.x[filter_.row].copy(), self._master.charted(state, filter_.row), self._common
         change = -x
         change[:common] = 0.0  # the nominal state is without what the filter would add to it
         reset(x, P, master.x, master.P)
@@ -347,9 +392,9 @@ class Federated:
         healthy = self._healthy()
         if not healthy.any():
             return
-        master = self._combine(state, healthy)
+        master = self._master.combine(state, healthy)
         row, model = faulty.row, faulty.model
-        shares = self._reset_shares()
+        shares = self._master.reset_shares()
         if self.config.combination == "information":
             shares = np.where(healthy > 0, shares, 0.0)
             shares = np.where(
@@ -361,7 +406,7 @@ class Federated:
                 state.x[row, where] = 0.0
                 forget(state.P[row], where.start, model.sigma[where] ** 2)
         for i, share in enumerate(shares):
-            self._reset(state, i, master.x, master.P / share)
+            self._master.reset(state, i, master.x, master.P / share)
 
     def _remember(self, state: State) -> None:
         """The younger shadows become the older ones, and the filters the younger."""
@@ -387,7 +432,7 @@ class Federated:
         if healthy.sum() >= 2:
             positions = state.P[:, range(POS, POS + 3), range(POS, POS + 3)]
             for i in np.flatnonzero((healthy > 0) & (positions.max(axis=1) < LOST_M**2)):
-                others = self._combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
+                others = self._master.combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
                 S = state.P[i, VEL:MOTION, VEL:MOTION] + others.P[VEL:MOTION, VEL:MOTION]
                 against[i] = whiten(state.x[i, VEL:MOTION] - others.x[VEL:MOTION], S)[1]
         if not against.max() > chi_square_threshold(CROSS_CHECK_FALSE_ALARM, MOTION - VEL):
@@ -431,76 +476,21 @@ class Federated:
             nu, S, nis = filter_.innovate(state, measurement)
             if part == "gnss_velocity" and nis <= filter_.gate.threshold(3):
                 continue
-            for i, share in enumerate(np.tile(self._reset_shares(), self._copies)):
+            for i, share in enumerate(np.tile(self._master.reset_shares(), self._copies)):
                 forget(state.P[i], start, (nu**2 + np.diag(S)) / share)
             if part == "gnss_velocity":
                 for local in self.locals:
                     local.forget_air(state)
 
-    # --- the master
-
-    def _noise_shares(self) -> Array:
-        """By which noise and covariance are divided, for each row: ones when information is not shared."""
-        shares = np.ones(len(self.locals)) if self.config.sharing == "none" else self.shares
-        return np.tile(shares, self._copies)
-
-    def _reset_shares(self) -> Array:
-        """The shares of a fused covariance, for each filter: ones when the combination does not add information up."""
-        return self.shares if self.config.combination == "information" else np.ones(len(self.locals))
-
-    def _combine(self, state: State, members: Array) -> Master:
-        """The fused solution of the ``members`` (filters,), one or zero each."""
-        n = len(self.locals)
-        P = state.P[:n]
-        if self._reference.scalings:
-            P = np.stack([self._charted(state, row) for row in range(n)])
-        return combine(state.x[:n], P, self._common, members, self.config.combination, self.config.weigh)
-
-    def _charted(self, state: State, row: int) -> Array:
-        """A copy of one filter's P, as the covariance of its x; by sigma points it is that of its own estimate."""
-        P = state.P[row]
-        return turned(state.x[row], P, own=False) if row in self._reference.scalings else P.copy()
-
-    def _reset(self, state: State, row: int, x_g: Array, P_g: Array) -> None:
-        """`reset` one filter."""
-        P = self._charted(state, row)
-        reset(state.x[row], P, x_g, P_g)
-        state.P[row] = turned(state.x[row], P, own=True) if row in self._reference.scalings else P
-
-    def _fuse(self, state: State) -> None:
-        """Fuse, correct the nominal state, reset the filters as the structure says."""
-        config = self.config
-        everyone = np.ones(len(self.locals))
-        if config.sharing == "by_covariance":
-            by = weights_by_covariance(state.P[: len(self.locals)], self._common, everyone, self.shares)
-            by = np.maximum(by, LEAST_SHARE)
-            self.shares = by / by.sum()
-            self._reference.share_noise(self._noise_shares())
-        master = self._combine(state, everyone)
-        retention = {"no_reset": 0.0, "full_reset": 1.0, "partial": config.retention}[config.structure]
-        if retention > 0:
-            for i, share in enumerate(self._reset_shares()):
-                target = master.x, master.P / share
-                if retention < 1:
-                    target = blend(state.x[i], self._charted(state, i), *target, retention)
-                self._reset(state, i, *target)
-        self._reference.correct(state, master.x)
-
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        status = Status.ALIGNING if state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
-        if t - last_bad <= BAD_SAMPLE_S:
-            status |= Status.BAD_SAMPLE
+        status = self._status(t, last_bad)
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
-        master = self._combine(state, np.ones(len(self.locals)))
-        inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
-        P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
-        covariance, sigma = spread(doubted(P, self._doubts.off), self.config.mounting_sigma**2)
-        imu = state.imu.copy()
-        common = ((name, at) for name, at in self.model.slices.items() if at.start < self._common)
-        extra = {name: (imu[at], sigma[at]) for name, at in common if name not in REPORTED}
-        for name, row, where in self._extra:
-            extra[name] = (state.x[row, where].copy(), np.sqrt(state.P[row, where, where].diagonal()))
-        return describe(state, imu, P, self.model, t, status, covariance, sigma, extra)
+        return self._master.told(state, t, status, self._doubts.off)
+
+    def _status(self, t: float, last_bad: float) -> Status:
+        """What it says of itself at ``t``."""
+        status = Status.ALIGNING if self._state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
+        return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status

@@ -58,7 +58,7 @@ from nav.samples import (
     WindSample,
 )
 from nav.smoother import Smoother
-from nav.state import Known, State
+from nav.state import Known, State, known
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
 
@@ -149,10 +149,8 @@ class Ins:
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
-        self._batch = Batch(self._filter, self._reference, self._is_plain)
-        plain = not (policies or fadings or config.smooth or config.scaling or course)
-        seen = field_n is not None or not any(isinstance(aid, MagnetometerAid) for aid in config.aids)
-        self._takes_steps = plain and seen
+        self._batch = Batch([self._filter], self._reference)
+        self._takes_steps = not (config.smooth or config.scaling or course)
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]
 
     @property
@@ -207,36 +205,24 @@ class Ins:
         self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
     ) -> int:
         """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        state = self._state
-        if state is None or self._doubt.any() or self._wind_doubt.pending:
+        if self._state is None or self._doubt.any() or self._wind_doubt.pending:
             return 0
-        plan = self._batch.plan(steps, self._monitor.last_fused)
-        if not len(plan):
-            return 0
-        done = self._batch.run(state, ahead, plan, self._last_bad)
-        self.t, self._last_bad = done.t, done.last_bad
-        reports += self._batch.reports(steps, done)
-        states = self._batch.states(done)
-        for t, _, sample in steps[: done.steps]:
-            if sample is not None:
-                self._took(sample)
-            elif not math.isnan(t):
-                then, last_bad, known = next(states)
-                self._wind_doubt.right(self._monitor.last_fused)
-                estimates.append(self._described(known, then, self._status(then, last_bad), self._doubt))
-        if not done.parts:
-            return done.steps
-        sample = steps[done.steps].sample
-        assert sample is not None
-        reports += self._finish(state, sample, done.parts)
-        return done.steps + 1
+        taken, self._last_bad = self._batch.take(
+            self, self._state, self._last_bad, self._monitor.last_fused, steps, ahead, reports, estimates
+        )
+        self.t = ahead.t
+        return taken
 
-    def _is_plain(self, fix: GnssSample, before: float) -> bool:
-        """Whether a fix, if it is inside the gate, is simply used when that of the time ``before`` was."""
+    def trusted(self, fix: GnssSample, before: float) -> bool:
+        """See `nav.batch.Taker`."""
         return self._monitor.sure(fix.t, before) and not (self._winds is not None and self._winds.due(fix.t))
 
-    def _took(self, sample: Sample) -> None:
-        """A sample was used, at least the first part of it."""
+    def pauses(self, t: float) -> bool:
+        """See `nav.batch.Taker`."""
+        return False
+
+    def took(self, sample: Sample) -> None:
+        """See `nav.batch.Taker`."""
         if isinstance(sample, GnssSample):
             if not sample.has_fix:
                 self._monitor.heard(sample.t)
@@ -246,13 +232,21 @@ class Ins:
             self._refusals[sample.sensor].taken()
         self._filter.stand_in(sample)
 
-    def _finish(self, state: State, sample: Sample, first: int) -> list[UpdateReport]:
-        """Use the parts from the ``first`` on of a sample whose others were used."""
-        self._took(sample)
-        aid = self._filter.aids[sample.sensor]
+    def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
+        """See `nav.batch.Taker`."""
+        self.took(sample)
+        aid, state = self._filter.aids[sample.sensor], self._state
+        assert state is not None
+        self.t = sample.t
         if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
             return self._update_gnss_further(state, sample, aid, None)
         return self._update_part_by_part(state, sample, aid, first)
+
+    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
+        """See `nav.batch.Taker`."""
+        assert self._state is not None
+        self._wind_doubt.right(self._monitor.last_fused)
+        return self._described(known(whole, *self._state.shape), t, self._status(t, last_bad), self._doubt)
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample is of an aid, or can still serve the alignment."""

@@ -150,6 +150,26 @@ class LocalFilter:
             P += np.outer(along, along)
             P[POS + axis, POS + axis] += (lasting_s * change[axis]) ** 2 / 12.0
 
+    def limits(self, sensor: str) -> tuple[float, ...] | None:
+        """The largest statistic of each part of a sensor's samples, up to which it is simply used.
+
+        None where more has to be decided, or is asked of what a sample is.
+        """
+        if sensor in self._scatters or sensor in self._contradictions:
+            return None
+        limits = []
+        for part, m in self.aids[sensor].parts:
+            monitor = self.monitors.get((sensor, part))
+            if monitor is None:
+                special = part in self.policies or part in self.fadings or part in self.noises
+                limit = None if special else self.gate.threshold(m)
+            else:
+                limit = monitor.limit(m)
+            if limit is None:
+                return None
+            limits.append(limit)
+        return tuple(limits)
+
     def _noise(self, sensor: str, part: str) -> SageHusa | None:
         """What learns the variances of one part of a sensor's samples."""
         monitor = self.monitors.get((sensor, part))
@@ -223,7 +243,7 @@ class LocalFilter:
                 state.P[self.row], measurement.at_points, measurement.H, measurement.R
             )
             return nu, S, nis
-        return _innovate(
+        return own_innovation(
             state.P[self.row], state.x[self.row], len(state.imu), measurement.H, measurement.R, measurement.nu
         )
 
@@ -353,7 +373,7 @@ class LocalFilter:
 
 
 @njit
-def _innovate(P: Array, x: Array, common: int, H: Array, R: Array, nu: Array) -> tuple[Array, Array, float]:
+def own_innovation(P: Array, x: Array, common: int, H: Array, R: Array, nu: Array) -> tuple[Array, Array, float]:
     """(innovation, S, nis) at nominal state plus ``x[:common]``, from the innovation ``nu`` (m,) at the nominal one."""
     own = nu.copy()
     for k in range(len(nu)):

@@ -64,6 +64,11 @@ class Isolation(NamedTuple):
     isolated: tuple[bool, ...]  # per axis, after the event
 
 
+def shown_limit(threshold: float, statistic: float, nis: float) -> float:
+    """The gate that a report shows beside ``nis``: NaN where the detector judged by another ``statistic``."""
+    return threshold if math.isclose(statistic, nis, rel_tol=1e-6) else math.nan
+
+
 class Monitor:
     """What is known of one part of a sensor's samples: which axes are isolated, how long each has been bad or good.
 
@@ -94,15 +99,28 @@ class Monitor:
         self._clean = True
         self._new_detector = deepcopy(detector)
 
+    def limit(self, m: int) -> float | None:
+        """Up to which statistic a measurement of ``m`` axes is sound, and changes nothing but `passed`; None if more
+        than that decides.
+        """
+        detector, simple = self.detector, self._variance is None and self.noise is None and self.policy is None
+        if not (simple and self._clean and isinstance(detector, ChiSquare) and not detector.alarmed):
+            return None
+        return chi_square_threshold(detector.false_alarm, m)
+
+    def passed(self, statistic: float, threshold: float, t: float) -> None:
+        """A measurement was judged: how suspicious it made the sensor."""
+        ratio = statistic / threshold
+        self.suspicion = max(ratio, 0.0) if ratio == ratio else math.inf
+        faded = self.suspected * math.exp((self.judged - t) / LATELY_S) if 0 < self.suspected < math.inf else 0.0
+        self.suspected, self.judged = max(self.suspicion, faded), t
+
     def judge(self, nu: Array, S: Array, t: float) -> tuple[Decision, Change]:
         """The detector's decision on a measurement, and what it changes; an axis isolated outweighs one readmitted."""
         if self._variance is not None:
             S = self._variance.widened(nu, S, t, sound=self._clean)
         decision = self.detector.step(nu, S, t)
-        ratio = decision.statistic / decision.threshold
-        self.suspicion = max(ratio, 0.0) if ratio == ratio else math.inf
-        faded = self.suspected * math.exp((self.judged - t) / LATELY_S) if 0 < self.suspected < math.inf else 0.0
-        self.suspected, self.judged = max(self.suspicion, faded), t
+        self.passed(decision.statistic, decision.threshold, t)
         if not decision.alarm and self._clean:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated

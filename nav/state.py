@@ -47,9 +47,9 @@ class State:
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
     shaking: Array  # (3, 3) rate and force of the increment before; densities of their noise, and the last one's length
 
-    def __init__(self, common: int, filters: int, n: int) -> None:
+    def __init__(self, common: int, filters: int, n: int, whole: Array | None = None) -> None:
         self.shape = common, filters, n
-        self.whole = np.zeros(FIXED + common + filters * n * (n + 1))
+        self.whole = np.zeros(FIXED + common + filters * n * (n + 1)) if whole is None else whole
         (
             self.q_nb, self.v_n, self.lla, self.imu, self.x, self.P, self.errors, self.sums, self.elapsed, self.rates,
             self.shaking,
@@ -156,7 +156,7 @@ def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -
         imu[i] += correction[i]
 
 
-@njit
+@inlined
 def _covariance_step(
     v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,

@@ -22,6 +22,11 @@ class ChiSquare:
     false_alarm: float
     _alarm: Alarm = field(default_factory=Alarm, init=False)
 
+    @property
+    def alarmed(self) -> bool:
+        """Whether the last sample was an alarm."""
+        return self._alarm.on
+
     def passes(self, gamma2: float, m: int) -> bool:
         """Whether the squared distance ``gamma2`` of ``m`` axes is small enough; a NaN is not."""
         return gamma2 <= chi_square_threshold(self.false_alarm, m)

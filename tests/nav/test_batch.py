@@ -7,8 +7,12 @@ import pytest
 from worlds.ins import CONSUMER, DT, FIELD_N, airspeed, barometer, flight, gnss, imu, magnetometer
 
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, PositionFixAid
+from nav.detection import ChiSquare, Eraim
+from nav.federated import Federated
+from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.monitor import MonitoredAid
 from nav.samples import FixType, ImuSamples, PositionSample
 
 ARM = (0.5, 0.1, -0.3)
@@ -87,9 +91,12 @@ def rough(increments, samples):
     return made
 
 
-def run(one_by_one, config, increments, samples, block_s, times):
-    """Reports, estimates and the last state, pushed in blocks of `block_s`."""
-    ins = Ins(config, lambda lat, lon, h: FIELD_N * (1 + 1e-3 * (lat - 0.83)))
+def field_n(lat, lon, h):
+    return FIELD_N * (1 + 1e-3 * (lat - 0.83))
+
+
+def run(one_by_one, ins, increments, samples, block_s, times):
+    """Reports, estimates and the estimator, pushed in blocks of `block_s`."""
     horizon = FusionHorizon(OneByOne(ins) if one_by_one else ins, lag_s=0.1)
     samples = sorted(samples, key=lambda s: s.t_arrival)
     reports, estimates, taken, size = [], [], 0, round(block_s / DT)
@@ -147,7 +154,7 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
             PositionSample(t, t, truth.lat[k], truth.lon[k], truth.h[k])
             for k, t in ((k, k * DT) for k in range(round(20 / DT), round(60 / DT), round(1 / DT)))
         ]
-        results.append(run(one_by_one, config, increments, samples, block_s, times))
+        results.append(run(one_by_one, Ins(config, field_n), increments, samples, block_s, times))
     (reports, estimates, ins), *others = results
     assert ins.aligned
     assert len({report.outcome for report in reports}) >= (4 if spoilt else min(1, len(config.aids)))
@@ -157,6 +164,38 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         assert all(map(same, estimates, told))
         assert np.array_equal(ins._state.whole, other._state.whole)
         assert same(ins._monitor, other._monitor)
+
+
+@pytest.mark.parametrize(
+    ("change", "detector"),
+    [
+        ({}, lambda: ChiSquare(1e-3)),
+        ({"structure": "full_reset", "fusion_period_s": 0.25}, lambda: ChiSquare(1e-2)),
+        ({"recall_s": 5.0, "cross_check": True}, lambda: ChiSquare(1e-3)),
+        ({"weighting": "normalised"}, lambda: Eraim(1e-3)),
+    ],
+)
+def test_so_does_a_federation(change, detector):
+    receiver, pressure, field, air = (MonitoredAid(aid, detector) for aid in AIDS)
+    parts = (Local("gnss", (receiver,)), Local("air", (air, pressure)), Local("field", (field,)))
+    config = dataclasses.replace(Config(CONSUMER, parts), **change)
+    times = np.arange(0.1, DURATION - 1, 0.1).tolist()
+    results = []
+    for one_by_one, block_s in ((True, 1.0), (False, 7.3)):
+        increments, samples = sound(0.0)
+        samples = rough(increments, samples)
+        results.append(run(one_by_one, Federated(config, field_n), increments, samples, block_s, times))
+    (reports, estimates, one), (some, told, other) = results
+    assert one.aligned
+    assert len({report.outcome for report in reports}) >= 4
+    assert len(some) == len(reports)
+    assert all(map(same, reports, some))
+    assert all(map(same, estimates, told))
+    assert same(one.events, other.events)
+    for a, b in zip(one.locals, other.locals, strict=True):
+        assert all(
+            same(x.suspected, y.suspected) for x, y in zip(a.monitors.values(), b.monitors.values(), strict=True)
+        )
 
 
 def test_most_of_a_sound_flight_is_taken_at_once():

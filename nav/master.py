@@ -1,0 +1,114 @@
+"""The master of a federation: fuses what the local filters found, gives it back to them, and says what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nav._jit import njit
+from nav.federation import Config
+from nav.fusion import Master, blend, combine, reset, weights_by_covariance
+from nav.local_filter import LocalFilter
+from nav.reference import REPORTED, Reference, describe, doubted, spread, turned
+from nav.samples import Array, Estimate, Status
+from nav.state import State, inject
+
+LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
+
+
+def noise_shares(config: Config, shares: Array, copies: int) -> Array:
+    """By which noise and covariance are divided, for each row: ones when information is not shared."""
+    return np.tile(np.ones(len(config.locals)) if config.sharing == "none" else shares, copies)
+
+
+class MasterFilter:
+    """Fuses the ``filters`` over a ``reference`` that has ``copies`` rows for each, its shadows among them."""
+
+    def __init__(self, config: Config, filters: Sequence[LocalFilter], reference: Reference, copies: int) -> None:
+        self.shares = config.shares
+        self._config, self._filters, self._reference, self._copies = config, filters, reference, copies
+        self._everyone = np.ones(len(filters))
+        self._extra = self._extras()
+        common = filters[0].model.slices.items()
+        self._common = [(name, at) for name, at in common if at.start < reference.common and name not in REPORTED]
+
+    def _extras(self) -> list[tuple[str, int, slice]]:
+        """(name, row, where) of the further states in an estimate: a name that two filters have gets the filter's."""
+        own = [
+            (name, row, where)
+            for row, filter_ in enumerate(self._filters)
+            for name, where in filter_.model.slices.items()
+            if where.start >= self._reference.common
+        ]
+        names = [name for name, _, _ in own]
+        return [
+            (f"{self._config.locals[row].name}_{name}" if names.count(name) > 1 else name, row, where)
+            for name, row, where in own
+        ]
+
+    def noise_shares(self) -> Array:
+        """See the function."""
+        return noise_shares(self._config, self.shares, self._copies)
+
+    def reset_shares(self) -> Array:
+        """The shares of a fused covariance, for each filter: ones when the combination does not add information up."""
+        return self.shares if self._config.combination == "information" else self._everyone
+
+    def combine(self, state: State, members: Array) -> Master:
+        """The fused solution of the ``members`` (filters,), one or zero each."""
+        n, config = len(self._filters), self._config
+        P = state.P[:n]
+        if self._reference.scalings:
+            P = np.stack([self.charted(state, row) for row in range(n)])
+        return combine(state.x[:n], P, self._reference.common, members, config.combination, config.weigh)
+
+    def charted(self, state: State, row: int) -> Array:
+        """A copy of one filter's P, as the covariance of its x; by sigma points it is that of its own estimate."""
+        P = state.P[row]
+        return turned(state.x[row], P, own=False) if row in self._reference.scalings else P.copy()
+
+    def reset(self, state: State, row: int, x_g: Array, P_g: Array) -> None:
+        """`nav.fusion.reset` one filter."""
+        P = self.charted(state, row)
+        reset(state.x[row], P, x_g, P_g)
+        state.P[row] = turned(state.x[row], P, own=True) if row in self._reference.scalings else P
+
+    def fuse(self, state: State) -> None:
+        """Fuse, correct the nominal state, reset the filters as the structure says."""
+        config, n = self._config, len(self._filters)
+        if config.sharing == "by_covariance":
+            by = weights_by_covariance(state.P[:n], self._reference.common, self._everyone, self.shares)
+            by = np.maximum(by, LEAST_SHARE)
+            self.shares = by / by.sum()
+            self._reference.share_noise(self.noise_shares())
+        master = self.combine(state, self._everyone)
+        retention = {"no_reset": 0.0, "full_reset": 1.0, "partial": config.retention}[config.structure]
+        if retention > 0:
+            for i, share in enumerate(self.reset_shares()):
+                target = master.x, master.P / share
+                if retention < 1:
+                    target = blend(state.x[i], self.charted(state, i), *target, retention)
+                self.reset(state, i, *target)
+        self._reference.correct(state, master.x)
+
+    def told(self, state: State, t: float, status: Status, off: Array) -> Estimate:
+        """The estimate of a settled ``state``, which is changed, with a doubt ``off`` (9,) of its motion."""
+        master, model = self.combine(state, self._everyone), self._filters[0].model
+        inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
+        P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
+        covariance, sigma = spread(doubted(P, off), self._config.mounting_sigma**2)
+        imu, x, deviation = state.imu.copy(), state.x.copy(), deviations(state.P)
+        extra = {name: (imu[at], sigma[at]) for name, at in self._common}
+        extra |= {name: (x[row, where], deviation[row, where]) for name, row, where in self._extra}
+        return describe(state, imu, P, model, t, status, covariance, sigma, extra)
+
+
+@njit
+def deviations(P: Array) -> Array:
+    """1-sigma (filters, n) of the states of covariances (filters, n, n)."""
+    sigma = np.empty(P.shape[:2])
+    for f in range(len(P)):
+        for i in range(P.shape[1]):
+            sigma[f, i] = np.sqrt(P[f, i, i])
+    return sigma
