@@ -430,7 +430,7 @@ class Federated:
         healthy = self._healthy()
         against = np.zeros(len(healthy))
         if healthy.sum() >= 2:
-            positions = state.P[:, range(POS, POS + 3), range(POS, POS + 3)]
+            positions = state.P[: len(healthy), range(POS, POS + 3), range(POS, POS + 3)]  # not those of shadows
             for i in np.flatnonzero((healthy > 0) & (positions.max(axis=1) < LOST_M**2)):
                 others = self._master.combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
                 S = state.P[i, VEL:MOTION, VEL:MOTION] + others.P[VEL:MOTION, VEL:MOTION]
