@@ -34,6 +34,7 @@ JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what th
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 COINCIDENT = 1e-6  # two times this close are the same [s]
+KNOWN = Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY
 NO_ATTITUDE = np.full(4, np.nan)
 NO_COVARIANCE = np.full((9, 9), np.nan)
 
@@ -166,7 +167,7 @@ class Ahrs:
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
-        return self._estimate(self._state.copy() if self._state is not None else None, self.t, self._last_bad)
+        return self._estimate(self._state.present() if self._state is not None else None, self.t, self._last_bad)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments, the filter itself staying where it is."""
@@ -386,11 +387,11 @@ class Ahrs:
         The attitude is what it is before the corrections still outstanding, so they are part of its error; so is the
         tilt of accelerometers that are biased, which no state stands for.
         """
-        bad = Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status(0)
+        bad = t - last_bad <= BAD_SAMPLE_S
         if s is None or not s.levelled:
             return Estimate(
                 t, math.nan, math.nan, math.nan, UNKNOWN, NO_ATTITUDE, UNKNOWN, UNKNOWN, NO_COVARIANCE, UNKNOWN,
-                UNKNOWN, Status.ALIGNING | bad,
+                UNKNOWN, Status.ALIGNING | Status.BAD_SAMPLE if bad else Status.ALIGNING,
             )  # fmt: skip
         self._settle(s)
         phi = s.x[PHI : PHI + 3]
@@ -413,7 +414,7 @@ class Ahrs:
             covariance=covariance,
             sigma_gyro_bias=sigma[BIAS:STATES],
             sigma_accel_bias=sigma_accel_bias,
-            status=Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY | bad,
+            status=KNOWN | Status.BAD_SAMPLE if bad else KNOWN,
             extra={
                 "mode_counter": (np.array([float(s.mode_counter)]), zero),
                 "correction_counter": (np.array([float(s.correction_counter)]), zero),

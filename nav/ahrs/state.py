@@ -67,6 +67,11 @@ class State:
         """The same in arrays of its own."""
         return copied(self)
 
+    def present(self) -> State:
+        """The same, to be settled and handed out, but not propagated: what that changes or shows is its own."""
+        own = {name: getattr(self, name).copy() for name in ("shown", "q_nb", "x", "P", "turned", "elapsed")}
+        return State(**vars(self) | own)
+
 
 T = TypeVar("T", State, InMotion)
 _OWN = np.ndarray, InMotion  # of what a copy has its own
