@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
@@ -160,12 +161,13 @@ def odometry(r: Rows) -> Fields:
     }
 
 
-def _solution(s: Snapshot) -> int:
+@cache
+def _solution(status: Status, fixed: bool) -> int:
     """What an aligned estimator knows, in the bits that ESTIMATOR_STATUS and EKF_STATUS_REPORT have in common.
 
     MAVSDK has its health from the latter, so position is no longer absolute as soon as nothing fixes it.
     """
-    if Status.ATTITUDE_ONLY in s.estimate.status:
+    if Status.ATTITUDE_ONLY in status:
         return int(mav.EKF_ATTITUDE)
     known: int = (
         mav.EKF_ATTITUDE
@@ -176,14 +178,15 @@ def _solution(s: Snapshot) -> int:
         | mav.EKF_PRED_POS_HORIZ_REL
     )
     absolute: int = mav.EKF_POS_HORIZ_ABS | mav.EKF_PRED_POS_HORIZ_ABS
-    return known if Status.DEAD_RECKONING in s.estimate.status or not s.fixed else known | absolute
+    return known if Status.DEAD_RECKONING in status or not fixed else known | absolute
 
 
 def estimator_status(s: Snapshot) -> Fields:
     """What the estimator holds for known, innovations over their gates, its own sigma."""
     return {
         "time_usec": s.usec,
-        "flags": (_solution(s) if s.aligned else 0) | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
+        "flags": (_solution(s.estimate.status, s.heard.fixed) if s.aligned else 0)
+        | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
         "vel_ratio": s.ratio("gnss_velocity"),
         "pos_horiz_ratio": s.ratio("gnss_position"),
         "pos_vert_ratio": s.ratio("barometer"),
@@ -197,7 +200,7 @@ def estimator_status(s: Snapshot) -> Fields:
 
 def ekf_flags(s: Snapshot) -> int:
     """What the estimator holds for known, in the bits of EKF_STATUS_REPORT."""
-    known: int = _solution(s) if s.aligned else mav.EKF_UNINITIALIZED
+    known: int = _solution(s.estimate.status, s.heard.fixed) if s.aligned else mav.EKF_UNINITIALIZED
     return known | (mav.EKF_GPS_GLITCHING if s.doubted else 0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +18,13 @@ from testbed.mavlink.stream import Stream
 
 Places: TypeAlias = NDArray[np.intp]
 
-KEPT = 250  # moments, ten seconds at the usual rate
+KEPT = 1000  # moments, forty seconds at the usual rate
+FRESH_S = 1.0  # of wall time: what is kept is no older, so that a log can be followed
 _SLOTS = 256  # frames of one moment at most
 _STAMP, _HEAD, _TAIL = 8, 10, 2  # bytes before and after a payload
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # frozen ones take three times as long to make
 class _Moment:
     """What one vehicle says at one time."""
 
@@ -39,6 +41,7 @@ class History:
     def __init__(self) -> None:
         self._moments: list[_Moment] = []
         self._numbers = np.zeros(256, np.uint8)
+        self._taken = time.monotonic()
 
     def add(
         self,
@@ -50,27 +53,32 @@ class History:
     ) -> bool:
         """Keep what is ``said`` first and the ``streams`` due of a ``snapshot``; whether it is time to take them."""
         self._moments.append(_Moment(stamp_us, system, said, snapshot, streams))
-        return len(self._moments) >= KEPT
+        return len(self._moments) >= KEPT or time.monotonic() - self._taken > FRESH_S
 
     def take(self) -> bytes:
         """All that was kept as bytes of a log: big-endian microseconds before each frame."""
-        moments, self._moments = self._moments, []
+        moments, self._moments, self._taken = self._moments, [], time.monotonic()
         parts = _Parts()
-        wanted: dict[Stream, list[tuple[int, int]]] = defaultdict(list)
+        wanted: dict[Stream, list[int]] = defaultdict(list)
         for at, moment in enumerate(moments):
-            for slot, (message, fields) in enumerate(moment.said):
+            place = at * _SLOTS
+            for message, fields in moment.said:
                 payload = np.frombuffer(layout(message).payload(fields), np.uint8)
-                parts.add(message, np.array([at]), np.array([slot]), np.array([len(payload)]), payload)
-            for slot, stream in enumerate(moment.streams, len(moment.said)):
-                wanted[stream].append((at, slot))
-        together: dict[tuple[int, ...], Rows] = {}  # streams of one rate share what is worked out
+                parts.add(message, np.array([place]), np.array([len(payload)]), payload)
+                place += 1
+            for stream in moment.streams:
+                wanted[stream].append(place)
+                place += 1
+        together: dict[bytes, Rows] = {}  # streams of one rate share what is worked out
         for stream, found in wanted.items():
-            where, slots = zip(*found, strict=True)
-            rows = together.get(where)
+            places = np.array(found)
+            where = places // _SLOTS
+            rows = together.get(where.tobytes())
             if rows is None:
-                rows = together[where] = Rows([one for at in where if (one := moments[at].snapshot) is not None])
+                snapshots = [one for at in where.tolist() if (one := moments[at].snapshot) is not None]
+                rows = together[where.tobytes()] = Rows(snapshots)
             own = stream.payloads(rows)
-            parts.add(stream.message, np.array(where)[own.rows], np.array(slots)[own.rows], own.sizes, own.data)
+            parts.add(stream.message, places[own.rows], own.sizes, own.data)
         stamps = np.array([max(0, min(2**64 - 1, moment.stamp_us)) for moment in moments], np.uint64)
         systems = np.array([moment.system for moment in moments], np.uint8)
         return parts.frames(stamps, systems, self._numbers)
@@ -83,12 +91,12 @@ class _Parts:
         self._payloads: list[NDArray[np.uint8]] = []
         self._facts: list[NDArray[np.int64]] = []  # rows of place, moment, size, message, seed of the checksum
 
-    def add(self, message: str, moments: Places, slots: Places, sizes: Places, data: NDArray[np.uint8]) -> None:
-        """Payloads of one message (N,), each at a slot of its moment."""
+    def add(self, message: str, places: Places, sizes: Places, data: NDArray[np.uint8]) -> None:
+        """Payloads of one message (N,), each at its place: the slot of a moment."""
         own = layout(message)
-        facts = np.empty((len(moments), 5), np.int64)
-        facts[:, 0] = moments * _SLOTS + slots
-        facts[:, 1] = moments
+        facts = np.empty((len(places), 5), np.int64)
+        facts[:, 0] = places
+        facts[:, 1] = places // _SLOTS
         facts[:, 2] = sizes
         facts[:, 3] = int.from_bytes(own.id, "little")
         facts[:, 4] = own.crc_extra[0]

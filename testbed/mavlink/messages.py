@@ -70,13 +70,18 @@ _AIDS: Mapping[type[Sample], int] = {
 }
 
 
+def inertial(s: Snapshot) -> bool:
+    """Whether the inertial reading is one."""
+    return all(map(math.isfinite, s.gyro.tolist() + s.accel.tolist()))
+
+
 def health(s: Snapshot) -> int:
     """Which sensors work, in the bits of SYS_STATUS.
 
     Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
     """
     bits = _ALWAYS
-    if all(map(math.isfinite, s.gyro.tolist() + s.accel.tolist())):
+    if inertial(s):
         bits |= _INERTIAL
     if s.aligned:
         bits |= _ALIGNED
@@ -94,7 +99,7 @@ def health(s: Snapshot) -> int:
 def sys_status(s: Snapshot) -> Fields:
     """Which sensors there are and which of them work."""
     present = _ALWAYS | _INERTIAL | _ALIGNED
-    for kind in s.first:
+    for kind in s.heard.first:
         present |= _AIDS.get(kind, 0)
     return {
         "onboard_control_sensors_present": present,
@@ -179,7 +184,7 @@ def home_position(s: Snapshot) -> Fields | None:
 
 def gps_raw_int(s: Snapshot) -> Fields | None:
     """What the receiver says: no fix and nothing known when it is denied."""
-    if GnssSample not in s.first:
+    if GnssSample not in s.heard.first:
         return None
     fix = s.gnss_fix
     if fix is None:
@@ -220,7 +225,7 @@ def gnss_integrity(s: Snapshot) -> Fields | None:
 
     Spoofing is reported while the estimator isolates, or long refuses, a receiver that has one.
     """
-    if GnssSample not in s.first:
+    if GnssSample not in s.heard.first:
         return None
     spoofing = mav.GPS_SPOOFING_STATE_UNKNOWN
     if s.gnss_fix:

@@ -23,7 +23,7 @@ from testbed.mavlink.identity import identity_of
 from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
 from testbed.mavlink.parameters import Parameters
 from testbed.mavlink.signing import Signing
-from testbed.mavlink.snapshot import Point, Snapshot, known_point
+from testbed.mavlink.snapshot import Heard, Point, Snapshot, known_point
 from testbed.mavlink.stream import BESIDE_VEHICLES, OTHERS_HZ, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
 from testbed.motion.table import TruthBlock
 from testbed.scenario import Scenario
@@ -109,7 +109,10 @@ class MavlinkPublisher:
         self._leg = -1.0
         self._home: Point | None = None
         self._health: tuple[int, int] | None = None
-        self._imu_before: ImuSamples | None = None
+        self._health_of: tuple[object, ...] = ()  # what it was worked out from
+        self._heard: Heard | None = None
+        self._imu: ImuSamples | None = None
+        self._readings: list[_Readings] = []  # of the newest increments, and of those before
         self._gyro: Array = np.full(3, math.nan)
         self._accel: Array = np.full(3, math.nan)
         self._ratios: dict[str, float] = {}
@@ -151,12 +154,14 @@ class MavlinkPublisher:
                     frozenset(sensor for sensor, _ in self._isolated),
                     frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
                 )
+            if self._heard is None or not self._heard.holds(samples, t):
+                self._heard = Heard(samples, t, self._silent_s)
             if self._home is None:
                 self._home = known_point(estimate)
             snapshot = Snapshot(
                 truth,
                 estimate,
-                samples,
+                self._heard,
                 self._gyro,
                 self._accel,
                 others,
@@ -165,7 +170,6 @@ class MavlinkPublisher:
                 dict(self._ratios),
                 self._identity,
                 self._legs,
-                self._silent_s,
                 *self._shut_out,
             )
             self._tell_isolations(t, snapshot.isolated)
@@ -308,6 +312,11 @@ class MavlinkPublisher:
 
     def _health_changed(self, snapshot: Snapshot) -> list[tuple[str, Fields]]:
         """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
+        status, inertial = snapshot.estimate.status, messages.inertial(snapshot)
+        depends = snapshot.heard, status, inertial, snapshot.isolated, snapshot.refused
+        if depends == self._health_of:
+            return []
+        self._health_of = depends
         before, self._health = self._health, (messages.health(snapshot), estimates.ekf_flags(snapshot))
         if before in (None, self._health):
             return []
@@ -332,13 +341,23 @@ class MavlinkPublisher:
 
     def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
         """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""
-        for block in (imu, self._imu_before):
-            newest = int(block.t.searchsorted(t + 1e-6)) - 1 if block is not None else -1
-            if block is not None and newest >= 0:
-                self._gyro = block.dtheta[newest] / block.dt[newest]
-                self._accel = block.dv[newest] / block.dt[newest]
+        if imu is not self._imu:
+            self._readings = [_Readings(imu), *self._readings[:1]] if imu is not None else []
+            self._imu = imu
+        for block in self._readings:
+            newest = int(block.t.searchsorted(t + 1e-6)) - 1
+            if newest >= 0:
+                self._gyro, self._accel = block.gyro[newest], block.accel[newest]
                 break
-        self._imu_before = imu
+
+
+class _Readings:
+    """Angular rates [rad/s] and specific forces [m/s^2] (N, 3) of increments."""
+
+    def __init__(self, imu: ImuSamples) -> None:
+        self.t = imu.t
+        self.gyro = imu.dtheta / imu.dt[:, None]
+        self.accel = imu.dv / imu.dt[:, None]
 
 
 def _as_estimate(truth: TruthBlock) -> Estimate:

@@ -10,6 +10,7 @@ from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
+from nav._jit import njit
 from nav.earth import displacement_n, position_difference_n
 from nav.rotation import euler_from_quat, quat_conjugate, quat_multiply, rotvec_from_quat
 from nav.samples import (
@@ -27,6 +28,7 @@ from testbed.mavlink.encode import boot_ms, microseconds
 from testbed.mavlink.identity import Identity
 from testbed.motion.table import FLYING_MPS, TruthBlock
 
+_MARGIN_S = 1e-6  # before a sensor falls silent, where rounding might decide
 S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
 _KINDS = (GnssSample, BarometerSample, MagnetometerSample, AirspeedSample, PositionSample)
 Point: TypeAlias = tuple[float, float, float]
@@ -36,20 +38,48 @@ POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 DOWN, HEADING = slice(2, 3), slice(8, 9)
 
 
+class Heard:
+    """The newest sample of each sensor at a time, and what follows from who has fallen silent."""
+
+    def __init__(self, samples: Mapping[str, Sample], t: float, silent_s: Mapping[str, float]) -> None:
+        """``silent_s`` says after how long a sensor that says nothing counts as failed."""
+        self._samples = [*samples.values()]
+        self._ids = [*map(id, self._samples)]
+        self._t, self._until = t, math.inf
+        # The newest sample of the first sensor of each kind, and those of them that have not fallen silent.
+        self.first: dict[type[Sample], Sample] = {}
+        self.newest: dict[type[Sample], Sample] = {}
+        # Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer.
+        self.fixed = False
+        for sample in self._samples:
+            kind = _kind(sample)
+            speaks = t - sample.t_arrival < silent_s[sample.sensor]
+            if kind not in self.first:
+                self.first[kind] = sample
+                if speaks:
+                    self.newest[kind] = sample
+            if speaks:
+                self._until = min(self._until, sample.t_arrival + silent_s[sample.sensor])
+                self.fixed |= kind is PositionSample or (isinstance(sample, GnssSample) and sample.has_fix)
+
+    def holds(self, samples: Mapping[str, Sample], t: float) -> bool:
+        """Whether nothing of it has changed at a later time, with samples that may be others."""
+        return self._t <= t < self._until - _MARGIN_S and [*map(id, samples.values())] == self._ids
+
+
 @dataclass
 class Snapshot:
     """One instant of a run, in the numbers that several messages share; worked out when first asked for.
 
     ``gyro`` [rad/s] and ``accel`` [m/s^2] are the newest inertial reading; ``home`` (lat, lon, h) the origin of local
     coordinates, None until the estimator is aligned; ``start_us`` the run's start in microseconds since 1970;
-    ``ratios`` the newest innovation over its gate, by aid; ``legs`` how many the plan has; ``silent_s`` after how long
-    a sensor that says nothing counts as failed; ``isolated`` and ``refused`` are sensors that the estimator has shut
-    out, or whose samples it has long refused.
+    ``ratios`` the newest innovation over its gate, by aid; ``legs`` how many the plan has; ``isolated`` and ``refused``
+    are sensors that the estimator has shut out, or whose samples it has long refused.
     """
 
     truth: TruthBlock
     estimate: Estimate
-    samples: Mapping[str, Sample]
+    heard: Heard
     gyro: Array
     accel: Array
     others: Sequence[tuple[str, Estimate]]
@@ -58,31 +88,19 @@ class Snapshot:
     ratios: Mapping[str, float]
     identity: Identity
     legs: int
-    silent_s: Mapping[str, float]
     isolated: frozenset[str]
     refused: frozenset[str]
 
     def __post_init__(self) -> None:
-        """What changes before a snapshot is read: time [s], and the newest sample of each sensor."""
+        """What every call needs."""
         self.t = float(self.truth.t[0])
         self.aligned = Status.ALIGNED in self.estimate.status
-        # The newest sample of the first sensor of each kind, and those of them that have not fallen silent.
-        self.first: dict[type[Sample], Sample] = {}
-        self._heard: dict[type[Sample], Sample] = {}
-        # Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer.
-        self.fixed = False
-        for sample in self.samples.values():
-            kind = _kind(sample)
-            speaks = self.t - sample.t_arrival < self.silent_s[sample.sensor]
-            if kind not in self.first:
-                self.first[kind] = sample
-                if speaks:
-                    self._heard[kind] = sample
-            if speaks and not self.fixed:
-                self.fixed = kind is PositionSample or (isinstance(sample, GnssSample) and sample.has_fix)
+
+    @property
+    def gnss_fix(self) -> GnssSample | None:
+        """The receiver's newest epoch if it has a fix."""
         receiver = self.newest(GnssSample)
-        # The receiver's newest epoch if it has a fix.
-        self.gnss_fix = receiver if receiver and receiver.has_fix else None
+        return receiver if receiver and receiver.has_fix else None
 
     @cached_property
     def alone(self) -> Rows:
@@ -141,7 +159,8 @@ class Snapshot:
     @cached_property
     def doubted(self) -> bool:
         """Whether the estimator has isolated, or long refused, a receiver that has a fix."""
-        return self.gnss_fix is not None and self.gnss_fix.sensor in self.isolated | self.refused
+        fix = self.gnss_fix
+        return fix is not None and (fix.sensor in self.isolated or fix.sensor in self.refused)
 
     @cached_property
     def flying(self) -> bool | None:
@@ -151,7 +170,7 @@ class Snapshot:
 
     def newest(self, kind: type[S]) -> S | None:
         """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
-        return cast("S | None", self._heard.get(kind))
+        return cast("S | None", self.heard.newest.get(kind))
 
     def sigma(self, block: slice, dimensions: int = 3) -> float:
         """Root of the summed variances of the first ``dimensions`` components of a block of the covariance."""
@@ -198,26 +217,28 @@ class Rows:
         self.snapshots = snapshots
         self._estimates = [one.estimate for one in snapshots]
         self._truths = [one.truth for one in snapshots]
+        self._t = np.array([one.t for one in snapshots])
 
     def __len__(self) -> int:
         return len(self.snapshots)
 
     @cached_property
     def boot_ms(self) -> Array:
-        """Time since boot [ms]."""
-        return np.array([one.boot_ms for one in self.snapshots], float)
+        """Time since boot [ms], as `encode.boot_ms` has it."""
+        found = np.rint(self._t * 1e3) % 2**32
+        return np.where(np.isfinite(found), found, 0.0)
 
     @cached_property
     def usec(self) -> Array:
-        """Time since boot [us]."""
-        return np.array([one.usec for one in self.snapshots], float)
+        """Time since boot [us], 0 when it is not finite."""
+        return np.where(np.isfinite(self._t * 1e6), np.rint(self._t * 1e6), 0.0)
 
     # The estimate
 
     @cached_property
     def q_nb(self) -> Array:
         """Estimated attitude (N, 4)."""
-        return np.array([one.q_nb for one in self._estimates])
+        return _together([one.q_nb for one in self._estimates])
 
     @cached_property
     def euler(self) -> Array:
@@ -227,7 +248,7 @@ class Rows:
     @cached_property
     def rates(self) -> Array:
         """Angular rate (N, 3) [rad/s], body: the gyro less its estimated bias; Earth and transport rate are left in."""
-        bias: Array = np.array([one.gyro_bias for one in self._estimates])
+        bias: Array = _together([one.gyro_bias for one in self._estimates])
         return self.gyro - bias
 
     @cached_property
@@ -244,7 +265,7 @@ class Rows:
     @cached_property
     def v_n(self) -> Array:
         """Estimated velocity (N, 3) [m/s], NED."""
-        return np.array([one.v_n for one in self._estimates])
+        return _together([one.v_n for one in self._estimates])
 
     @cached_property
     def covariance(self) -> Array:
@@ -254,7 +275,7 @@ class Rows:
     @cached_property
     def gyro_bias_variance(self) -> Array:
         """Of the gyro's bias (N, 3) [rad^2/s^2]."""
-        return np.array([one.sigma_gyro_bias for one in self._estimates]) ** 2
+        return _together([one.sigma_gyro_bias for one in self._estimates]) ** 2
 
     @cached_property
     def second(self) -> Array:
@@ -276,12 +297,12 @@ class Rows:
     @cached_property
     def gyro(self) -> Array:
         """Newest angular rate measured (N, 3) [rad/s]."""
-        return np.array([one.gyro for one in self.snapshots])
+        return _together([one.gyro for one in self.snapshots])
 
     @cached_property
     def accel(self) -> Array:
         """Newest specific force measured (N, 3) [m/s^2]."""
-        return np.array([one.accel for one in self.snapshots])
+        return _together([one.accel for one in self.snapshots])
 
     @cached_property
     def field_b(self) -> Array:
@@ -308,7 +329,7 @@ class Rows:
     @cached_property
     def true_euler(self) -> Array:
         """True roll, pitch, heading (N, 3) [rad]."""
-        return np.array([euler_from_quat(one.q_nb[0]) for one in self._truths])
+        return _euler_rows(self.truth("q_nb"))
 
     @cached_property
     def specific_force(self) -> Array:
@@ -345,15 +366,26 @@ class Rows:
 
 
 _NOWHERE = (math.nan, math.nan, math.nan)
+_NOTHING = np.full(4, math.nan)
+
+
+def _together(vectors: Sequence[Array]) -> Array:
+    """Vectors (n,) as rows (N, n); several times faster than `numpy.array`."""
+    return np.concatenate(vectors).reshape(len(vectors), -1)
 
 
 def _eulers(estimates: Sequence[Estimate | None]) -> Array:
     """Roll, pitch, heading (N, 3) [rad] of estimates that have an attitude."""
-    found = np.array(
-        [
-            euler_from_quat(one.q_nb) if one is not None and Status.ALIGNED in one.status else _NOWHERE
-            for one in estimates
-        ]
-    )
+    q_nb = [one.q_nb if one is not None and Status.ALIGNED in one.status else _NOTHING for one in estimates]
+    found = _euler_rows(_together(q_nb))
     found[~np.isfinite(found).all(axis=1)] = math.nan
+    return found
+
+
+@njit
+def _euler_rows(q_nb: Array) -> Array:
+    """`euler_from_quat` of each row (N, 4)."""
+    found = np.empty((len(q_nb), 3))
+    for k in range(len(q_nb)):
+        found[k] = euler_from_quat(q_nb[k])
     return found

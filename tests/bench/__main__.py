@@ -15,7 +15,7 @@ os.environ.update({name: value for name, value in threads.ONE.items() if name no
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # so that this folder is the package `bench`
 
-from bench import filters, hour, live, peers, runs
+from bench import filters, hour, live, pages, peers, runs
 from bench.command import main
 
 MEASURES = {
@@ -25,7 +25,9 @@ MEASURES = {
         runs.cpu_two_estimators,
         runs.cpu_main_scenario,
         runs.federation,
+        runs.telemetry,
         runs.exports,
+        pages.pages,
         peers.strapdown_alone,
         peers.ins_at_every_sample,
         peers.accuracy,

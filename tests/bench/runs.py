@@ -30,7 +30,7 @@ def whole_run(effort: Effort) -> Iterator[Row]:
 
     A run counts until its record is complete and read back (`run.wall_s`): what comes then, metrics, is no part of it.
     """
-    scenario = _main_scenario(effort, TWO_ESTIMATORS)
+    scenario = main_scenario(effort, TWO_ESTIMATORS)
     with tempfile.TemporaryDirectory() as folder:
         whole, bare = alternate(
             lambda: loop.run(scenario, out=Path(folder)).metrics["run.wall_s"],
@@ -42,12 +42,12 @@ def whole_run(effort: Effort) -> Iterator[Row]:
 
 def cpu_two_estimators(effort: Effort) -> Iterator[Row]:
     """Processor time of a whole run with two estimators and record, over JSBSim stepping the same aircraft."""
-    yield _cpu("two estimators and record / bare JSBSim, CPU", _main_scenario(effort, TWO_ESTIMATORS), 2.2, effort)
+    yield _cpu("two estimators and record / bare JSBSim, CPU", main_scenario(effort, TWO_ESTIMATORS), 2.2, effort)
 
 
 def cpu_main_scenario(effort: Effort) -> Iterator[Row]:
     """The same of the main scenario with its three estimators."""
-    yield _cpu("main scenario's three and record / bare, CPU", _main_scenario(effort), 3.0, effort)
+    yield _cpu("main scenario's three and record / bare, CPU", main_scenario(effort), 3.0, effort)
 
 
 def _cpu(what: str, scenario: Scenario, at_most: float, effort: Effort) -> Row:
@@ -63,10 +63,32 @@ def _cpu(what: str, scenario: Scenario, at_most: float, effort: Effort) -> Row:
     return Row(what, ratios(whole, bare), at_most=at_most, detail=f"{_over(whole, bare)}: {parts}")
 
 
+def telemetry(effort: Effort) -> Iterator[Row]:
+    """Processor time that a telemetry log at 25 Hz adds to the main scenario, over JSBSim stepping alone."""
+    from testbed.mavlink import MavlinkPublisher
+
+    scenario = main_scenario(effort)
+    with tempfile.TemporaryDirectory() as folder:
+
+        def fly(*urls: str) -> float:
+            def flown() -> None:
+                links = [MavlinkPublisher(urls, scenario)] if urls else []
+                loop.run(scenario, links=links, out=Path(folder))
+
+            return cpu_seconds(flown)
+
+        def added() -> float:
+            without = fly()
+            return fly(f"tlog:{folder}/run.tlog") - without
+
+        more, bare = alternate(added, lambda: cpu_seconds(lambda: _step(scenario)), effort)
+    yield Row("telemetry log adds / bare JSBSim, CPU", ratios(more, bare), at_most=0.6, detail=_over(more, bare))
+
+
 def exports(effort: Effort) -> Iterator[Row]:
     """Processor time of turning the record of the main scenario into each format; mcap where its extra is installed."""
     with tempfile.TemporaryDirectory() as folder:
-        loop.run(_main_scenario(effort), out=Path(folder))
+        loop.run(main_scenario(effort), out=Path(folder))
         for name, one in FORMATS.items():
             if one.extra and find_spec(one.extra) is None:
                 continue
@@ -87,7 +109,7 @@ def federation(effort: Effort) -> Iterator[Row]:
     )
 
     def spent(estimator: str) -> float:
-        scenario = _main_scenario(effort, estimator)
+        scenario = main_scenario(effort, estimator)
         return shares(lambda: loop.run(scenario))["estimators"]
 
     for structure in ("full_reset", "no_reset"):
@@ -97,7 +119,7 @@ def federation(effort: Effort) -> Iterator[Row]:
         yield Row(f"federation, {structure} / INS, CPU", ratios(above, below), at_most=4.0, detail=detail)
 
 
-def _main_scenario(effort: Effort, *overrides: str) -> Scenario:
+def main_scenario(effort: Effort, *overrides: str) -> Scenario:
     """The main scenario, all of it or its beginning."""
     full = Scenario.load(MAIN, [*overrides, "expect={}"])
     duration = effort.count(full.duration_s)
