@@ -157,7 +157,7 @@ def test_the_legend_hides_an_estimator_everywhere(opened: Page) -> None:
         " return [box.left + box.width / 2, box.top + box.height / 2] })()"
     )
     visible = "page.panels.filter((p) => p.inSight).flatMap((p) => p.parts).filter(([of, r]) => of == 0 && r.visible)"
-    assert opened.run(f"{visible}.length") > 1
+    opened.until(f"{visible}.length > 1")
     opened.click(x, y)
     opened.until(f"{visible}.length == 0")
     assert opened.run("document.querySelector('.legend button').ariaPressed") == "false"
