@@ -9,7 +9,7 @@ is not what it seemed to be; that is left to the filter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from typing import NamedTuple, Protocol
 
@@ -19,7 +19,7 @@ from nav._jit import njit
 from nav.aids import MagnetometerAid, problem
 from nav.aids.airspeed import airspeed, is_slow, sideslip
 from nav.aids.barometer import barometer
-from nav.aids.base import FUSED, Kind, PlainAid, report_on
+from nav.aids.base import Kind, PlainAid
 from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
 from nav.aids.magnetometer import magnetometer
 from nav.detection import whiten
@@ -27,9 +27,9 @@ from nav.earth import pressure_altitude
 from nav.error_model import Indices
 from nav.increments import COINCIDENT, Increments, Step
 from nav.local_filter import LocalFilter, own_innovation
-from nav.monitor import shown_limit
-from nav.reference import NEVER, PREDICTED_PERIODS, Reference, is_near
-from nav.samples import Array, Estimate, GnssSample, Sample, UpdateReport
+from nav.monitor import Monitor, shown_limit
+from nav.reference import PREDICTED_PERIODS, Reference, is_near
+from nav.samples import Array, Estimate, GnssSample, Outcome, Sample, UpdateReport
 from nav.state import State, absorb, parts, propagate
 
 # What a step is, in place of the number of an aid; and where its numbers begin.
@@ -79,6 +79,16 @@ class Taker(Protocol):
         ...
 
 
+class _Plain(NamedTuple):
+    """A sensor whose samples are taken at once as long as they are plain: its row in the tables; name, size, limit and
+    monitor of each part.
+    """
+
+    row: int
+    aid: PlainAid
+    parts: list[tuple[str, int, float, Monitor | None]]
+
+
 class Batch:
     """Takes the plain steps of an estimator that has these ``filters``, `LocalFilter.row` by row.
 
@@ -87,6 +97,7 @@ class Batch:
 
     def __init__(self, filters: Sequence[LocalFilter], reference: Reference) -> None:
         self._filters, self._reference = filters, reference
+        self._listening = [filter_ for filter_ in filters if filter_.silence is not None]
         self._aids: dict[str, tuple[int, PlainAid, LocalFilter]] = {}
         kinds: list[list[int]] = []
         told: list[list[float]] = []
@@ -110,7 +121,8 @@ class Batch:
 
         The last fix that was used was of the time ``last_fix``.
         """
-        plan = self._plan(taker, steps, last_fix)
+        known = self._known()
+        plan = self._plan(taker, known, steps, last_fix)
         if not len(plan):
             return 0, last_bad
         imu, (common, filters, n) = ahead.imu, state.shape
@@ -124,11 +136,14 @@ class Batch:
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
-        reports += self._reports(steps, told[: done.reports])
-        drafted = 0
-        for t, _, sample in steps[: done.steps]:
+        reports += _reports(known, steps, told[: done.reports])
+        drafted, whats = 0, plan[:, WHAT].tolist()
+        for (t, _, sample), what in zip(steps[: done.steps], whats, strict=False):
             if sample is not None:
                 taker.took(sample)
+                if what >= 0:
+                    for filter_ in self._listening:
+                        filter_.stand_in(sample)
             elif t == t:
                 then, bad = states[drafted, :2].tolist()
                 estimates.append(taker.told(states[drafted, 2:], then, bad))
@@ -137,26 +152,37 @@ class Batch:
             return done.steps, done.last_bad
         sample = steps[done.steps].sample
         assert sample is not None
+        taker.took(sample)
         reports += taker.finish(sample, done.parts)
+        for filter_ in self._listening:
+            filter_.stand_in(sample)
         return done.steps + 1, done.last_bad
 
-    def _plan(self, taker: Taker, steps: Sequence[Step], last_fix: float) -> Array:
-        """The first of the ``steps`` that look plain, as rows for `follow`."""
-        flat: list[float] = []
-        silences = [copy(filter_.silence) for filter_ in self._filters if filter_.silence is not None]
-        known: dict[str, tuple[int, PlainAid]] = {}
-        for sensor, (index, aid, filter_) in self._aids.items():
+    def _known(self) -> dict[str, _Plain]:
+        """The sensors whose samples may be plain now, their limits in the table."""
+        known = {}
+        for sensor, (row, aid, filter_) in self._aids.items():
             limits = filter_.limits(sensor)
             if limits is not None:
-                known[sensor] = index, aid
-                self._told[index, LIMITS : LIMITS + len(limits)] = limits
+                self._told[row, LIMITS : LIMITS + len(limits)] = limits
+                parts = [
+                    (name, m, limit, filter_.monitors.get((sensor, name)))
+                    for (name, m), limit in zip(aid.parts, limits, strict=True)
+                ]
+                known[sensor] = _Plain(row, aid, parts)
+        return known
+
+    def _plan(self, taker: Taker, known: Mapping[str, _Plain], steps: Sequence[Step], last_fix: float) -> Array:
+        """The first of the ``steps`` that look plain, as rows for `follow`."""
+        flat: list[float] = []
+        silences = [copy(filter_.silence) for filter_ in self._listening]
         for t, horizon, sample in steps:
             if sample is None:
                 flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
                 continue
             if t != horizon or sample.sensor not in known:  # too late, or not known when
                 break
-            index, aid = known[sample.sensor]
+            row, aid, _ = known[sample.sensor]
             if isinstance(sample, GnssSample):
                 if not sample.has_fix:
                     flat += (t, t, SPLIT, *NOTHING)
@@ -166,26 +192,25 @@ class Batch:
                 last_fix = t
             elif problem(sample):
                 break
-            if any(silence.stand_in(sample) is not None for silence in silences):
+            if silences and any([silence.stand_in(sample) for silence in silences if silence is not None]):
                 break
-            flat += (t, t, index, *aid.numbers(sample))
+            flat += (t, t, row, *aid.numbers(sample))
             if taker.pauses(t):
                 break
         return np.array(flat).reshape(-1, WIDTH)
 
-    def _reports(self, steps: Sequence[Step], rows: Array) -> Iterator[UpdateReport]:
-        """The reports on what was just done."""
-        for row, (step, part, nis, statistic) in zip(rows, rows[:, :4].tolist(), strict=True):
-            sample = steps[int(step)].sample
-            assert sample is not None
-            index, aid, filter_ = self._aids[sample.sensor]
-            name, m = aid.parts[int(part)]
-            limit = float(self._told[index, LIMITS + int(part)])
-            monitor = filter_.monitors.get((sample.sensor, name))
-            if monitor is not None:
-                monitor.passed(statistic, limit, sample.t)
-                limit = shown_limit(limit, statistic, nis)
-            yield report_on(sample, name, row[4 : 4 + m], row[7 : 7 + m * m].reshape(m, m), nis, limit, FUSED)
+
+def _reports(known: Mapping[str, _Plain], steps: Sequence[Step], rows: Array) -> Iterator[UpdateReport]:
+    """The reports on what was just done, of which monitors are told, too."""
+    for row, (step, part, nis, statistic) in zip(rows, rows[:, :4].tolist(), strict=True):
+        sample = steps[int(step)].sample
+        assert sample is not None
+        name, m, limit, monitor = known[sample.sensor].parts[int(part)]
+        if monitor is not None:
+            monitor.passed(statistic, limit, sample.t)
+            limit = shown_limit(limit, statistic, nis)
+        nu, S = row[4 : 4 + m], row[7 : 7 + m * m].reshape(m, m)
+        yield UpdateReport(sample.t, sample.sensor, name, nu, S, nis, limit, 1.0, Outcome.FUSED)
 
 
 @njit
@@ -213,20 +238,20 @@ def follow(
     """
     q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
-    # No literals: for each of them numba would compile `propagate` anew.
-    yes, no, never = len(steps) >= 0, len(steps) < 0, max(period, NEVER)
     written = drafted = 0
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
-        stop = row_after(t, steps[k, HORIZON], row)
-        if stop > row:
+        stop, settle = row_after(t, steps[k, HORIZON], row), what >= 0
+        reached = t[stop - 1] if stop > row else now
+        split = (settle or what == SPLIT) and time > reached + COINCIDENT and stop < len(t)
+        if stop > row or settle:
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
-                dtheta[row:stop], dv[row:stop], dt[row:stop], no,
+                dtheta[row:stop], dv[row:stop], dt[row:stop], settle and not split,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, t[row + bad])
-            row, now = stop, t[stop - 1]
+            row, now = stop, reached
         if what == ADVANCE:
             continue
         if what == ESTIMATE:
@@ -247,9 +272,9 @@ def follow(
                 bad_then = max(bad_then, t[row + bad])
             if further > COINCIDENT:
                 _share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
-                bad = propagate(
+                bad = propagate(  # not with a literal, for which it would be compiled anew
                     draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
-                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, yes,
+                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, further > COINCIDENT,
                 )  # fmt: skip
                 then = time
                 if bad >= 0:
@@ -257,7 +282,7 @@ def follow(
             estimates[drafted, 0], estimates[drafted, 1] = then, bad_then
             drafted += 1
             continue
-        if time > now + COINCIDENT and row < len(t):
+        if split:
             _share(one_dt, one_angle, one_push, dt, dtheta, dv, row, 1 - (t[row] - time) / dt[row])
             dt[row] -= one_dt[0]
             for i in range(3):
@@ -265,17 +290,13 @@ def follow(
                 dv[row, i] -= one_push[0, i]
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
-                one_push, one_dt, no,
+                one_push, one_dt, settle,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, time)
             now = time
         if what == SPLIT:
             continue
-        propagate(
-            whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, never,
-            dtheta[:0], dv[:0], dt[:0], yes,
-        )  # fmt: skip
         for part in range(kinds[what, 1]):
             f, limit = kinds[what, 7], told[what, LIMITS + part]
             plain, nu, H, R = _measure(

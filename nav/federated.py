@@ -237,13 +237,10 @@ class Federated:
                 return
             self._last_fused = sample.t
             self._doubts.used(sample)
-        for filter_ in self.locals:
-            filter_.stand_in(sample)
 
     def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
         """See `nav.batch.Taker`."""
         assert self._state is not None
-        self.took(sample)
         return self._use(self._state, self._users[sample.sensor][0], sample, first)
 
     def told(self, whole: Array, t: float, last_bad: float) -> Estimate:

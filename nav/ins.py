@@ -230,11 +230,9 @@ class Ins:
             self._monitor.judge(sample, sample.v_n, sample.sigma_velocity_n, inside_gate=True)
         elif sample.sensor in self._refusals:
             self._refusals[sample.sensor].taken()
-        self._filter.stand_in(sample)
 
     def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
         """See `nav.batch.Taker`."""
-        self.took(sample)
         aid, state = self._filter.aids[sample.sensor], self._state
         assert state is not None
         self.t = sample.t

@@ -156,7 +156,7 @@ def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -
         imu[i] += correction[i]
 
 
-@inlined
+@njit
 def _covariance_step(
     v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,
