@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.aids import MagnetometerAid, problem
 from nav.aids.airspeed import airspeed, is_slow, sideslip
 from nav.aids.barometer import barometer
@@ -340,7 +340,7 @@ def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float, s
             report[7 + m * i + j] = S[i, j]
 
 
-@njit
+@inlined
 def _measure(
     kind: Indices, part: int, told: Array, numbers: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, rates: Array,
     errors: Array, driven: Indices, field: Array,
