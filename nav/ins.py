@@ -52,6 +52,7 @@ from nav.samples import (
     ImuSamples,
     MagnetometerSample,
     Outcome,
+    PositionSample,
     Sample,
     Status,
     UpdateReport,
@@ -300,6 +301,9 @@ class Ins:
                     report = self._hear_of_wind(state, sample, aid, measurement.R, report)
                 else:
                     report = self._unless_lasting(state, sample, aid, report)
+                if isinstance(sample, PositionSample) and report.weight:
+                    for refused in self._astray.values():
+                        refused.taken()
                 reports.append(report)
         return reports
 
@@ -325,9 +329,9 @@ class Ins:
         The search goes by the shape of the ground, which a sensor that is off leaves as it is.
         """
         refused = self._astray[sample.sensor]
-        if report.weight:
+        if aided := bool(report.weight or self._aided(sample.t)):
             refused.taken()
-        if report.outcome is not Outcome.OUTSIDE_GATE or not refused.too_long(sample.t) or self._aided(sample.t):
+        if aided or report.outcome is not Outcome.OUTSIDE_GATE or not refused.too_long(sample.t):
             return report
         refused.taken()
         self._filter.reopen_wind(state, ASTRAY_MPS, ASTRAY_LASTING_S)

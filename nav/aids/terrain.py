@@ -35,7 +35,8 @@ TIME_TOLERANCE = 1e-6  # [s]
 LOST_M, FOUND_M = 100.0, 50.0  # sigma of the position per axis from which on it is searched, and no more
 WEIGH_S, FIX_S = 1.0, 5.0  # in a search, from one range that is used to the next, and from one attempt at a fix
 GAP_S, GIVE_UP_S = 5.0, 240.0  # without a range, or without a fix, it begins again
-REPEATED = 5  # the same range to the last digit, so often in a row, is no echo of relief: the sensor is stuck
+# The same range to the last digit, so often in a row and faster than that, is no echo of relief: the sensor is stuck.
+REPEATED, MOVING_MPS = 5, 5.0
 STUCK = Ruling(Outcome.ISOLATED, "the same range again and again: the sensor is stuck")
 REACH = 2.0  # sigma of the horizontal position, to either side, over which slopes are taken
 
@@ -65,7 +66,8 @@ class Search:
         if t == self._t:
             return
         self._t, self.fix = t, None
-        self._repeated = self._repeated + 1 if sample.range == self._range else 1
+        moving = math.hypot(state.v_n[0], state.v_n[1]) > MOVING_MPS
+        self._repeated = self._repeated + 1 if sample.range == self._range and moving else 1
         self._range = sample.range
         P, own = at.P[POS : POS + 2, POS : POS + 2], at.x[: POS + 3]
         sigma = math.sqrt(0.5 * P.trace())

@@ -115,7 +115,7 @@ class ArduPilot:
         asks = t >= self._ask_due
         for one in self._ears.values():
             one.listen(SYSTEM)
-            if asks and not one.told.placed:
+            if asks and not one.told.moving:
                 one.ask(SYSTEM)
             elif asks and not (one.told.armed or self.flies):
                 one.arm_ardupilot(SYSTEM)

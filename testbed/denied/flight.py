@@ -142,8 +142,8 @@ def fly(cases: Sequence[Case], seed: int, tell: Callable[[float], None] = lambda
     """
     parts: list[Outcome] = []
     done = 0
-    for route in dict.fromkeys(case.aids.route for case in cases):
-        own = [case for case in cases if case.aids.route == route]
+    for motion_ in dict.fromkeys((case.aids.route, case.longest_s) for case in cases):
+        own = [case for case in cases if (case.aids.route, case.longest_s) == motion_]
         before, share = done / len(cases), len(own) / len(cases)
         parts.append(_route(own, seed, lambda one, before=before, share=share: tell(before + share * one)))  # type: ignore[misc]
         done += len(own)

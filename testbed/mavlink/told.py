@@ -91,6 +91,11 @@ class Told:
         """Whether it has said an attitude and a position."""
         return bool(self._position.rows and (self._attitude.rows or self._odometry.rows))
 
+    @property
+    def moving(self) -> bool:
+        """Whether it has said a velocity too, which ArduPilot does only once it knows where it is."""
+        return self.placed and bool(self._fine.rows)
+
     def estimates(self, times: Sequence[float], boot: float) -> Iterator[Estimate]:
         """The estimates at ``times`` [s] of a clock that says ``boot`` when the vehicle's says zero."""
         attitude = self._attitude if self._attitude.rows else self._odometry

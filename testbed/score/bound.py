@@ -24,6 +24,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from nav.samples import Array
 from testbed.errors import UserError
+from testbed.estimators.outside import ArduPilotSection
 from testbed.estimators.section import EstimatorSection, Handover
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
@@ -130,10 +131,10 @@ def of_estimator(
 
 
 def _none_for(section: EstimatorSection, scenario: Scenario) -> bool:
-    """Whether an estimator has no bound, whatever its sensors are."""
+    """Whether an estimator has no bound, whatever its sensors are: ArduPilot has some of its own, made of truth."""
     receivers = [aid for aid in section.aiding(scenario.sensors) if isinstance(scenario.sensors[aid], GnssConfig)]
     told_more = section.spare_imus or getattr(section, "nonholonomic_mps", None) is not None
-    return bool(section.attitude_only or not receivers or told_more)
+    return bool(section.attitude_only or not receivers or told_more or isinstance(section, ArduPilotSection))
 
 
 def _start(handover: Handover | None) -> Array:

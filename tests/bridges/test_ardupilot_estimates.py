@@ -12,7 +12,7 @@ from worlds.loop import same
 from testbed import RunResult, Scenario, run
 from testbed.bridges.ardupilot import ArduPilot
 from testbed.errors import UserError
-from testbed.score import accuracy
+from testbed.score import accuracy, bound
 
 DURATION_S, PLACED_S = 12.0, 3.0
 
@@ -59,6 +59,7 @@ def test_it_is_asked_heard_and_scored_at_its_own_stamps(heard: tuple[RunResult, 
     np.testing.assert_allclose(errors.velocity[known], 0.0, atol=0.02)
     np.testing.assert_allclose(errors.attitude[known], 0.0, atol=math.radians(0.05))
     assert "theirs.position_nees_mean" not in result.metrics  # it says nothing of how sure it is
+    assert "theirs" not in bound.of_run(result.dataset)  # it has sensors of its own
 
 
 @pytest.mark.ci

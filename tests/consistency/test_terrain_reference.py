@@ -130,6 +130,22 @@ def test_a_broken_rangefinder_leads_nobody_astray(fault: str) -> None:
     assert off.max() < 800
 
 
+@pytest.mark.ci
+def test_ranges_refused_beside_fixes_put_nothing_in_doubt() -> None:
+    """A sensor that was off before the outage is given the ten seconds after it, too."""
+    changes = [
+        "duration_s=350",
+        "expect={}",
+        "sensors.gnss.denied=[[300, 350]]",
+        'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed", "rangefinder"]}]',
+        'fault=[{sensor="rangefinder", channel="range", window=[200, 350], kind="step", size=60}]',
+    ]
+    e = errors(run(Scenario.load("denied_terrain", changes), seed=11).dataset, "ins")
+    claimed = np.hypot(*e.sigma_position[:, :2].T)
+    assert claimed[(e.t > 300) & (e.t < 309)].max() < 10
+    assert claimed[(e.t > 313) & (e.t < 320)].max() > 100
+
+
 @pytest.mark.slow
 def test_the_shipped_flight_knows_how_good_it_is() -> None:
     """Four seeds, ten minutes without GNSS each, over the same hills lap by lap."""

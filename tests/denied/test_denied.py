@@ -123,6 +123,8 @@ def test_some_aids_are_flown_longer(flown: Outcome) -> None:
     """Then the others have nothing after their own end, and goals have a time of their own."""
     table = dataclasses.replace(SMALL, judged_longest_s={"flow": 30})
     longer = flight.fly(table.judged(INS), 7)
+    shared = dataclasses.replace(table, aids=AIDS[:2])  # one route, but each flown for as long as it is asked
+    assert np.isfinite(flight.fly(shared.judged(INS), 7).error[1]).all()
     assert longer.t.tolist() == [0, 10, 20, 30]
     for k, lane in enumerate(longer.lanes):
         same = flown.lane(lane)

@@ -41,6 +41,12 @@ def verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], che
     return lambda: check.fly(task)
 
 
+def one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every sample goes through Python, where it can be broken; `tests/nav/test_batch` holds batches to that."""
+    for aid in (aids.AirspeedAid, aids.BarometerAid, aids.GnssAid, aids.MagnetometerAid):
+        monkeypatch.setattr(aid, "plain", None)
+
+
 def sign(aid: str, start: int) -> Break:
     """The sign of a block of three columns of one aid's Jacobian."""
 
@@ -55,6 +61,7 @@ def sign(aid: str, start: int) -> Break:
             H[:, start : start + 3] *= -1
             return nu, H
 
+        one_by_one(monkeypatch)
         monkeypatch.setattr(module, aid, wrong)
 
     return apply
@@ -74,6 +81,7 @@ def noise(part: str, factor: float = 100.0) -> Break:
                 else measurement._replace(R=factor * measurement.R)
             )
 
+        one_by_one(monkeypatch)
         monkeypatch.setattr(LocalFilter, "measure", wrong)
 
     return apply
