@@ -42,7 +42,10 @@ REACH = 2.0  # sigma of the horizontal position, to either side, over which slop
 
 
 class Search:
-    """Where over the map a filter is that doesn't know: from its ranges, as fixes in place of these (`PointMass`)."""
+    """Where over the map a filter is that doesn't know: from its ranges, as fixes in place of these (`PointMass`).
+
+    It belongs to one filter, from its beginning on.
+    """
 
     def __init__(self, places: PointMass) -> None:
         self.places = places

@@ -40,7 +40,7 @@ from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, Estimate
 from testbed.bridges.address import address, bound
 from testbed.bridges.gps_input import GpsInput
-from testbed.bridges.listener import Listener
+from testbed.bridges.listener import Listener, listeners
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
 from testbed.feeds.bridged import OURS, THEIRS
@@ -88,8 +88,8 @@ class ArduPilot:
             "barometer": THEIRS,
         }
         self.surfaces: Surfaces | None = None
-        self._ears = {name: Listener(where) for name, where in (estimators or {}).items()}
-        self.estimators: Collection[str] = tuple(self._ears)
+        self._ears: dict[str, Listener] = {}
+        self.estimators: Collection[str] = tuple(estimators or ())
         self._ask_due = -math.inf
         self._started = False
         self._answer_s = answer_s
@@ -101,10 +101,14 @@ class ArduPilot:
         self._home: tuple[float, float, float] | None = None
         self._airspeed: float | None = None
         self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
-        self._next = self._heard(time.monotonic() + connect_s)
-        if self._next is None:
+        try:
+            self._ears = listeners(estimators or {})
+            self._next = self._heard(time.monotonic() + connect_s)
+            if self._next is None:
+                raise UserError(f"{url}: no ArduPilot has called within {connect_s:g} s: start it with --model JSON")
+        except BaseException:  # an interrupt too
             self.close()
-            raise UserError(f"{url}: no ArduPilot has called within {connect_s:g} s: start it with --model JSON")
+            raise
 
     def follow(self, turn: Turn) -> None:
         """Answer the frames that the steps of a turn belong to."""

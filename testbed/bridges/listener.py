@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from collections.abc import Mapping
 
 from testbed.bridges.address import address, bound
 from testbed.mavlink.encode import Encoder
@@ -32,10 +33,11 @@ class Listener:
         for _ in range(MOST_DATAGRAMS):
             self._socket.settimeout(max(0.0, until - time.monotonic()))
             try:
-                datagram, self._speaker = self._socket.recvfrom(65536)
-                self.told.hear(datagram, system)
+                datagram, speaker = self._socket.recvfrom(65536)
             except OSError:  # there is no more
                 return
+            if self.told.hear(datagram, system):
+                self._speaker = speaker
 
     def arm_px4(self, system: int) -> None:
         """Have a PX4 that has spoken armed, whatever its checks say.
@@ -61,3 +63,11 @@ class Listener:
     def close(self) -> None:
         """Close the port."""
         self._socket.close()
+
+
+def listeners(addresses: Mapping[str, str]) -> dict[str, Listener]:
+    """One for each of the ``addresses`` by name, or none at all. Raises UserError as one does."""
+    with contextlib.ExitStack() as opened:
+        found = {name: opened.enter_context(contextlib.closing(Listener(url))) for name, url in addresses.items()}
+        opened.pop_all()
+    return found

@@ -24,6 +24,7 @@ MAVLink common messages HIL_SENSOR, HIL_GPS, HIL_STATE_QUATERNION, HIL_ACTUATOR_
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import time
@@ -36,7 +37,7 @@ import numpy as np
 from nav.earth import SEA_LEVEL_DENSITY, isa_temperature, pressure_altitude
 from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, MagnetometerSample
 from testbed.bridges.address import address, bound
-from testbed.bridges.listener import Listener
+from testbed.bridges.listener import listeners
 from testbed.bridges.steps import Step, Stepper, moved
 from testbed.errors import UserError
 from testbed.feeds.bridged import OURS
@@ -80,8 +81,7 @@ class Px4:
         self.failure, self.answered, self.armed = "", 0, False
         self.flies = flies
         self.surfaces: Surfaces | None = None
-        self._ears = {name: Listener(where) for name, where in (estimators or {}).items()}
-        self.estimators: Collection[str] = tuple(self._ears)
+        self.estimators: Collection[str] = tuple(estimators or ())
         self._boot_s, self._answer_s = boot_s, answer_s
         self._stepper, self._encoder, self._reader = Stepper(), Encoder(), Reader()
         self._heard: deque[Message] = deque()
@@ -92,14 +92,20 @@ class Px4:
         self._order: list[str] = []  # of the aiding sensors, as the scenario has them
         self._truth_due = self._arm_due = -math.inf
         self._said = 0  # bytes, by PX4
-        listener = bound(url, address(url, "tcpin", DEFAULT), socket.SOCK_STREAM)
-        with listener:
+        with (
+            bound(url, address(url, "tcpin", DEFAULT), socket.SOCK_STREAM) as listener,
+            contextlib.ExitStack() as broken,
+        ):
+            self._ears = listeners(estimators or {})
+            for one in self._ears.values():
+                broken.callback(one.close)
             listener.listen(1)
             listener.settimeout(connect_s)
             try:
                 self._socket, _ = listener.accept()
             except TimeoutError:
                 raise UserError(f"{url}: no PX4 has connected within {connect_s:g} s: start one, try again") from None
+            broken.pop_all()
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def follow(self, turn: Turn) -> None:

@@ -230,8 +230,12 @@ def _digest(contestant: Contestant) -> str:
 
 
 def _write_scenarios(plan: Plan) -> None:
-    """Each case as a file: `testbed run` flies it with any of the seeds."""
+    """Each case as a file: `testbed run` flies it with any of the seeds. One that is flown longer has a second."""
     folder = plan.out / SCENARIOS
     folder.mkdir(exist_ok=True)
     for case in plan.cases():
         write_file(folder / f"{case.weather.name}_{case.aids.name}_{case.grade.name}.toml", case.text.encode())
+    for case in plan.table.judged(plan.contestants):
+        if case.aids.name in plan.table.judged_longest_s:
+            name = f"{case.weather.name}_{case.aids.name}_{case.grade.name}_{case.longest_s}s.toml"
+            write_file(folder / name, case.text.encode())

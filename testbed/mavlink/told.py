@@ -79,12 +79,18 @@ class Told:
             "ESTIMATOR_STATUS": self._take_accuracy,
         }
 
-    def hear(self, datagram: bytes, system: int) -> None:
-        """Take what the autopilot of a ``system`` says in it."""
-        for message in Reader().read(datagram, whole=True):
+    def hear(self, datagram: bytes, system: int) -> bool:
+        """Take what the autopilot of a ``system`` says in it; whether it said anything."""
+        own = [
+            message
+            for message in Reader().read(datagram, whole=True)
+            if (message.system, message.component) == (system, dialect.MAV_COMP_ID_AUTOPILOT1)
+        ]
+        for message in own:
             take = self._take.get(message.name)
-            if take is not None and (message.system, message.component) == (system, dialect.MAV_COMP_ID_AUTOPILOT1):
+            if take is not None:
                 take(message)
+        return bool(own)
 
     @property
     def placed(self) -> bool:

@@ -153,10 +153,13 @@ def _csv(result: Result) -> str:
         ["weather", "aids", "grade", "estimator", "seed", "after_s", "north_m", "east_m", "variance_north_m2",
          "covariance_m2", "variance_east_m2", "bound_m", "distance_m"]
     )  # fmt: skip
+    table = result.plan.table
     for one in (*result.outcomes, *result.further):
-        rows = [int(np.searchsorted(one.t, mark - 1e-6)) for mark in result.plan.table.marks_s]
         for k, lane in enumerate(one.lanes):
-            for mark, row in zip(result.plan.table.marks_s, rows, strict=True):
+            longer = table.judged_longest_s.get(lane[0])
+            marks = (*table.marks_s, *([longer] if longer is not None and longer <= one.t[-1] else []))
+            for mark in marks:
+                row = int(np.searchsorted(one.t, mark - 1e-6))
                 numbers = (*one.error[k, row], *one.covariance[k, row], one.bound[k, row], one.distance[k, row])
                 writer.writerow(
                     [one.weather, *lane, one.seed, mark, *("" if np.isnan(x) else f"{x:.6g}" for x in numbers)]

@@ -52,6 +52,7 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         if not isinstance(scenario.truth, LogTruth):  # whose units are brought to common times
             yield from _stamp_mistakes(("estimator", index, "spare_imus"), estimator, scenario.sensors)
         taken |= set(estimator.recorded)
+    yield from _address_mistakes(scenario)
     yield from _autopilot_mistakes(scenario)
     for key in scenario.expect:
         yield from _expect_mistakes(key, taken)
@@ -203,6 +204,16 @@ def _stamp_mistakes(
     for name in (section.imu, *section.spare_imus):
         if getattr(sensors.get(name), "jitter_s", 0.0):
             yield path, f"sensors.{name}.jitter_s: units that are voted on must be stamped together: set it to 0"
+
+
+def _address_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
+    """Two estimators that would be heard at one address."""
+    heard: dict[str, str] = {}
+    for index, one in enumerate(scenario.estimator):
+        if isinstance(one, OutsideSection):
+            if one.address in heard:
+                yield ("estimator", index, "address"), f"{heard[one.address]!r} is heard there: give it another"
+            heard.setdefault(one.address, one.name)
 
 
 def _autopilot_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:

@@ -47,8 +47,9 @@ def heard(alone: RunResult) -> tuple[RunResult, autopilots.Answering]:
 
 @pytest.mark.ci
 def test_it_is_asked_heard_and_scored_at_its_own_stamps(heard: tuple[RunResult, autopilots.Answering]) -> None:
-    result, _ = heard
+    result, voice = heard
     assert result.failure == ""
+    assert voice.asked == dict.fromkeys((30 + 1, 33, 32), 50_000.0)  # 20 Hz: attitude, global and local position
     errors = accuracy.errors(result.dataset, "theirs")
     known = np.isfinite(errors.position[:, 0])
     assert known[(errors.t > PLACED_S + 0.1) & (errors.t < DURATION_S - 0.1)].all()
@@ -75,6 +76,36 @@ def test_one_that_does_not_fly_is_armed_once_it_knows_where_it_is(
 def test_ours_have_the_same_bits_beside_it(heard: tuple[RunResult, autopilots.Answering], alone: RunResult) -> None:
     for group in ("truth", "sensors", "estimators/ins"):
         assert same(heard[0].dataset[group], alone.dataset[group])
+
+
+def test_one_that_flies_is_armed_by_whom_it_likes() -> None:
+    voice = autopilots.Answering(0.5, 1.5, 100.0)
+    peer = autopilots.ArduPilot(voice=voice)
+    far_end = ArduPilot(peer.url, estimators={"theirs": voice.url}, flies=True)
+    theirs = [{"name": "theirs", "kind": "ardupilot"}]
+    flown = {"duration_s": 5.0, "sensors.gnss.denied": [], "expect": {}, "estimator": theirs}
+    try:
+        run(Scenario.load("loiter_gnss_outage", flown), far_end=far_end)
+    finally:
+        peer.over.set()
+        peer.join()
+        far_end.close()
+        voice.close()
+    assert voice.asked
+    assert voice.armed is None
+
+
+def test_an_address_that_is_taken_leaves_nothing_open() -> None:
+    voice = autopilots.Answering(0.5, 1.5, 100.0)
+    with pytest.raises(UserError, match="in use"):
+        ArduPilot("udpin:127.0.0.1:0", estimators={"one": voice.url, "two": voice.url}, connect_s=0.1)
+    voice.close()
+
+
+def test_two_at_one_address_are_told_of() -> None:
+    twice = [{"name": name, "kind": "ardupilot"} for name in ("a", "b")]
+    with pytest.raises(UserError, match=r"estimator\[1\].address: 'a' is heard there: give it another"):
+        Scenario.load("kinematic_u_flight", {"estimator": twice, "expect": {}})
 
 
 def test_without_ardupilot_it_is_said_where_it_is() -> None:

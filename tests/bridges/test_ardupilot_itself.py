@@ -5,15 +5,12 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from worlds import autopilots
 
@@ -35,63 +32,32 @@ pytestmark = [
 ]
 
 
-class Station(threading.Thread):
-    """A ground station that loads a mission, arms as soon as it may, and has it flown."""
+class Station(autopilots.Station):
+    """Loads a mission, arms as soon as it may, and has it flown."""
 
     def __init__(self, mission: Path) -> None:
-        super().__init__(daemon=True)
-        self._rows = [line.split("\t") for line in mission.read_text().splitlines()[1:]]
-        self.port = autopilots.free_port(socket.SOCK_DGRAM)
-        self._link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{self.port}", source_system=255)
-        self.over = threading.Event()
+        super().__init__(autopilots.free_port(socket.SOCK_DGRAM))
+        rows = [line.split("\t") for line in mission.read_text().splitlines()[1:]]
+        self._items = [(int(row[2]), int(row[3]), [float(value) for value in row[4:11]]) for row in rows]
         self.fixes: set[int] = set()  # kinds that it said it has, while armed
         self.start()
 
     def run(self) -> None:
-        if self._hear("HEARTBEAT", 120.0) is None:
+        if self.hear("HEARTBEAT", 120.0) is None:
             return
-        while not self._sent_mission() and not self.over.is_set():  # it is refused until its store is open
+        # It is refused until its store is open.
+        while not self.over.is_set() and self.send(self._items) != mav.MAV_MISSION_ACCEPTED:
             time.sleep(0.1)
         # Armed first: one that enters AUTO before it knows where it is takes the sea for its home.
         for command, *values in (
             (mav.MAV_CMD_COMPONENT_ARM_DISARM, 1),
             (mav.MAV_CMD_DO_SET_MODE, mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, AUTO),
         ):
-            while not self.over.is_set() and not self._command(command, *values):
+            while not self.over.is_set() and not self.command(command, *values):
                 time.sleep(0.1)
         while not self.over.is_set():
-            if (message := self._hear("GPS_RAW_INT", 1.0)) is not None:
+            if (message := self.hear("GPS_RAW_INT", 1.0)) is not None:
                 self.fixes.add(int(message.fix_type))
-
-    def close(self) -> None:
-        self.over.set()
-        self.join()
-        self._link.close()
-
-    def _hear(self, name: str, seconds: float, is_it: Callable[[Any], bool] = lambda _: True) -> Any:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until and not self.over.is_set():
-            self._link.mav.heartbeat_send(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0)
-            message = self._link.recv_match(type=name.split("|"), blocking=True, timeout=0.1)
-            if message is not None and is_it(message):
-                return message
-        return None
-
-    def _sent_mission(self) -> bool:
-        self._link.mav.mission_count_send(1, 1, len(self._rows))
-        while (asked := self._hear("MISSION_REQUEST_INT|MISSION_REQUEST|MISSION_ACK", 5.0)) is not None:
-            if asked.get_type() == "MISSION_ACK":
-                return bool(asked.type == mav.MAV_MISSION_ACCEPTED)
-            _, _, frame, command, *numbers, _ = self._rows[asked.seq]
-            *how, lat, lon, h = map(float, numbers)
-            place = round(lat * 1e7), round(lon * 1e7), h
-            self._link.mav.mission_item_int_send(1, 1, asked.seq, int(frame), int(command), 0, 1, *how, *place)
-        return False
-
-    def _command(self, command: int, *values: float) -> bool:
-        self._link.mav.command_long_send(1, 1, command, 0, *values, *[0.0] * (7 - len(values)))
-        answer = self._hear("COMMAND_ACK", 2.0, lambda one: one.command == command)
-        return answer is not None and answer.result == mav.MAV_RESULT_ACCEPTED
 
 
 @pytest.fixture

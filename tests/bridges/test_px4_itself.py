@@ -6,16 +6,13 @@ import json
 import os
 import struct
 import subprocess
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mav
+from worlds import autopilots
 
 from testbed import Scenario, run
 from testbed.bridges import files
@@ -50,73 +47,40 @@ def px4(tmp_path: Path) -> Iterator[str]:
             process.wait()
 
 
-class Station(threading.Thread):
-    """A ground station that loads parameters and a mission, sets the mode, and arms as soon as it may."""
+class Station(autopilots.Station):
+    """Loads parameters and a mission, sets the mode, and arms as soon as it may."""
 
     def __init__(self, plan: Path, parameters: Path) -> None:
-        super().__init__(daemon=True)
-        self._items = json.loads(plan.read_text())["mission"]["items"]
+        super().__init__(14540 + INSTANCE, SYSTEM)
+        items = json.loads(plan.read_text())["mission"]["items"]
+        self._items = [(one["frame"], one["command"], one["params"]) for one in items]
         rows = (line.split("\t") for line in parameters.read_text().splitlines() if not line.startswith("#"))
         self._parameters = [(name, value, int(kind)) for _, _, name, value, kind in rows]
-        self._link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{14540 + INSTANCE}", source_system=255)
-        self.over = threading.Event()
         self.refused: list[str] = []
         self.start()
 
     def run(self) -> None:
-        if self._hear("HEARTBEAT", 120.0) is None:
+        if self.hear("HEARTBEAT", 120.0) is None:
             return
         for name, value, kind in self._parameters:
             self._set(name, value, kind)
-        self._send_mission()
+        if (answer := self.send(self._items)) != mav.MAV_MISSION_ACCEPTED:
+            self.refused.append(f"mission {answer}")
         while not self.over.is_set():
-            self._command(mav.MAV_CMD_DO_SET_MODE, 1, *MISSION_MODE)
-            if self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1):
+            self.command(mav.MAV_CMD_DO_SET_MODE, 1, *MISSION_MODE)
+            if self.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1):
                 return
-
-    def close(self) -> None:
-        self.over.set()
-        self.join()
-        self._link.close()
-
-    def _hear(self, name: str, seconds: float, is_it: Callable[[Any], bool] = lambda _: True) -> Any:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until and not self.over.is_set():
-            self._link.mav.heartbeat_send(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0)
-            message = self._link.recv_match(type=name.split("|"), blocking=True, timeout=0.1)
-            if message is not None and is_it(message):
-                return message
-        return None
 
     def _set(self, name: str, value: str, kind: int) -> None:
         number = (
             float(value) if kind == mav.MAV_PARAM_TYPE_REAL32 else struct.unpack("<f", struct.pack("<i", int(value)))[0]
         )
         for _ in range(5):
-            self._link.mav.param_set_send(SYSTEM, 1, name.encode(), number, kind)
-            answer = self._hear("PARAM_VALUE", 1.0, lambda one: one.param_id == name)
+            self.link.mav.param_set_send(SYSTEM, 1, name.encode(), number, kind)
+            answer = self.hear("PARAM_VALUE", 1.0, lambda one: one.param_id == name)
             if answer is not None and struct.pack("<f", answer.param_value) == struct.pack("<f", number):
                 return
         self.refused.append(name)
-
-    def _send_mission(self) -> None:
-        self._link.mav.mission_count_send(SYSTEM, 1, len(self._items))
-        while (asked := self._hear("MISSION_REQUEST_INT|MISSION_REQUEST|MISSION_ACK", 5.0)) is not None:
-            if asked.get_type() == "MISSION_ACK":
-                if asked.type != mav.MAV_MISSION_ACCEPTED:
-                    self.refused.append(f"mission {asked.type}")
-                return
-            one = self._items[asked.seq]
-            *how, lat, lon, h = one["params"]
-            place = round(lat * 1e7), round(lon * 1e7), h
-            self._link.mav.mission_item_int_send(SYSTEM, 1, asked.seq, one["frame"], one["command"], 0, 1, *how, *place)
-        self.refused.append("mission")
-
-    def _command(self, command: int, *values: float) -> bool:
-        padded = [*values, *[0.0] * (7 - len(values))]
-        self._link.mav.command_long_send(SYSTEM, 1, command, 0, *padded)
-        answer = self._hear("COMMAND_ACK", 2.0, lambda one: one.command == command)
-        return answer is not None and answer.result == mav.MAV_RESULT_ACCEPTED
 
 
 def test_its_estimator_runs_beside_ours(px4: str) -> None:

@@ -18,12 +18,12 @@ from nav.aids.terrain import RangefinderAid
 from nav.earth import radii
 from nav.error_model import MOTION, POS, VEL
 from nav.kalman import update
-from nav.samples import RangeSample
+from nav.samples import Outcome, RangeSample
 from nav.terrain import Terrain, ground
 from testbed import Scenario, run
 from testbed.motion.sections import Terrain as Section
 from testbed.motion.terrain import of, thinned, uneven
-from testbed.score.accuracy import errors
+from testbed.score.accuracy import column, errors
 
 LAT, LON, H_M = math.radians(36.58), math.radians(-84.34), 1100.0
 RADIUS_M, SPEED, DT, SECONDS = 1500.0, 25.0, 1.0, 900
@@ -121,8 +121,12 @@ def test_a_broken_rangefinder_leads_nobody_astray(fault: str) -> None:
         'estimator=[{name="ins", aids=["gnss", "barometer", "magnetometer", "airspeed", "rangefinder"]}]',
         f'fault=[{{sensor="rangefinder", channel="range", window=[500, 1100], {fault}}}]',
     ]
-    e = errors(run(Scenario.load("denied_terrain", changes), seed=11).dataset, "ins")
-    since = e.t > 540
+    dataset = run(Scenario.load("denied_terrain", changes), seed=11).dataset
+    e, since = errors(dataset, "ins"), 540
+    outcome = column(dataset, "estimators/ins/innovations/range/outcome")
+    late = column(dataset, "estimators/ins/innovations/range/sample_time") > since
+    assert (outcome[late] == Outcome.ISOLATED).mean() == (1.0 if "stuck" in fault else 0.0)
+    since = e.t > since
     off, claimed = np.hypot(*e.position[since, :2].T), np.hypot(*e.sigma_position[since, :2].T)
     print(f"median {np.median(off):.0f} m, over the claimed {np.median(off / claimed):.1f}")
     assert np.median(off / claimed) < 3

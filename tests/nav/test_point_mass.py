@@ -97,6 +97,7 @@ def flown(seed: int, sigma: float, sigma_v: float = 0.5, local: float = 4.0) -> 
         places.move(float(t), np.array([*(v + slip), 0.0]), np.array([sigma_v, 0.0]))
         here = height(true, lat, lon, *(v * t)) + higher + 0.5 * rng.standard_normal()
         places.weigh(np.array([0.0, 0.0, H_M - here]))
+        assert places.fits  # as its sensor and its map are what they are said to be
         if t % 5:
             continue
         P, own = np.eye(2) * (sigma**2 + (sigma_v * t) ** 2), (v + slip) * t + off

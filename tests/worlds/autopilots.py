@@ -9,9 +9,10 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mav
 
 TRIES = 2000  # at reaching a simulator that has not opened its port yet
@@ -254,7 +255,7 @@ class Answering:
     def __init__(self, lat: float, lon: float, h: float, placed_s: float = 0.0) -> None:
         self.home, self.placed_s = (lat, lon, h), placed_s
         self.armed: float | None = None  # when [s]
-        self._asked: dict[int, float] = {}  # intervals [us] by message
+        self.asked: dict[int, float] = {}  # intervals [us] by message
         self._link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._port = free_port(socket.SOCK_DGRAM)
         self._mav = mav.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -288,7 +289,7 @@ class Answering:
             said.append(mav.MAVLink_global_position_int_message(stamp, *map(round, place), 0, 0, 0, 0, 0))
             said.append(mav.MAVLink_local_position_ned_message(stamp, north, east, down, *velocity))
         for message in said:
-            if message.get_msgId() == mav.MAVLINK_MSG_ID_HEARTBEAT or message.get_msgId() in self._asked:
+            if message.get_msgId() == mav.MAVLINK_MSG_ID_HEARTBEAT or message.get_msgId() in self.asked:
                 self._link.sendto(message.pack(self._mav), ("127.0.0.1", self._port))
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -296,8 +297,9 @@ class Answering:
 
     def _hear(self, data: bytes, t: float) -> None:
         for message in mav.MAVLink(None).parse_buffer(data) or []:
+            assert (message.target_system, message.target_component) == (1, 1)
             if message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
-                self._asked[int(message.param1)] = message.param2
+                self.asked[int(message.param1)] = message.param2
             elif message.command == mav.MAV_CMD_COMPONENT_ARM_DISARM and (message.param1, message.param2) == (1, 2989):
                 self.armed = t if self.armed is None else self.armed
 
@@ -405,3 +407,47 @@ class Ear:
             while True:
                 messages += parser.parse_buffer(self._link.recv(4096)) or []
         return messages
+
+
+class Station(threading.Thread):
+    """A ground station of an autopilot itself, a ``system`` that speaks to a port: hears, commands, sends a mission."""
+
+    def __init__(self, port: int, system: int = 1) -> None:
+        super().__init__(daemon=True)
+        self.port, self.system = port, system
+        self.link = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", source_system=255)
+        self.over = threading.Event()
+
+    def close(self) -> None:
+        """It hears no more."""
+        self.over.set()
+        self.join()
+        self.link.close()
+
+    def hear(self, name: str, seconds: float, is_it: Callable[[Any], bool] = lambda _: True) -> Any:
+        """The next message of a name, or of several, "A|B"; None when none comes within so many seconds."""
+        until = time.monotonic() + seconds
+        while time.monotonic() < until and not self.over.is_set():
+            self.link.mav.heartbeat_send(mav.MAV_TYPE_GCS, mav.MAV_AUTOPILOT_INVALID, 0, 0, 0)
+            message = self.link.recv_match(type=name.split("|"), blocking=True, timeout=0.1)
+            if message is not None and is_it(message):
+                return message
+        return None
+
+    def command(self, command: int, *values: float) -> bool:
+        """Whether a command was accepted."""
+        padded = [*values, *[0.0] * (7 - len(values))]
+        self.link.mav.command_long_send(self.system, 1, command, 0, *padded)
+        answer = self.hear("COMMAND_ACK", 2.0, lambda one: one.command == command)
+        return answer is not None and answer.result == mav.MAV_RESULT_ACCEPTED
+
+    def send(self, items: Sequence[tuple[int, int, Sequence[float]]]) -> int | None:
+        """What a mission was answered with, None when it wasn't; of each item frame, command and seven numbers."""
+        self.link.mav.mission_count_send(self.system, 1, len(items))
+        while (asked := self.hear("MISSION_REQUEST_INT|MISSION_REQUEST|MISSION_ACK", 5.0)) is not None:
+            if asked.get_type() == "MISSION_ACK":
+                return int(asked.type)
+            frame, command, (*how, lat, lon, h) = items[asked.seq]
+            place = round(lat * 1e7), round(lon * 1e7), h
+            self.link.mav.mission_item_int_send(self.system, 1, asked.seq, frame, command, 0, 1, *how, *place)
+        return None

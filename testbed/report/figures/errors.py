@@ -107,7 +107,8 @@ def _error_panels(run: Run, axes: Any, name: str, error: Array, sigmas: _Sigmas,
     some = stride(len(t))
     for k, ax in enumerate(axes):
         low, high = -3 * sigma[some, k], 3 * sigma[some, k]
-        ax.fill_between(t[some], low, high, color=run.colours[name], alpha=FAINT, lw=0, label="±3 sigma, claimed")
+        if np.isfinite(sigma[:, k]).any():  # who says nothing of it claims nothing
+            ax.fill_between(t[some], low, high, color=run.colours[name], alpha=FAINT, lw=0, label="±3 sigma, claimed")
         ax.plot(*thin(t, error[:, k]), color=run.colours[name], lw=0.9, label="error")
         if least is not None:
             for sign in (-3, 3):
