@@ -29,7 +29,7 @@ from nav.increments import COINCIDENT, Increments, Step
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import Monitor, shown_limit
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
-from nav.samples import Array, Estimate, GnssSample, Outcome, Sample, UpdateReport
+from nav.samples import Array, Estimates, GnssSample, Outcome, Sample, Status, Told, UpdateReport
 from nav.state import State, absorb, parts, propagate
 
 # What a step is, in place of the number of an aid; and where its numbers begin.
@@ -74,8 +74,12 @@ class Taker(Protocol):
         """Use the parts from the ``first`` on of a sample whose others were used."""
         ...
 
-    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
-        """The estimate at ``t`` of a settled state, the ``whole`` of which may be changed."""
+    def status(self, t: float, last_bad: float) -> Status:
+        """What it says of itself at ``t`` [s], an increment having been bad for the last time at ``last_bad``."""
+        ...
+
+    def told(self, wholes: Array, t: Array, status: Sequence[Status]) -> Estimates:
+        """The estimates at ``t`` (N,) of settled states, each the whole of one of ``wholes``, which may be changed."""
         ...
 
 
@@ -115,7 +119,7 @@ class Batch:
 
     def take(
         self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Sequence[Step], ahead: Increments,
-        reports: list[UpdateReport], estimates: list[Estimate],
+        reports: list[UpdateReport], estimates: Told,
     ) -> tuple[int, float]:  # fmt: skip
         """Take the first of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
 
@@ -127,17 +131,19 @@ class Batch:
             return 0, last_bad
         imu, (common, filters, n) = ahead.imu, state.shape
         told = np.empty((2 * len(plan), REPORT))
-        states = np.empty((np.count_nonzero(plan[:, WHAT] == ESTIMATE), 2 + len(state.whole)))
+        asked = np.count_nonzero(plan[:, WHAT] == ESTIMATE)
+        wholes, when = np.empty((asked, len(state.whole))), np.empty((asked, 2))
         done = Done(
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
                 ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
-                self._filters[0].closed, told, states,
+                self._filters[0].closed, told, wholes, when,
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
         reports += _reports(known, steps, told[: done.reports])
-        drafted, whats = 0, plan[:, WHAT].tolist()
+        whats, then = plan[:, WHAT].tolist(), iter(when.tolist())
+        status: list[Status] = []
         for (t, _, sample), what in zip(steps[: done.steps], whats, strict=False):
             if sample is not None:
                 taker.took(sample)
@@ -145,9 +151,10 @@ class Batch:
                     for filter_ in self._listening:
                         filter_.stand_in(sample)
             elif t == t:
-                then, bad = states[drafted, :2].tolist()
-                estimates.append(taker.told(states[drafted, 2:], then, bad))
-                drafted += 1
+                status.append(taker.status(*next(then)))
+        if status:
+            drafted = len(status)
+            estimates.append(taker.told(wholes[:drafted], when[:drafted, 0], status))
         if not done.parts:
             return done.steps, done.last_bad
         sample = steps[done.steps].sample
@@ -227,14 +234,14 @@ def follow(
     in_motion: Array, room: Array, work: Array, period: int,
     t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
     steps: Array, kinds: Indices, told: Array, field: Array, closed: bool,
-    reports: Array, estimates: Array,
+    reports: Array, estimates: Array, when: Array,
 ) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
     """Take ``steps`` (K, WIDTH) as far as they are plain: see `Done`. In place on all that is handed over.
 
     The state and how it moves as of `nav.state.propagate`, the increments of `nav.increments.Increments`; ``kinds`` (A,
     8) and ``told`` (A, 12) of the aids (`_measure`), the last place of the reference ``field`` (6,), and whether the
-    filters are ``closed``. Into ``reports`` (_, `REPORT`) and ``estimates`` (_, 2 + whole): time, last bad increment,
-    state.
+    filters are ``closed``. Into ``reports`` (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2): of each of
+    these its time and that of the last bad increment.
     """
     q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
@@ -261,7 +268,7 @@ def follow(
             further = 0.0 if abs(time - now) <= COINCIDENT else time - max(t[stop - 1], now)
             if further > longest + COINCIDENT:
                 return k, 0, row, now, last_bad, written, drafted
-            draft, bad_then, then = estimates[drafted, 2:], last_bad, now if stop == row else t[stop - 1]
+            draft, bad_then, then = estimates[drafted], last_bad, now if stop == row else t[stop - 1]
             for i in range(len(whole)):
                 draft[i] = whole[i]
             bad = propagate(
@@ -279,7 +286,7 @@ def follow(
                 then = time
                 if bad >= 0:
                     bad_then = max(bad_then, time)
-            estimates[drafted, 0], estimates[drafted, 1] = then, bad_then
+            when[drafted, 0], when[drafted, 1] = then, bad_then
             drafted += 1
             continue
         if split:

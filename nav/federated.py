@@ -47,11 +47,13 @@ from nav.samples import (
     NO_SENSOR,
     Array,
     Estimate,
+    Estimates,
     GnssSample,
     ImuSamples,
     Outcome,
     Sample,
     Status,
+    Told,
     UpdateReport,
 )
 from nav.state import State
@@ -211,7 +213,11 @@ class Federated:
         return self._state is not None and self.config.weighting == "none" and not self._reference.scalings
 
     def take(
-        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+        self,
+        steps: Sequence[Step],
+        ahead: Increments,
+        reports: list[UpdateReport],
+        estimates: Told,
     ) -> int:
         """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubts.off.any():
@@ -243,11 +249,10 @@ class Federated:
         assert self._state is not None
         return self._use(self._state, self._users[sample.sensor][0], sample, first)
 
-    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
+    def told(self, wholes: Array, t: Array, status: Sequence[Status]) -> Estimates:
         """See `nav.batch.Taker`."""
         assert self._state is not None
-        state = State(*self._state.shape, whole)
-        return self._master.told(state, t, self._status(t, last_bad), self._doubts.off)
+        return self._master.told(wholes, self._state.shape, t, status, self._doubts.off)
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN), as `update` would give."""
@@ -481,13 +486,13 @@ class Federated:
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        status = self._status(t, last_bad)
+        status = self.status(t, last_bad)
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
-        return self._master.told(state, t, status, self._doubts.off)
+        return self._master.told(state.whole[None].copy(), state.shape, np.array([t]), [status], self._doubts.off)[0]
 
-    def _status(self, t: float, last_bad: float) -> Status:
-        """What it says of itself at ``t``."""
+    def status(self, t: float, last_bad: float) -> Status:
+        """What it says of itself at ``t``; see `nav.batch.Taker`."""
         status = Status.ALIGNING if self._state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
         return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status

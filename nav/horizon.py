@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 from nav.increments import COINCIDENT, Increments, Step, joined, share_of
-from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from nav.samples import Estimate, Estimates, ImuSamples, Sample, Told, UpdateReport
 from nav.strapdown import compensate
 
 
@@ -64,7 +64,11 @@ class TakesSteps(Protocol):
         ...
 
     def take(
-        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+        self,
+        steps: Sequence[Step],
+        ahead: Increments,
+        reports: list[UpdateReport],
+        estimates: Told,
     ) -> int:
         """How many of the first ``steps`` it took, zero when the first of them must be taken by itself."""
         ...
@@ -95,7 +99,7 @@ class FusionHorizon:
 
     def track(
         self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]
-    ) -> tuple[list[UpdateReport], list[Estimate]]:
+    ) -> tuple[list[UpdateReport], Estimates]:
         """`push`, and the estimates at ``times`` [s] on the way, ascending, the last less than an increment ahead.
 
         Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``, and none that
@@ -112,17 +116,17 @@ class FusionHorizon:
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
             self._ahead.append(ready)
         reports: list[UpdateReport] = []
-        estimates: list[Estimate] = []
+        estimates: Told = []
         estimator = self.estimator
         if isinstance(estimator, TakesSteps) and estimator.in_steps and self._ahead.next:
             self._take(estimator, times, reports, estimates)
-            return reports, estimates
+            return reports, Estimates.of(estimates)
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
         if self._ahead.ends:
             self._use(self._ahead.ends[-1], reports)
-        return reports, estimates
+        return reports, Estimates.of(estimates)
 
     def estimate_at(self, t: float) -> Estimate:
         """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
@@ -149,7 +153,11 @@ class FusionHorizon:
         return self.estimator.predict(front)
 
     def _take(
-        self, estimator: TakesSteps, times: Sequence[float], reports: list[UpdateReport], estimates: list[Estimate]
+        self,
+        estimator: TakesSteps,
+        times: Sequence[float],
+        reports: list[UpdateReport],
+        estimates: Told,
     ) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         steps: list[Step] = []
@@ -168,7 +176,7 @@ class FusionHorizon:
                 self._go(steps[0], reports, estimates)
             del steps[: max(taken, 1)]
 
-    def _go(self, step: Step, reports: list[UpdateReport], estimates: list[Estimate]) -> None:
+    def _go(self, step: Step, reports: list[UpdateReport], estimates: Told) -> None:
         """Take one step by itself."""
         if step.sample is not None:
             self._apply(step.horizon, step.sample, reports)

@@ -38,8 +38,7 @@ from nav.reference import (
     FieldModel,
     Reference,
     align,
-    describe,
-    doubted,
+    described,
     forget,
     nothing_known,
     spread,
@@ -48,6 +47,7 @@ from nav.samples import (
     NO_SENSOR,
     Array,
     Estimate,
+    Estimates,
     GnssSample,
     ImuSamples,
     MagnetometerSample,
@@ -55,11 +55,12 @@ from nav.samples import (
     PositionSample,
     Sample,
     Status,
+    Told,
     UpdateReport,
     WindSample,
 )
 from nav.smoother import Smoother
-from nav.state import Known, State, known
+from nav.state import State, known
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
 
@@ -203,7 +204,11 @@ class Ins:
         return self._takes_steps and self._state is not None
 
     def take(
-        self, steps: Sequence[Step], ahead: Increments, reports: list[UpdateReport], estimates: list[Estimate]
+        self,
+        steps: Sequence[Step],
+        ahead: Increments,
+        reports: list[UpdateReport],
+        estimates: Told,
     ) -> int:
         """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubt.any() or self._wind_doubt.pending:
@@ -241,11 +246,9 @@ class Ins:
             return self._update_gnss_further(state, sample, aid, None)
         return self._update_part_by_part(state, sample, aid, first)
 
-    def told(self, whole: Array, t: float, last_bad: float) -> Estimate:
+    def told(self, wholes: Array, t: Array, status: Sequence[Status]) -> Estimates:
         """See `nav.batch.Taker`."""
-        assert self._state is not None
-        self._wind_doubt.right(self._monitor.last_fused)
-        return self._described(known(whole, *self._state.shape), t, self._status(t, last_bad), self._doubt)
+        return self._described(wholes, t, status, self._doubt)
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample is of an aid, or can still serve the alignment."""
@@ -377,7 +380,7 @@ class Ins:
         if self._smoother is None:
             raise ValueError("this filter was not told to keep what smoothing needs: see InsConfig.smooth")
         for t, state in self._smoother.states(times):
-            yield self._described(state.known, t, Status.ALIGNED, np.zeros(MOTION))
+            yield self._described(state.whole[None].copy(), np.array([t]), [Status.ALIGNED], np.zeros(MOTION))[0]
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
@@ -472,22 +475,24 @@ class Ins:
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
-        status = self._status(t, last_bad)
+        status = self.status(t, last_bad)
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
         self._wind_doubt.right(self._monitor.last_fused)
-        return self._described(state.known, t, status, self._doubt + self._wind_doubt.off(t))
+        doubt = self._doubt + self._wind_doubt.off(t)
+        return self._described(state.whole[None].copy(), np.array([t]), [status], doubt)[0]
 
-    def _status(self, t: float, last_bad: float) -> Status:
-        """What it says of itself at ``t``."""
+    def status(self, t: float, last_bad: float) -> Status:
+        """What it says of itself at ``t``; see `nav.batch.Taker`."""
         status = Status.ALIGNING if self._state is None else FUSED if self._aided(t) else UNAIDED
         return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status
 
-    def _described(self, state: Known, t: float, status: Status, doubt: Array) -> Estimate:
-        """The estimate of a settled state, with a ``doubt`` (9,) of its motion."""
-        P, x = state.P, state.x.copy()
-        x[: len(state.imu)] = state.imu
-        covariance, sigma = spread(doubted(P, doubt), self.config.mounting_sigma**2)
-        extra = {name: (x[where], sigma[where]) for name, where in self._extra}
-        return describe(state, x, P, self.model, t, status, covariance, sigma, extra)
+    def _described(self, wholes: Array, t: Array, status: Sequence[Status], doubt: Array) -> Estimates:
+        """The estimates of N settled states (N, numbers), with a ``doubt`` (9,) of their motion."""
+        assert self._state is not None
+        q_nb, v_n, lla, imu, x, P, first = known(wholes, *self._state.shape)
+        x[:, : imu.shape[1]] = imu
+        covariance, sigma = spread(wholes, first, x.shape[1], self.config.mounting_sigma**2, doubt)
+        extra = {name: (x[:, where], sigma[:, where]) for name, where in self._extra}
+        return described(t, status, q_nb, v_n, lla, x, P, self.model, covariance, sigma, extra)

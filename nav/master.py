@@ -10,9 +10,9 @@ from nav._jit import njit
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance
 from nav.local_filter import LocalFilter
-from nav.reference import REPORTED, Reference, describe, doubted, spread, turned
-from nav.samples import Array, Estimate, Status
-from nav.state import State, inject
+from nav.reference import REPORTED, Reference, described, spread, turned
+from nav.samples import Array, Estimates, Status
+from nav.state import State, inject, known, parts
 
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
@@ -92,23 +92,32 @@ class MasterFilter:
                 self.reset(state, i, *target)
         self._reference.correct(state, master.x)
 
-    def told(self, state: State, t: float, status: Status, off: Array) -> Estimate:
-        """The estimate of a settled ``state``, which is changed, with a doubt ``off`` (9,) of its motion."""
-        master, model = self.combine(state, self._everyone), self._filters[0].model
-        inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
-        P = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
-        covariance, sigma = spread(doubted(P, off), self._config.mounting_sigma**2)
-        imu, x, deviation = state.imu.copy(), state.x.copy(), deviations(state.P)
-        extra = {name: (imu[at], sigma[at]) for name, at in self._common}
-        extra |= {name: (x[row, where], deviation[row, where]) for name, row, where in self._extra}
-        return describe(state, imu, P, model, t, status, covariance, sigma, extra)
+    def told(
+        self, wholes: Array, shape: tuple[int, int, int], t: Array, status: Sequence[Status], off: Array
+    ) -> Estimates:
+        """The estimates of settled states (N, numbers), which are changed, with a doubt ``off`` (9,) of the motion."""
+        common, filters, n = shape
+        model, masters = self._filters[0].model, np.empty((len(wholes), common, common))
+        for k, whole in enumerate(wholes):
+            state = State(*shape, whole)
+            master = self.combine(state, self._everyone)
+            inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
+            masters[k] = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
+        q_nb, v_n, lla, imu, *_, first = known(wholes, *shape)
+        covariance, sigma = spread(masters.reshape(len(t), -1), 0, common, self._config.mounting_sigma**2, off)
+        x, deviation = wholes[:, first - filters * n : first].reshape(-1, filters, n), deviations(wholes, *shape)
+        extra = {name: (imu[:, at], sigma[:, at]) for name, at in self._common}
+        extra |= {name: (x[:, row, where], deviation[:, row, where]) for name, row, where in self._extra}
+        return described(t, status, q_nb, v_n, lla, imu, masters, model, covariance, sigma, extra)
 
 
 @njit
-def deviations(P: Array) -> Array:
-    """1-sigma (filters, n) of the states of covariances (filters, n, n)."""
-    sigma = np.empty(P.shape[:2])
-    for f in range(len(P)):
-        for i in range(P.shape[1]):
-            sigma[f, i] = np.sqrt(P[f, i, i])
+def deviations(wholes: Array, common: int, filters: int, n: int) -> Array:
+    """1-sigma (N, filters, n) of the states of all filters, of N states of which each is the whole of a `State`."""
+    sigma = np.empty((len(wholes), filters, n))
+    for k in range(len(wholes)):
+        P = parts(wholes[k], common, filters, n)[5]
+        for f in range(filters):
+            for i in range(n):
+                sigma[k, f, i] = np.sqrt(P[f, i, i])
     return sigma

@@ -23,8 +23,8 @@ from nav.rotation import (
     quat_multiply,
     rotvec_from_quat,
 )
-from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
-from nav.state import Known, State, inject, propagate, sigma_step, working
+from nav.samples import Array, Estimate, Estimates, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
+from nav.state import State, inject, propagate, sigma_step, working
 from nav.unscented import Scaling, carry, scratch
 
 FIELD_PATCH_RAD, FIELD_PATCH_M = 1e-4, 500.0  # the reference field is looked up again beyond this
@@ -264,20 +264,22 @@ def nothing_known(t: float, status: Status) -> Estimate:
     )  # fmt: skip
 
 
-def describe(
-    state: State | Known, x: Array, P: Array, model: ErrorModel, t: float, status: Status, covariance: Array,
-    sigma: Array, extra: dict[str, tuple[Array, Array]],
-) -> Estimate:  # fmt: skip
-    """The estimate of a nominal state with estimated sensor errors ``x`` and covariance ``P``, laid out as ``model``.
+def described(
+    t: Array, status: Sequence[int], q_nb: Array, v_n: Array, lla: Array, x: Array, P: Array, model: ErrorModel,
+    covariance: Array, sigma: Array, extra: dict[str, tuple[Array, Array]],
+) -> Estimates:  # fmt: skip
+    """The estimates of N nominal states with estimated sensor errors ``x`` (N, n) and covariances ``P`` (N, n, n).
 
-    ``covariance`` and ``sigma`` are those of `spread`. Nothing of the estimate is a view of ``state``.
+    These are laid out as ``model``; ``covariance`` and ``sigma`` are those of `spread`. Of each argument each estimate
+    has a row. Nothing of them is a view of the states, which are larger.
     """
     gyro_bias, sigma_gyro = _with_drift(x, P, model, sigma, "gyro")
     accel_bias, sigma_accel = _with_drift(x, P, model, sigma, "accel")
-    lat, lon, h = state.lla.tolist()
-    return Estimate(
-        t, lat, lon, h, state.v_n.copy(), state.q_nb.copy(), gyro_bias, accel_bias, covariance, sigma_gyro, sigma_accel,
-        status, extra,
+    lat, lon, h = lla.T.copy()
+    return Estimates(
+        t.copy(), lat, lon, h, v_n.copy(), q_nb.copy(), gyro_bias.copy(), accel_bias.copy(), covariance,
+        sigma_gyro.copy(), sigma_accel.copy(), np.array(status, np.int64),
+        {name: (value.copy(), deviation.copy()) for name, (value, deviation) in extra.items()},
     )  # fmt: skip
 
 
@@ -299,37 +301,34 @@ def forget(P: Array, start: int, variance: Array) -> None:
     P[block, block] = np.diag(variance)
 
 
-def doubted(P: Array, off: Array) -> Array:
-    """The covariance of a motion that is off by ``off`` (9,) or right, nobody knows which: half of its square on top.
-
-    That is the second moment about the estimate where both are as likely. Zeros give ``P`` itself.
-    """
-    if not off.any():
-        return P
-    P = P.copy()
-    P[:MOTION, :MOTION] += 0.5 * np.outer(off, off)
-    return P
-
-
 def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str) -> tuple[Array, Array]:
-    """Bias of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
+    """Biases (N, 3) of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
     bias = model.slices[f"{sensor}_bias"]
     drift = model.slices.get(f"{sensor}_drift")
     if drift is None:
-        return x[bias], sigma[bias]
-    variance = sigma[bias] ** 2 + sigma[drift] ** 2 + 2 * P[bias, drift].diagonal()
-    return x[bias] + x[drift], np.sqrt(variance)
+        return x[:, bias], sigma[:, bias]
+    common = np.diagonal(P[:, bias, drift], axis1=1, axis2=2)
+    variance = sigma[:, bias] ** 2 + sigma[:, drift] ** 2 + 2 * common
+    return x[:, bias] + x[:, drift], np.sqrt(variance)
 
 
 @njit
-def spread(P: Array, mounting_variance: float) -> tuple[Array, Array]:
-    """Covariance (9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (n,) of every state."""
-    covariance, sigma = np.empty((MOTION, MOTION)), np.empty(len(P))
-    for i in range(MOTION):
-        for j in range(MOTION):
-            covariance[i, j] = P[ESTIMATE_ORDER[i], ESTIMATE_ORDER[j]]
-        if ESTIMATE_ORDER[i] < PHI + 3:
-            covariance[i, i] += mounting_variance
-    for i in range(len(P)):
-        sigma[i] = math.sqrt(P[i, i])
+def spread(rows: Array, first: int, n: int, mounting_variance: float, off: Array) -> tuple[Array, Array]:
+    """Covariances (N, 9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (N, n) of every state.
+
+    A covariance (n, n) begins in each of ``rows`` at the place ``first``. The motion is off by ``off`` (9,) or right,
+    nobody knows which: half of its square comes on top, which is the second moment about the estimate where both are as
+    likely.
+    """
+    covariance, sigma = np.empty((len(rows), MOTION, MOTION)), np.empty((len(rows), n))
+    for k in range(len(rows)):
+        for i in range(MOTION):
+            a = ESTIMATE_ORDER[i]
+            for j in range(MOTION):
+                b = ESTIMATE_ORDER[j]
+                covariance[k, i, j] = rows[k, first + a * n + b] + 0.5 * (off[a] * off[b])
+            if a < PHI + 3:
+                covariance[k, i, i] += mounting_variance
+        for i in range(n):
+            sigma[k, i] = math.sqrt(rows[k, first + i * (n + 1)])
     return covariance, sigma

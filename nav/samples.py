@@ -7,10 +7,11 @@ was true, ``t_arrival`` when the receiver of it could first have known (``t_arri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import TypeAlias
+from itertools import chain
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -283,3 +284,104 @@ class Estimate:
             np.full(4, np.nan) if q_nb is None else q_nb, unknown, unknown,
             np.full((9, 9), np.nan) if covariance is None else covariance, unknown, unknown, status,
         )  # fmt: skip
+
+
+# The fields of an estimate that are arrays, and how long they are.
+VECTORS: Mapping[str, tuple[int, ...]] = {
+    "v_n": (3,), "q_nb": (4,), "gyro_bias": (3,), "accel_bias": (3,), "covariance": (9, 9), "sigma_gyro_bias": (3,),
+    "sigma_accel_bias": (3,),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates(Sequence[Estimate]):
+    """Estimates one after the other: the fields of `Estimate`, with a row of each array for each of N.
+
+    ``status`` (N,) are numbers of `Status`. In ``extra`` a state that an estimate lacks is NaN, and so is its sigma.
+    """
+
+    t: Array
+    lat: Array
+    lon: Array
+    h: Array
+    v_n: Array
+    q_nb: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+    sigma_gyro_bias: Array
+    sigma_accel_bias: Array
+    status: npt.NDArray[np.int64]
+    extra: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, pieces: Iterable[Estimate | Estimates]) -> Estimates:
+        """Single ones, and several at once, in their order."""
+        blocks: list[Estimates] = []
+        singles: list[Estimate] = []
+        for piece in pieces:
+            if isinstance(piece, Estimate):
+                singles.append(piece)
+                continue
+            if singles:
+                blocks.append(cls._gathered(singles))
+                singles = []
+            blocks.append(piece)
+        if singles:
+            blocks.append(cls._gathered(singles))
+        if len(blocks) < 2:
+            return blocks[0] if blocks else NO_ESTIMATES
+        columns = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in (*_NUMBERS, *VECTORS)}
+        return cls(**columns, extra=_joined(blocks))
+
+    @classmethod
+    def _gathered(cls, singles: Sequence[Estimate]) -> Estimates:
+        columns: dict[str, Any] = {name: np.array([getattr(one, name) for one in singles]) for name in _NUMBERS}
+        columns |= {
+            name: np.array([getattr(one, name) for one in singles], float).reshape(-1, *shape)
+            for name, shape in VECTORS.items()
+        }
+        widths = {name: len(value) for one in singles for name, (value, _) in one.extra.items()}
+        extra = {}
+        for name, width in widths.items():
+            unknown = (np.full(width, np.nan),) * 2
+            pairs = np.array([one.extra.get(name, unknown) for one in singles], float)
+            extra[name] = pairs[:, 0], pairs[:, 1]
+        return cls(**columns, extra=extra)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @overload
+    def __getitem__(self, which: int) -> Estimate: ...
+    @overload
+    def __getitem__(self, which: slice | Sequence[int]) -> Estimates: ...
+
+    def __getitem__(self, which: int | slice | Sequence[int]) -> Estimate | Estimates:
+        """One of them, or those of a slice or of a list of indices."""
+        if not isinstance(which, int):
+            columns = {name: getattr(self, name)[which] for name in (*_NUMBERS, *VECTORS)}
+            return Estimates(**columns, extra={name: (x[which], s[which]) for name, (x, s) in self.extra.items()})
+        numbers: dict[str, Any] = {name: float(getattr(self, name)[which]) for name in ("t", "lat", "lon", "h")}
+        vectors: dict[str, Any] = {name: getattr(self, name)[which] for name in VECTORS}
+        pairs = {name: (value[which], sigma[which]) for name, (value, sigma) in self.extra.items()}
+        extra = {name: pair for name, pair in pairs.items() if not np.isnan(pair).all()}
+        return Estimate(**numbers, **vectors, status=Status(int(self.status[which])), extra=extra)
+
+
+Told: TypeAlias = list[Estimate | Estimates]  # on the way, one at a time or several
+_NUMBERS = ("t", "lat", "lon", "h", "status")
+_EMPTY: dict[str, Any] = dict.fromkeys(("t", "lat", "lon", "h"), np.empty(0)) | {
+    name: np.empty((0, *shape)) for name, shape in VECTORS.items()
+}
+NO_ESTIMATES = Estimates(**_EMPTY, status=np.empty(0, np.int64))
+
+
+def _joined(blocks: Sequence[Estimates]) -> dict[str, tuple[Array, Array]]:
+    """The further states of blocks; where one lacks a state it is NaN."""
+    extra = {}
+    for name in dict.fromkeys(chain.from_iterable(block.extra for block in blocks)):
+        width = next(block.extra[name][0].shape[1] for block in blocks if name in block.extra)
+        pairs = [block.extra.get(name) or (np.full((len(block), width), np.nan),) * 2 for block in blocks]
+        extra[name] = np.concatenate([x for x, _ in pairs]), np.concatenate([sigma for _, sigma in pairs])
+    return extra

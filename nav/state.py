@@ -65,34 +65,31 @@ class State:
         made.take(self)
         return made
 
-    @property
-    def known(self) -> Known:
-        """What it says of the motion, of the inertial sensors and of its first filter."""
-        return known(self.whole, *self.shape)
-
     def __deepcopy__(self, memo: object) -> State:
         """A deep copy of views would be arrays each by itself."""
         return self.copy()
 
 
 class Known(NamedTuple):
-    """What a `State` says of the motion, of the inertial sensors and of its first filter: the same names."""
+    """What each of N states says of the motion, of the inertial sensors and of its first filter, where its P begins."""
 
-    q_nb: Array
+    q_nb: Array  # (N, 4)
     v_n: Array
     lla: Array
-    imu: Array
-    x: Array  # (n,)
-    P: Array  # (n, n)
+    imu: Array  # (N, common)
+    x: Array  # (N, n)
+    P: Array  # (N, n, n)
+    first: int
 
 
-def known(whole: Array, common: int, filters: int, n: int) -> Known:
-    """Views of the ``whole`` of a `State`."""
+def known(wholes: Array, common: int, filters: int, n: int) -> Known:
+    """Views of ``wholes`` (N, numbers), each the whole of a `State`."""
     x = FIXED + common
     P = x + filters * n
     return Known(
-        whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x : x + n], whole[P : P + n * n].reshape(n, n)
-    )
+        wholes[:, :4], wholes[:, 4:7], wholes[:, 7:10], wholes[:, FIXED:x], wholes[:, x : x + n],
+        wholes[:, P : P + n * n].reshape(-1, n, n), P,
+    )  # fmt: skip
 
 
 @njit

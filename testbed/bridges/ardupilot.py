@@ -31,13 +31,13 @@ import math
 import socket
 import struct
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.rotation import euler_from_quat
-from nav.samples import AirspeedSample, Estimate
+from nav.samples import AirspeedSample, Estimates
 from testbed.bridges.address import address, bound
 from testbed.bridges.gps_input import GpsInput
 from testbed.bridges.listener import Listener, listeners
@@ -125,12 +125,11 @@ class ArduPilot:
                 one.arm_ardupilot(SYSTEM)
         self._ask_due = t + ASK_S if asks else self._ask_due
 
-    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+    def estimates(self, times: Sequence[float]) -> Mapping[str, Estimates]:
         """What ArduPilot said over the whole run of its own motion."""
-        for name, one in self._ears.items():
+        for one in self._ears.values():
             one.listen(SYSTEM, LAST_S)
-            for estimate in one.told.estimates(times, 0.0):
-                yield name, estimate
+        return {name: Estimates.of(one.told.estimates(times, 0.0)) for name, one in self._ears.items()}
 
     def close(self) -> None:
         """Close the port, the link for fixes, and where its estimators are heard."""

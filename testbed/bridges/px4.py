@@ -29,13 +29,13 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from nav.earth import SEA_LEVEL_DENSITY, isa_temperature, pressure_altitude
-from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, MagnetometerSample
+from nav.samples import AirspeedSample, BarometerSample, Estimates, GnssSample, MagnetometerSample
 from testbed.bridges.address import address, bound
 from testbed.bridges.listener import listeners
 from testbed.bridges.steps import Step, Stepper, moved
@@ -124,13 +124,12 @@ class Px4:
                 self._arm_due = float(turn.reference.t[-1]) + ARM_S
                 one.arm_px4(self._system)
 
-    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+    def estimates(self, times: Sequence[float]) -> Mapping[str, Estimates]:
         """What PX4 said over the whole run of its own motion."""
         boot = (self._first_us - (self._offset_us or 0)) / 1e6
-        for name, one in self._ears.items():
+        for one in self._ears.values():
             one.listen(self._system, LAST_S)
-            for estimate in one.told.estimates(times, boot):
-                yield name, estimate
+        return {name: Estimates.of(one.told.estimates(times, boot)) for name, one in self._ears.items()}
 
     def close(self) -> None:
         """Close the connections."""

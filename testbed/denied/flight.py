@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from nav.earth import position_difference_n
-from nav.samples import Array, Estimate
+from nav.samples import Array, Estimates
 from testbed import sensors
 from testbed.data import write_file
 from testbed.denied.table import EVERY_S, Case
@@ -104,7 +104,7 @@ class _Flying:
     scenario: Scenario
     lanes: Mapping[str, Lane]
     faults: Faults
-    estimates: dict[str, list[Estimate]] = field(default_factory=dict)
+    estimates: dict[str, list[Estimates]] = field(default_factory=dict)
 
 
 class _Bench:
@@ -217,7 +217,7 @@ def _part(one: _Flying, block: TruthBlock, bench: _Bench, times: Sequence[float]
             record.samples(name, samples)
         record.truth(block)
     for name, lane in one.lanes.items():
-        one.estimates[name] += lane.track(commanded(block), imu, found, times).estimates
+        one.estimates[name].append(lane.track(commanded(block), imu, found, times).estimates)
 
 
 def _outcome(
@@ -236,7 +236,7 @@ def _outcome(
             found = least[aids]
             names.append((one.case.aids.name, one.case.grade.name, section.name))
             bounds.append(np.full(len(t), np.nan) if found is None else np.interp(t, found.t, found.horizontal))
-            error, covariance = _errors(one.estimates[section.name], kept)
+            error, covariance = _errors(Estimates.of(one.estimates[section.name]), kept)
             errors.append(error)
             covariances.append(covariance)
         tell(FLOWN + (1 - FLOWN) * (k + 1) / len(flying))
@@ -251,11 +251,11 @@ def _outcome(
     )  # fmt: skip
 
 
-def _errors(estimates: Sequence[Estimate], kept: Array) -> tuple[Array, Array]:
+def _errors(estimates: Estimates, kept: Array) -> tuple[Array, Array]:
     """Horizontal errors (K, 2) [m] and their claimed covariance (K, 3) [m^2]; the IMU sits at the centre of gravity."""
-    lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
-    P = np.array([e.covariance[:2, :2] for e in estimates])
-    return position_difference_n(lat, lon, h, *kept.T[1:])[:, :2], np.column_stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
+    P = estimates.covariance
+    error = position_difference_n(estimates.lat, estimates.lon, estimates.h, *kept.T[1:])
+    return error[:, :2], np.column_stack([P[:, 0, 0], P[:, 0, 1], P[:, 1, 1]])
 
 
 def _flown(tree: xarray.DataTree, t: Array) -> Array:

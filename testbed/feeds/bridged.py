@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
-from nav.samples import Estimate
+from nav.samples import Estimates
 from testbed.feeds.feed import Feed, Surfaces, Turn
 
 OURS, THEIRS = "ours", "theirs"  # whose samples of a kind of sensor a far end has
@@ -33,8 +33,8 @@ class FarEnd(Protocol):
         """Tell it of a turn, and hear its answers; waits for them. Sets ``failure`` in place of raising anything."""
         ...
 
-    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
-        """What its estimators said over the whole run: names, and estimates at ``times`` [s]."""
+    def estimates(self, times: Sequence[float]) -> Mapping[str, Estimates]:
+        """What its estimators, by name, said over the whole run, at ``times`` [s]."""
         ...
 
     def close(self) -> None:

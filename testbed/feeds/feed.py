@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from nav.samples import ImuSamples, Sample
+from nav.samples import Estimates, ImuSamples, Sample
 from testbed.estimators.lane import Tracked
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.sensors.faults import Faults
@@ -111,7 +111,7 @@ def join(turns: Sequence[Turn]) -> Turn:
                 _join_imu([turn.tracked[name].increments for turn in turns]),
                 [report for turn in turns for report in turn.tracked[name].votes],
                 [report for turn in turns for report in turn.tracked[name].reports],
-                [estimate for turn in turns for estimate in turn.tracked[name].estimates],
+                Estimates.of(turn.tracked[name].estimates for turn in turns),
             )
             for name in first.tracked
         },

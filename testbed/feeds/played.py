@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import Array, Estimate
+from nav.samples import Array, Estimates
 from testbed.errors import UserError
 from testbed.feeds.feed import Surfaces, Turn
 from testbed.feeds.piloted import TAKES_OVER, is_step
@@ -54,9 +54,9 @@ class Played:
         elif last >= 0 and self._flew[last]:
             self.surfaces = Surfaces(*self._commands[last].tolist())
 
-    def estimates(self, times: Sequence[float]) -> Iterator[tuple[str, Estimate]]:
+    def estimates(self, times: Sequence[float]) -> Mapping[str, Estimates]:
         """None: what it estimated is not heard again."""
-        return iter(())
+        return {}
 
     def close(self) -> None:
         """Nothing is open."""

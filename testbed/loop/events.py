@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from nav.samples import Estimate, GnssSample, Sample, Status, UpdateReport
+from nav.samples import GnssSample, Sample, UpdateReport
 from testbed.motion.logged import LogTruth
 from testbed.motion.table import ON_GROUND, OUTSIDE
 from testbed.scenario import Scenario
@@ -87,11 +87,10 @@ class EventWatch:
                 text = f"{estimator}: {what} refused {REFUSALS} times in a row, {report.reason}"
                 self.emit(report.t, "warning", text)
 
-    def estimate(self, estimator: str, estimate: Estimate) -> None:
+    def estimate(self, estimator: str, t: float, aligned: bool) -> None:
         """An estimator may have aligned."""
-        aligned = Status.ALIGNED in estimate.status
         if aligned and not self.aligned.get(estimator, False):
-            self.emit(estimate.t, "info", f"{estimator} aligned")
+            self.emit(t, "info", f"{estimator} aligned")
         self.aligned[estimator] = aligned
 
     def row(self, t: float, leg: float, plan: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nav.samples import Estimate, Sample, UpdateReport
+from nav.samples import Estimates, Sample, Status, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -238,10 +238,12 @@ class _Passage:
         wanted = {name: rows if name in (self.setup.shown, *turn.tracked) else fewer for name in self.lanes}
         tracked = {name: self._track(name, turn, block.t[wanted[name]].tolist()) for name in self.lanes}
         self._record(turn)
-        estimates = {name: dict(zip(wanted[name], tracked[name].estimates, strict=True)) for name in self.lanes}
+        recorded = range(-self.tick % self.cadence.record, len(block), self.cadence.record)
+        told = {name: _Told.of(tracked[name].estimates, wanted[name]) for name in self.lanes}
+        for name, one in told.items():
+            self.recorder.estimates(name, one.of_rows(recorded))
         for k in rows:
-            now = [(name, own[k]) for name, own in estimates.items() if k in own]
-            self._hand_out(turn, tracked, now, k)
+            self._hand_out(turn, tracked, told, k)
         self.tick += len(block)
         t = float(block.t[-1])
         if self.director.pacer is not None:
@@ -280,35 +282,32 @@ class _Passage:
             self.recorder.samples(name, own)
         self.recorder.steered(turn.steered)
 
-    def _hand_out(
-        self, turn: Turn, tracked: Mapping[str, Tracked], now: Sequence[tuple[str, Estimate]], k: int
-    ) -> None:
-        """Row ``k`` of a turn, with the estimates that are wanted ``now``: events, record, links."""
+    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], told: Mapping[str, _Told], k: int) -> None:
+        """Row ``k`` of a turn, with what estimators that were asked told: events, links."""
         t = float(turn.reference.t[k])
         self.arrived += self.latest.until(t)
         if (self.tick + k) % self.cadence.events == 0:
-            self._look(t, float(turn.reference.leg[k]), now)
-        if (self.tick + k) % self.cadence.record == 0:
-            for name, estimate in now:
-                self.recorder.estimate(name, estimate)
+            self._look(t, float(turn.reference.leg[k]), told, k)
         shown = self.setup.shown
         if self.cadence.publish and (self.tick + k) % self.cadence.publish == 0 and shown is not None:
             due = self.backlog[shown].shown_until(t)
-            row, first = turn.reference.rows(k, k + 1), next(estimate for name, estimate in now if name == shown)
-            others = [(name, estimate) for name, estimate in now if name != shown]
+            others = [(name, one.estimates[one.at[k]]) for name, one in told.items() if name != shown and k in one.at]
+            first, row = told[shown], turn.reference.rows(k, k + 1)
+            estimate = first.estimates[first.at[k]]
             for link in self.setup.links:
-                link.publish(row, first, self.latest.by_sensor, tracked[shown].increments, others, due)
+                link.publish(row, estimate, self.latest.by_sensor, tracked[shown].increments, others, due)
 
-    def _look(self, t: float, leg: float, now: Sequence[tuple[str, Estimate]]) -> None:
-        """Look for events at ``t``."""
+    def _look(self, t: float, leg: float, told: Mapping[str, _Told], k: int) -> None:
+        """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
             self.told.emit(*event)
         for sample in self.arrived:
             self.watch.sample(sample)
         self.arrived.clear()
         self.watch.row(t, leg, self.leg_names)
-        for name, estimate in now:
-            self.watch.estimate(name, estimate)
+        for name, one in told.items():
+            if k in one.at:
+                self.watch.estimate(name, *one.aligned[one.at[k]])
             for report in self.backlog[name].read_until(t):
                 self.watch.report(name, report)
 
@@ -345,11 +344,10 @@ class _Passage:
         for section in _own(self.scenario, self.setup.far_end):
             _, *smoothed = section.recorded
             for name in smoothed:
-                for estimate in self.lanes[section.name].smoothed(times):
-                    self.recorder.estimate(name, estimate)
+                self.recorder.estimates(name, Estimates.of(self.lanes[section.name].smoothed(times)))
         if self.setup.far_end is not None:
-            for name, estimate in self.setup.far_end.estimates(times):
-                self.recorder.estimate(name, estimate)
+            for name, found in self.setup.far_end.estimates(times).items():
+                self.recorder.estimates(name, found)
 
     @property
     def _end(self) -> float:
@@ -363,6 +361,25 @@ class _Passage:
             seconds["missed_percent"] = 100 * pacer.missed / pacer.waits
             seconds["jitter_p99_s"] = pacer.jitter_s(0.99)
         return seconds
+
+
+class _Told(NamedTuple):
+    """What an estimator told in a turn: where among it each row of the turn is; time, and whether it is aligned."""
+
+    estimates: Estimates
+    at: dict[int, int]
+    aligned: list[tuple[float, bool]]
+
+    @classmethod
+    def of(cls, estimates: Estimates, rows: Sequence[int]) -> _Told:
+        """Of the ``rows`` that were wanted."""
+        aligned = (estimates.status & Status.ALIGNED).astype(bool)
+        at = {row: k for k, row in enumerate(rows)}
+        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)))
+
+    def of_rows(self, rows: Sequence[int]) -> Estimates:
+        """Those of some rows."""
+        return self.estimates if len(rows) == len(self.at) else self.estimates[[self.at[row] for row in rows]]
 
 
 def _own(scenario: Scenario, far_end: FarEnd | None) -> tuple[EstimatorSection, ...]:

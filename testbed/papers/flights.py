@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from nav.earth import position_difference_n
 from nav.ins import Ins
-from nav.samples import Array, Estimate, ImuSamples, Outcome, UpdateReport
+from nav.samples import Array, Estimates, ImuSamples, Outcome, UpdateReport
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.estimators.federated import FederatedSection
@@ -163,7 +163,7 @@ class Flight:
         self._lane, self._sensed = lane, sensed
         self._now, self._t = -math.inf, np.empty(0)
         self._reports: list[UpdateReport] = []
-        self._estimates: list[Estimate] = []
+        self._estimates: list[Estimates] = []
 
     def on(self, t: Array) -> None:
         """Fly on, with estimates at ``t`` (N,) [s], to the last of them."""
@@ -172,7 +172,7 @@ class Flight:
         reports, estimates = self._lane.horizon.track(self._lane.increments(now.samples)[0], handed, t.tolist())
         self._now, self._t = float(t[-1]), np.append(self._t, t)
         self._reports += reports
-        self._estimates += estimates
+        self._estimates.append(estimates)
 
     def fork(self, sensed: Sensed) -> Flight:
         """The same up to now, on the way over another flight that was alike so far."""
@@ -183,7 +183,7 @@ class Flight:
 
     def track(self) -> Track:
         """What came of it so far."""
-        return _errors(self._estimates, self._reports, self._sensed.truth, self._t)
+        return _errors(Estimates.of(self._estimates), self._reports, self._sensed.truth, self._t)
 
 
 def track(lane: Lane, sensed: Sensed, t: Array) -> Track:
@@ -193,18 +193,15 @@ def track(lane: Lane, sensed: Sensed, t: Array) -> Track:
     return flight.track()
 
 
-def _errors(
-    estimates: Sequence[Estimate], reports: Sequence[UpdateReport], truth: TruthBlock, t: Array
-) -> Track:  # fmt: skip
+def _errors(estimates: Estimates, reports: Sequence[UpdateReport], truth: TruthBlock, t: Array) -> Track:
     rows = np.searchsorted(truth.t, t - accuracy.SAME_TIME_S)
-    lat, lon, h = np.array([(e.lat, e.lon, e.h) for e in estimates]).T
-    q_nb, true = np.array([e.q_nb for e in estimates]), truth.q_nb[rows]
+    here, true = (truth.lat[rows], truth.lon[rows], truth.h[rows]), truth.q_nb[rows]
     return Track(
         t=t,
-        position=position_difference_n(lat, lon, h, truth.lat[rows], truth.lon[rows], truth.h[rows]),
-        velocity=np.array([e.v_n for e in estimates]) - truth.v_n[rows],
-        attitude=accuracy.attitude_error(q_nb, true),
-        angles=accuracy.wrapped(accuracy.euler(q_nb) - accuracy.euler(true)),
-        sigma=np.sqrt([e.covariance.diagonal() for e in estimates]),
+        position=position_difference_n(estimates.lat, estimates.lon, estimates.h, *here),
+        velocity=estimates.v_n - truth.v_n[rows],
+        attitude=accuracy.attitude_error(estimates.q_nb, true),
+        angles=accuracy.wrapped(accuracy.euler(estimates.q_nb) - accuracy.euler(true)),
+        sigma=np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2)),
         reports=reports,
     )

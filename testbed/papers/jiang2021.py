@@ -227,10 +227,10 @@ def _run(running: Lane, sensed: Sensed, increments: ImuSamples, tilt_n: Array, w
     t = np.arange(1.0, (truth.t[-1] if whole else turning[0]) + 0.5)
     reports, estimates = running.horizon.track(increments, aids, t.tolist())
     rows = np.searchsorted(truth.t, t - accuracy.SAME_TIME_S)
-    q_nb, true = np.array([estimate.q_nb for estimate in estimates]), truth.q_nb[rows]
+    q_nb, true = estimates.q_nb, truth.q_nb[rows]
 
     def told(*names: str) -> Array:
-        return np.array([[estimate.extra[name][0][0] for name in names] for estimate in estimates])
+        return np.column_stack([estimates.extra[name][0][:, 0] for name in names])
 
     return Flown(
         t=t,

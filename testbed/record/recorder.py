@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 import numpy as np
 
-from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from nav.samples import Estimates, ImuSamples, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.record import tables
@@ -119,9 +119,10 @@ class Recorder:
         if samples:
             self._table(f"sensors/{name}", tables.pack_samples).objects.extend(samples)
 
-    def estimate(self, name: str, estimate: Estimate) -> None:
-        """Take one estimate."""
-        self._table(f"estimators/{name}", tables.pack_estimates).objects.append(estimate)
+    def estimates(self, name: str, estimates: Estimates) -> None:
+        """Take estimates of one estimator."""
+        if len(estimates):
+            self._table(f"estimators/{name}").add(*tables.estimate_columns(estimates))
 
     def reports(self, name: str, reports: Sequence[UpdateReport]) -> None:
         """Take what became of aiding samples, one group per aid."""

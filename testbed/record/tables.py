@@ -6,14 +6,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import Field, dataclass, field, fields, replace
-from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import Estimate, Sample, UpdateReport
+from nav.samples import VECTORS, Estimates, Sample, UpdateReport
 from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
 
 if TYPE_CHECKING:
@@ -201,25 +200,18 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     return block, variables
 
 
-def pack_estimates(estimates: Sequence[Estimate]) -> tuple[Block, dict[str, Variable]]:
+def estimate_columns(estimates: Estimates) -> tuple[Block, dict[str, Variable]]:
     """Estimates of one estimator."""
-    block: Block = {"time": _scalars(estimates, "t")}
+    block: Block = {"time": estimates.t}
     variables = dict(ESTIMATE)
-    for name in ("lat", "lon", "h", "status"):
-        block[name] = _scalars(estimates, name, ESTIMATE[name].dtype)
-    for name in ("v_n", "q_nb", "gyro_bias", "accel_bias", "sigma_gyro_bias", "sigma_accel_bias", "covariance"):
-        block[name] = _vectors(estimates, name)
-    sigma = np.sqrt(np.maximum(np.diagonal(block["covariance"], axis1=1, axis2=2), 0.0))  # nan stays nan
+    for name in ("lat", "lon", "h", "status", *VECTORS):
+        block[name] = getattr(estimates, name)
+    sigma = np.sqrt(np.maximum(np.diagonal(estimates.covariance, axis1=1, axis2=2), 0.0))  # nan stays nan
     for k, name in enumerate(("sigma_position_n", "sigma_velocity_n", "sigma_attitude_n")):
         block[name] = sigma[:, 3 * k : 3 * k + 3]
-    extras = [e.extra for e in estimates]
-    for name in dict.fromkeys(chain.from_iterable(extras)):
-        width = next(len(extra[name][0]) for extra in extras if name in extra)
+    for name, pair in estimates.extra.items():
         variable = extra_state(name)
-        blank = (np.full(width, np.nan), np.full(width, np.nan))
-        pairs = zip(*[extra.get(name, blank) for extra in extras], strict=True)
-        for column, parts in zip((name, f"sigma_{name}"), pairs, strict=True):
-            values = _joined(parts)
+        for column, values in zip((name, f"sigma_{name}"), pair, strict=True):
             block[column] = values if variable.dims else values[:, 0]
             variables[column] = variable if column == name else replace(variable, meaning=f"1-sigma of {name}")
     return block, variables

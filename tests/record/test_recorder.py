@@ -22,14 +22,14 @@ from worlds import synthetic_run
 from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import Estimate, ImuSamples, Outcome, UpdateReport
+from nav.samples import Estimates, ImuSamples, Outcome, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record
 from testbed.record.columns import AXES
 from testbed.record.reader import load
 from testbed.record.recorder import Recorder
-from testbed.record.tables import Table, pack_estimates
+from testbed.record.tables import Table
 
 TWO = {"ins": Errors(), "dead_reckoning": Errors(drift_mps=5.0)}
 DENIED = ((20.0, 40.0),)
@@ -199,7 +199,7 @@ def test_every_flush_can_be_read_and_flushing_changes_nothing(tmp_path: Path, ru
         block = truth.rows(start, min(start + 397, len(truth)))
         recorder.truth(block)
         for k in range(-(-start // 20) * 20, start + len(block), 20):
-            recorder.estimate("late" if k > 6000 else "ins", told[k])
+            recorder.estimates("late" if k > 6000 else "ins", Estimates.of([told[k]]))
         recorder.flush()
         tree = load(path)
         assert tree["truth"]["time"].values[-1] == truth.t[(start + len(block) - 1) // 20 * 20]
@@ -218,7 +218,7 @@ def test_a_column_that_appears_late_is_blank_before(tmp_path: Path) -> None:
     told = synthetic_run.estimates(truth, Errors(), np.random.default_rng(0))
     recorder.truth(truth)
     for k in (0, 20, 2000, 2020):  # the extra states come with alignment at 5 s
-        recorder.estimate("ins", told[k])
+        recorder.estimates("ins", Estimates.of([told[k]]))
         recorder.flush()
     recorder.close()
     wind = load(tmp_path / "run.nc")["estimators/ins"]["wind"].values
@@ -287,18 +287,6 @@ def test_a_record_without_spare_moments_is_written_all_the_same(
     recorder.truth(circle(10.0))
     assert load(tmp_path / "run.nc")["truth"].sizes["time"] == 101
     recorder.close()
-
-
-def test_arrays_of_any_kind_are_recorded_by_their_values() -> None:
-    """As a user's estimator may give them: whole numbers, every other number of more, rows stored as columns."""
-    spread, turned = np.arange(8.0), np.asfortranarray(np.arange(81.0).reshape(9, 9))
-    plain = Estimate.of(1.0, lla=np.zeros(3), v_n=np.arange(3.0), q_nb=spread[:4], covariance=np.ones((9, 9)))
-    odd = replace(plain, v_n=np.array([4, 5, 6]), q_nb=spread[::2], covariance=turned)
-    block, _ = pack_estimates([plain, odd, plain])
-    np.testing.assert_array_equal(block["v_n"], [[0, 1, 2], [4, 5, 6], [0, 1, 2]])
-    np.testing.assert_array_equal(block["q_nb"], [[0, 1, 2, 3], [0, 2, 4, 6], [0, 1, 2, 3]])
-    np.testing.assert_array_equal(block["covariance"], [np.ones((9, 9)), turned, np.ones((9, 9))])
-    assert {block[name].dtype for name in ("v_n", "q_nb", "covariance")} == {np.dtype(float)}
 
 
 def test_long_text_is_cut_at_a_whole_character() -> None:
@@ -413,7 +401,7 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
     recorder.truth(truth.rows(2001, 4001))
     told = synthetic_run.estimates(truth, Errors(), np.random.default_rng(5))
     for k in range(2020, 4001, 20):
-        recorder.estimate("ins", told[k])
+        recorder.estimates("ins", Estimates.of([told[k]]))
     with pytest.raises(Died):
         recorder.flush()
     with pytest.raises(Died):

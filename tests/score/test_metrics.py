@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from scipy.stats import chi2
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import NO_SENSOR, FixType, GnssSample, Outcome
+from nav.samples import NO_SENSOR, Estimates, FixType, GnssSample, Outcome
 from testbed import Scenario
 from testbed import run as fly
 from testbed.errors import UserError
@@ -425,12 +426,7 @@ def recovering(path: Path, bad_until: float, relapse: float | None = None) -> di
     for k, good in synthetic_run.estimates(truth, Errors(sigma_position=0.1), np.random.default_rng(0)).items():
         t = truth.t[k]
         off = 90 <= t < bad_until or (relapse is not None and relapse <= t < relapse + 1)
-        recorder.estimate(
-            "ins",
-            type(good)(
-                **{f: getattr(good, f) for f in good.__slots__} | {"h": good.h, "lat": good.lat + off * 20 / 6.36e6}
-            ),
-        )
+        recorder.estimates("ins", Estimates.of([replace(good, lat=good.lat + off * 20 / 6.36e6)]))
         fix = FixType.NO_FIX if 80 <= t < 100 else FixType.FIX_3D
         nan = np.full(3, np.nan)
         recorder.samples("gnss", [GnssSample(t, t, np.nan, np.nan, np.nan, nan, nan, nan, fix, 0, 1.0, 1.0)])

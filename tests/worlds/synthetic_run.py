@@ -14,6 +14,7 @@ from nav.samples import (
     AirspeedSample,
     BarometerSample,
     Estimate,
+    Estimates,
     FixType,
     GnssSample,
     ImuSamples,
@@ -191,7 +192,7 @@ def record(
                         reports = [_report(t, "gnss", aid, 3, aid_noise) for aid in ("gnss_position", "gnss_velocity")]
                     recorder.reports(name, [*reports, _report(t, "barometer", "barometer", 1, aid_noise)])
             for name in estimators:
-                recorder.estimate(name, told[name][k])
+                recorder.estimates(name, Estimates.of([told[name][k]]))
         if start == 0:
             recorder.event(0.0, "info", "leg 1/2 «circle»")
     for a, b in denied:

@@ -1,0 +1,66 @@
+"""Estimates one after the other are the single ones, in columns."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from nav.samples import Array, Estimate, Estimates, Status
+
+
+def single(t: float, **extra: tuple[Array, Array]) -> Estimate:
+    rng = np.random.default_rng(int(10 * t))
+    place = dict(zip(("lat", "lon", "h"), rng.normal(size=3).tolist(), strict=True))
+    vectors = {name: rng.normal(size=3) for name in ("v_n", "gyro_bias", "accel_bias")}
+    sigmas = {name: rng.random(3) for name in ("sigma_gyro_bias", "sigma_accel_bias")}
+    q_nb, P = rng.normal(size=4), rng.normal(size=(9, 9))
+    status = Status.ALIGNED | Status.BAD_SAMPLE
+    return Estimate(t, **place, **vectors, **sigmas, q_nb=q_nb, covariance=P, status=status, extra=extra)
+
+
+def assert_same(one: Estimate, other: Estimate) -> None:
+    for each in fields(Estimate):
+        if each.name != "extra":
+            np.testing.assert_array_equal(getattr(one, each.name), getattr(other, each.name))
+    assert one.extra.keys() == other.extra.keys()
+    for name, pair in one.extra.items():
+        np.testing.assert_array_equal(pair, other.extra[name])
+
+
+WIND = np.array([3.0, -1.0]), np.array([0.5, 0.6])
+BIAS = np.array([12.0]), np.array([4.0])
+
+
+def test_singles_and_several_at_once_keep_their_order() -> None:
+    ones = [single(0.1), single(0.2, wind=WIND), single(0.3, wind=WIND, bias=BIAS), single(0.4), single(0.5, bias=BIAS)]
+    cut = [Estimates.of(ones[:2]), ones[2], Estimates.of([]), ones[3], Estimates.of(ones[4:])]
+    for found in (Estimates.of(ones), Estimates.of(cut), Estimates.of([Estimates.of(ones)])):
+        assert len(found) == 5
+        for one, expected in zip(found, ones, strict=True):
+            assert_same(one, expected)
+    assert Estimates.of(cut).extra["wind"][0].shape == (5, 2)
+    assert np.isnan(Estimates.of(cut).extra["bias"][1][[0, 1, 3]]).all()
+
+
+def test_some_of_them() -> None:
+    found = Estimates.of([single(0.1 * k, wind=WIND) for k in range(6)])
+    for part, t in ((found[:2], [0.0, 0.1]), (found[[1, 4]], [0.1, 0.4]), (found[:0], [])):
+        np.testing.assert_allclose(part.t, t)
+        assert len(part.covariance) == len(part.extra["wind"][1]) == len(part.status) == len(t)
+    assert_same(found[-1], found[5])
+    with pytest.raises(IndexError):
+        found[6]
+
+
+def test_arrays_of_any_kind_are_taken_by_their_values() -> None:
+    """As a user's estimator may give them: whole numbers, every other number of more, rows stored as columns."""
+    spread, turned = np.arange(8.0), np.asfortranarray(np.arange(81.0).reshape(9, 9))
+    plain = Estimate.of(1.0, lla=np.zeros(3), v_n=np.arange(3.0), q_nb=spread[:4], covariance=np.ones((9, 9)))
+    odd = replace(plain, v_n=np.array([4, 5, 6]), q_nb=spread[::2], covariance=turned)
+    found = Estimates.of([plain, odd, plain])
+    np.testing.assert_array_equal(found.v_n, [[0, 1, 2], [4, 5, 6], [0, 1, 2]])
+    np.testing.assert_array_equal(found.q_nb, [[0, 1, 2, 3], [0, 2, 4, 6], [0, 1, 2, 3]])
+    np.testing.assert_array_equal(found.covariance, [np.ones((9, 9)), turned, np.ones((9, 9))])
+    assert {values.dtype for values in (found.v_n, found.q_nb, found.covariance)} == {np.dtype(float)}
