@@ -7,7 +7,7 @@ was true, ``t_arrival`` when the receiver of it could first have known (``t_arri
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from itertools import chain
@@ -362,15 +362,30 @@ class Estimates(Sequence[Estimate]):
         if not isinstance(which, int):
             columns = {name: getattr(self, name)[which] for name in (*_NUMBERS, *VECTORS)}
             return Estimates(**columns, extra={name: (x[which], s[which]) for name, (x, s) in self.extra.items()})
-        numbers: dict[str, Any] = {name: float(getattr(self, name)[which]) for name in ("t", "lat", "lon", "h")}
-        vectors: dict[str, Any] = {name: getattr(self, name)[which] for name in VECTORS}
-        pairs = {name: (value[which], sigma[which]) for name, (value, sigma) in self.extra.items()}
-        extra = {name: pair for name, pair in pairs.items() if not np.isnan(pair).all()}
-        return Estimate(**numbers, **vectors, status=Status(int(self.status[which])), extra=extra)
+        return next(self._singles(range(len(self))[which]))
+
+    def __iter__(self) -> Iterator[Estimate]:
+        return self._singles(slice(None))
+
+    def _singles(self, which: int | slice) -> Iterator[Estimate]:
+        """Those of an index or of a slice."""
+        rows = slice(which, which + 1) if isinstance(which, int) else which
+        columns = [getattr(self, name)[rows] for name in _FIELDS]
+        lists: list[Any] = [column.tolist() if column.ndim == 1 else column for column in columns]
+        pairs = [(name, x[rows], sigma[rows]) for name, (x, sigma) in self.extra.items()]
+        known: Any = [~(np.isnan(x).all(axis=1) & np.isnan(sigma).all(axis=1)) for _, x, sigma in pairs]
+        known = [one.tolist() for one in known]
+        for k, (status, t, lat, lon, h, *vectors) in enumerate(zip(*lists, strict=True)):
+            own = zip(pairs, known, strict=True)
+            extra = {name: (x[k], sigma[k]) for (name, x, sigma), has in own if has[k]}
+            yield Estimate(t, lat, lon, h, *vectors, _STATUS.get(status) or Status(status), extra)  # type: ignore[call-arg]
 
 
 Told: TypeAlias = list[Estimate | Estimates]  # on the way, one at a time or several
 _NUMBERS = ("t", "lat", "lon", "h", "status")
+_FIELDS = ("status", *_NUMBERS[:4], *VECTORS)  # status, and the others as `Estimate` has them
+_USUAL = (Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING)
+_STATUS = {int(status): status for status in _USUAL}  # made anew it takes longer than all the rest
 _EMPTY: dict[str, Any] = dict.fromkeys(("t", "lat", "lon", "h"), np.empty(0)) | {
     name: np.empty((0, *shape)) for name, shape in VECTORS.items()
 }

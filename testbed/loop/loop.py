@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nav.samples import Estimates, Sample, Status, UpdateReport
+from nav.samples import Estimate, Estimates, Sample, Status, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -239,7 +239,10 @@ class _Passage:
         tracked = {name: self._track(name, turn, block.t[wanted[name]].tolist()) for name in self.lanes}
         self._record(turn)
         recorded = range(-self.tick % self.cadence.record, len(block), self.cadence.record)
-        told = {name: _Told.of(tracked[name].estimates, wanted[name]) for name in self.lanes}
+        shown = (
+            range(-self.tick % self.cadence.publish, len(block), self.cadence.publish) if self.cadence.publish else ()
+        )
+        told = {name: _Told.of(tracked[name].estimates, wanted[name], shown) for name in self.lanes}
         for name, one in told.items():
             self.recorder.estimates(name, one.of_rows(recorded))
         for k in rows:
@@ -291,11 +294,10 @@ class _Passage:
         shown = self.setup.shown
         if self.cadence.publish and (self.tick + k) % self.cadence.publish == 0 and shown is not None:
             due = self.backlog[shown].shown_until(t)
-            others = [(name, one.estimates[one.at[k]]) for name, one in told.items() if name != shown and k in one.at]
-            first, row = told[shown], turn.reference.rows(k, k + 1)
-            estimate = first.estimates[first.at[k]]
+            now = [(name, one.shown[k]) for name, one in told.items() if name != shown and k in one.shown]
+            row = turn.reference.rows(k, k + 1)
             for link in self.setup.links:
-                link.publish(row, estimate, self.latest.by_sensor, tracked[shown].increments, others, due)
+                link.publish(row, told[shown].shown[k], self.latest.by_sensor, tracked[shown].increments, now, due)
 
     def _look(self, t: float, leg: float, told: Mapping[str, _Told], k: int) -> None:
         """Look for events at ``t``, row ``k`` of a turn."""
@@ -364,18 +366,23 @@ class _Passage:
 
 
 class _Told(NamedTuple):
-    """What an estimator told in a turn: where among it each row of the turn is; time, and whether it is aligned."""
+    """What an estimator told in a turn: where each row of the turn is among it; time, and whether it is aligned; and
+    what links are shown, by row.
+    """
 
     estimates: Estimates
     at: dict[int, int]
     aligned: list[tuple[float, bool]]
+    shown: dict[int, Estimate]
 
     @classmethod
-    def of(cls, estimates: Estimates, rows: Sequence[int]) -> _Told:
-        """Of the ``rows`` that were wanted."""
+    def of(cls, estimates: Estimates, rows: Sequence[int], shown: Sequence[int]) -> _Told:
+        """Of the ``rows`` that were wanted, and of those that are ``shown``."""
         aligned = (estimates.status & Status.ALIGNED).astype(bool)
         at = {row: k for k, row in enumerate(rows)}
-        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)))
+        there = [row for row in shown if row in at]
+        own = dict(zip(there, estimates[[at[row] for row in there]], strict=True)) if there else {}
+        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)), own)
 
     def of_rows(self, rows: Sequence[int]) -> Estimates:
         """Those of some rows."""
