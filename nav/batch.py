@@ -9,7 +9,7 @@ is not what it seemed to be; that is left to the filter.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import NamedTuple, Protocol
 
@@ -27,9 +27,19 @@ from nav.earth import pressure_altitude
 from nav.error_model import Indices
 from nav.increments import COINCIDENT, Increments, Step
 from nav.local_filter import LocalFilter, own_innovation
-from nav.monitor import Monitor, shown_limit
+from nav.monitor import shown_limits
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
-from nav.samples import Array, Estimates, GnssSample, Outcome, Sample, Status, Told, UpdateReport
+from nav.samples import (
+    Array,
+    Estimates,
+    FusedReports,
+    GnssSample,
+    Reported,
+    Sample,
+    Status,
+    Told,
+    UpdateReport,
+)
 from nav.state import State, absorb, parts, propagate
 
 # What a step is, in place of the number of an aid; and where its numbers begin.
@@ -83,16 +93,6 @@ class Taker(Protocol):
         ...
 
 
-class _Plain(NamedTuple):
-    """A sensor whose samples are taken at once as long as they are plain: its row in the tables; name, size, limit and
-    monitor of each part.
-    """
-
-    row: int
-    aid: PlainAid
-    parts: list[tuple[str, int, float, Monitor | None]]
-
-
 class Batch:
     """Takes the plain steps of an estimator that has these ``filters``, `LocalFilter.row` by row.
 
@@ -102,7 +102,9 @@ class Batch:
     def __init__(self, filters: Sequence[LocalFilter], reference: Reference) -> None:
         self._filters, self._reference = filters, reference
         self._listening = [filter_ for filter_ in filters if filter_.silence is not None]
-        self._aids: dict[str, tuple[int, PlainAid, LocalFilter]] = {}
+        self._aids: dict[str, tuple[int, PlainAid, LocalFilter]] = {}  # with their rows in the tables
+        self._parts: list[tuple[str, str, int]] = []  # sensor, name and axes of each part of a sample
+        first: list[int] = []  # of an aid's parts
         kinds: list[list[int]] = []
         told: list[list[float]] = []
         sensors = [sensor for filter_ in filters for sensor in filter_.aids]
@@ -112,14 +114,17 @@ class Batch:
                 field = reference.has_field or not isinstance(aid, MagnetometerAid)
                 if plain is not None and isinstance(aid, PlainAid) and field:
                     self._aids[sensor] = len(kinds), aid, filter_
+                    first.append(len(self._parts))
+                    self._parts += [(sensor, name, m) for name, m in aid.parts]
                     starts = filter_.starts[sensor]
                     kinds.append([plain[0], len(aid.parts), *starts, *[-1] * (5 - len(starts)), filter_.row])
                     told.append([*plain[1], *[0.0] * (LIMITS + 2 - len(plain[1]))])
+        self._first = np.array(first, np.int64)
         self._kinds, self._told = np.array(kinds, np.int64).reshape(-1, 8), np.array(told).reshape(-1, LIMITS + 2)
 
     def take(
         self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Sequence[Step], ahead: Increments,
-        reports: list[UpdateReport], estimates: Told,
+        reports: Reported, estimates: Told,
     ) -> tuple[int, float]:  # fmt: skip
         """Take the first of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
 
@@ -141,7 +146,8 @@ class Batch:
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
-        reports += _reports(known, steps, told[: done.reports])
+        if done.reports:
+            reports.append(self._reports(plan, told[: done.reports]))
         whats, then = plan[:, WHAT].tolist(), iter(when.tolist())
         status: list[Status] = []
         for (t, _, sample), what in zip(steps[: done.steps], whats, strict=False):
@@ -165,21 +171,35 @@ class Batch:
             filter_.stand_in(sample)
         return done.steps + 1, done.last_bad
 
-    def _known(self) -> dict[str, _Plain]:
-        """The sensors whose samples may be plain now, their limits in the table."""
+    def _reports(self, plan: Array, rows: Array) -> FusedReports:
+        """The reports on what was just done, of which monitors are told, too."""
+        step, part = rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64)
+        what = plan[step, WHAT].astype(np.int64)
+        t, nis, statistic = plan[step, TIME], rows[:, 2].copy(), rows[:, 3]
+        kind, limit = self._first[what] + part, self._told[what, LIMITS + part]
+        for number, (sensor, name, _) in enumerate(self._parts):
+            monitor = self._aids[sensor][2].monitors.get((sensor, name))
+            if monitor is not None:
+                own = np.flatnonzero(kind == number)
+                for judged in zip(statistic[own].tolist(), limit[own].tolist(), t[own].tolist(), strict=True):
+                    monitor.passed(*judged)
+        return FusedReports(
+            self._parts, kind, t, rows[:, 4:7], rows[:, 7:], nis, shown_limits(limit, statistic, nis)
+        )  # fmt: skip
+
+    def _known(self) -> dict[str, tuple[int, PlainAid]]:
+        """The sensors whose samples may be plain now, with their rows in the tables, which have their limits."""
         known = {}
         for sensor, (row, aid, filter_) in self._aids.items():
             limits = filter_.limits(sensor)
             if limits is not None:
                 self._told[row, LIMITS : LIMITS + len(limits)] = limits
-                parts = [
-                    (name, m, limit, filter_.monitors.get((sensor, name)))
-                    for (name, m), limit in zip(aid.parts, limits, strict=True)
-                ]
-                known[sensor] = _Plain(row, aid, parts)
+                known[sensor] = row, aid
         return known
 
-    def _plan(self, taker: Taker, known: Mapping[str, _Plain], steps: Sequence[Step], last_fix: float) -> Array:
+    def _plan(
+        self, taker: Taker, known: Mapping[str, tuple[int, PlainAid]], steps: Sequence[Step], last_fix: float
+    ) -> Array:
         """The first of the ``steps`` that look plain, as rows for `follow`."""
         flat: list[float] = []
         silences = [copy(filter_.silence) for filter_ in self._listening]
@@ -189,7 +209,7 @@ class Batch:
                 continue
             if t != horizon or sample.sensor not in known:  # too late, or not known when
                 break
-            row, aid, _ = known[sample.sensor]
+            row, aid = known[sample.sensor]
             if isinstance(sample, GnssSample):
                 if not sample.has_fix:
                     flat += (t, t, SPLIT, *NOTHING)
@@ -205,19 +225,6 @@ class Batch:
             if taker.pauses(t):
                 break
         return np.array(flat).reshape(-1, WIDTH)
-
-
-def _reports(known: Mapping[str, _Plain], steps: Sequence[Step], rows: Array) -> Iterator[UpdateReport]:
-    """The reports on what was just done, of which monitors are told, too."""
-    for row, (step, part, nis, statistic) in zip(rows, rows[:, :4].tolist(), strict=True):
-        sample = steps[int(step)].sample
-        assert sample is not None
-        name, m, limit, monitor = known[sample.sensor].parts[int(part)]
-        if monitor is not None:
-            monitor.passed(statistic, limit, sample.t)
-            limit = shown_limit(limit, statistic, nis)
-        nu, S = row[4 : 4 + m], row[7 : 7 + m * m].reshape(m, m)
-        yield UpdateReport(sample.t, sample.sensor, name, nu, S, nis, limit, 1.0, Outcome.FUSED)
 
 
 @njit

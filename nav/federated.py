@@ -51,6 +51,7 @@ from nav.samples import (
     GnssSample,
     ImuSamples,
     Outcome,
+    Reported,
     Sample,
     Status,
     Told,
@@ -212,13 +213,7 @@ class Federated:
         """Whether it takes many steps at once."""
         return self._state is not None and self.config.weighting == "none" and not self._reference.scalings
 
-    def take(
-        self,
-        steps: Sequence[Step],
-        ahead: Increments,
-        reports: list[UpdateReport],
-        estimates: Told,
-    ) -> int:
+    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubts.off.any():
             return 0

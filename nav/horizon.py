@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 from nav.increments import COINCIDENT, Increments, Step, joined, share_of
-from nav.samples import Estimate, Estimates, ImuSamples, Sample, Told, UpdateReport
+from nav.samples import Estimate, Estimates, ImuSamples, Reported, Reports, Sample, Told, UpdateReport
 from nav.strapdown import compensate
 
 
@@ -63,13 +63,7 @@ class TakesSteps(Protocol):
         """Whether it does so now: from then on it listens, and accepts the same sensors, for ever."""
         ...
 
-    def take(
-        self,
-        steps: Sequence[Step],
-        ahead: Increments,
-        reports: list[UpdateReport],
-        estimates: Told,
-    ) -> int:
+    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
         """How many of the first ``steps`` it took, zero when the first of them must be taken by itself."""
         ...
 
@@ -95,11 +89,9 @@ class FusionHorizon:
 
     def push(self, imu: ImuSamples, samples: Sequence[Sample] = ()) -> list[UpdateReport]:
         """Add consecutive increments and the samples that arrived with them; what became of the samples applied now."""
-        return self.track(imu, samples, ())[0]
+        return [*self.track(imu, samples, ())[0]]
 
-    def track(
-        self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]
-    ) -> tuple[list[UpdateReport], Estimates]:
+    def track(self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]) -> tuple[Reports, Estimates]:
         """`push`, and the estimates at ``times`` [s] on the way, ascending, the last less than an increment ahead.
 
         Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``, and none that
@@ -115,18 +107,18 @@ class FusionHorizon:
             ready = compensate(imu, self._raw) if self.coning else imu
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
             self._ahead.append(ready)
-        reports: list[UpdateReport] = []
+        reports: Reported = []
         estimates: Told = []
         estimator = self.estimator
         if isinstance(estimator, TakesSteps) and estimator.in_steps and self._ahead.next:
             self._take(estimator, times, reports, estimates)
-            return reports, Estimates.of(estimates)
+            return Reports(reports), Estimates.of(estimates)
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
         if self._ahead.ends:
             self._use(self._ahead.ends[-1], reports)
-        return reports, Estimates.of(estimates)
+        return Reports(reports), Estimates.of(estimates)
 
     def estimate_at(self, t: float) -> Estimate:
         """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
@@ -152,13 +144,7 @@ class FusionHorizon:
             front = joined(front, share_of(last, further / last.dt[0], t))
         return self.estimator.predict(front)
 
-    def _take(
-        self,
-        estimator: TakesSteps,
-        times: Sequence[float],
-        reports: list[UpdateReport],
-        estimates: Told,
-    ) -> None:
+    def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Told) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         steps: list[Step] = []
         ends, lag = self._ahead.ends, self.lag_s if self.estimator.listening else 0.0
@@ -176,7 +162,7 @@ class FusionHorizon:
                 self._go(steps[0], reports, estimates)
             del steps[: max(taken, 1)]
 
-    def _go(self, step: Step, reports: list[UpdateReport], estimates: Told) -> None:
+    def _go(self, step: Step, reports: Reported, estimates: Told) -> None:
         """Take one step by itself."""
         if step.sample is not None:
             self._apply(step.horizon, step.sample, reports)
@@ -185,7 +171,7 @@ class FusionHorizon:
         if not math.isnan(step.t):
             estimates.append(self.estimate_at(step.t))
 
-    def _use(self, now: float, reports: list[UpdateReport]) -> None:
+    def _use(self, now: float, reports: Reported) -> None:
         """Bring the estimator to ``lag_s`` before the last increment by ``now``, with every sample up to there.
 
         An estimator that listens to no sample any more need not wait for any.
@@ -200,7 +186,7 @@ class FusionHorizon:
                 self._apply(turn, sample, reports)
         self._propagate_to(horizon, reports)
 
-    def _apply(self, turn: float, sample: Sample, reports: list[UpdateReport]) -> None:
+    def _apply(self, turn: float, sample: Sample, reports: Reported) -> None:
         """Hand over a sample at its time; one whose ``turn`` is later is refused then."""
         t = sample.t if math.isfinite(sample.t) else turn
         if turn > t:  # too late, wherever the blocks were cut
@@ -214,7 +200,7 @@ class FusionHorizon:
             reports += self.estimator.propagate(part) or ()
         reports += self.estimator.update(sample)
 
-    def _propagate_to(self, t: float, reports: list[UpdateReport]) -> None:
+    def _propagate_to(self, t: float, reports: Reported) -> None:
         """Hand over the whole increments that end by ``t``."""
         whole = self._ahead.whole(t)
         if whole is not None:

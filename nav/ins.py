@@ -53,6 +53,7 @@ from nav.samples import (
     MagnetometerSample,
     Outcome,
     PositionSample,
+    Reported,
     Sample,
     Status,
     Told,
@@ -203,13 +204,7 @@ class Ins:
         """Whether it takes many steps at once."""
         return self._takes_steps and self._state is not None
 
-    def take(
-        self,
-        steps: Sequence[Step],
-        ahead: Increments,
-        reports: list[UpdateReport],
-        estimates: Told,
-    ) -> int:
+    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubt.any() or self._wind_doubt.pending:
             return 0

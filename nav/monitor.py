@@ -19,6 +19,7 @@ from nav.weighting import Policy, split
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Monitor`
 LATELY_S = 5.0  # in which a suspicion is forgotten
 ROUNDING = 1e-6  # of times [s]
+SAME = 1e-6  # between two statistics, relative
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,13 @@ class Isolation(NamedTuple):
 
 def shown_limit(threshold: float, statistic: float, nis: float) -> float:
     """The gate that a report shows beside ``nis``: NaN where the detector judged by another ``statistic``."""
-    return threshold if math.isclose(statistic, nis, rel_tol=1e-6) else math.nan
+    return threshold if math.isclose(statistic, nis, rel_tol=SAME) else math.nan
+
+
+def shown_limits(threshold: Array, statistic: Array, nis: Array) -> Array:
+    """`shown_limit` of finite numbers, each (N,)."""
+    same = np.abs(statistic - nis) <= SAME * np.maximum(np.abs(statistic), np.abs(nis))
+    return np.where(same, threshold, math.nan)
 
 
 class Monitor:

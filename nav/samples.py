@@ -243,6 +243,88 @@ class UpdateReport:
 
 
 @dataclass(frozen=True, slots=True)
+class FusedReports(Sequence[UpdateReport]):
+    """Reports on N parts of samples that were simply fused, one after the other.
+
+    ``kinds`` are sensor, aid and axes m; ``kind`` (N,) the place of each report's among them. ``innovation`` (N, 3) and
+    ``S`` (N, 9), row by row, begin with the m and the m * m numbers that there are; the others as in `UpdateReport`.
+    """
+
+    kinds: Sequence[tuple[str, str, int]]
+    kind: npt.NDArray[np.int64]
+    t: Array
+    innovation: Array
+    S: Array
+    nis: Array
+    threshold: Array
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @overload
+    def __getitem__(self, which: int) -> UpdateReport: ...
+    @overload
+    def __getitem__(self, which: slice) -> list[UpdateReport]: ...
+
+    def __getitem__(self, which: int | slice) -> UpdateReport | list[UpdateReport]:
+        """One of them, or those of a slice."""
+        rows = range(len(self))[which]
+        return self._one(rows) if isinstance(rows, int) else [self._one(k) for k in rows]
+
+    def _one(self, k: int) -> UpdateReport:
+        sensor, aid, m = self.kinds[self.kind[k]]
+        numbers = float(self.nis[k]), float(self.threshold[k])
+        S = self.S[k, : m * m].reshape(m, m)
+        return UpdateReport(float(self.t[k]), sensor, aid, self.innovation[k, :m], S, *numbers, 1.0, Outcome.FUSED)
+
+    def by_kind(self) -> Iterator[FusedReports]:
+        """Those of one kind after the other, as columns of as many numbers as it has."""
+        for number, (sensor, aid, m) in enumerate(self.kinds):
+            own = np.flatnonzero(self.kind == number)
+            if len(own):
+                yield FusedReports(
+                    [(sensor, aid, m)], np.zeros(len(own), np.int64), self.t[own], self.innovation[own, :m],
+                    self.S[own, : m * m], self.nis[own], self.threshold[own],
+                )  # fmt: skip
+
+
+class Reports(Sequence[UpdateReport]):
+    """Reports one after the other: single ones, and stretches of `FusedReports`."""
+
+    def __init__(self, pieces: Iterable[UpdateReport | FusedReports] = ()) -> None:
+        self.pieces = [*pieces]
+
+    def __len__(self) -> int:
+        return sum(len(piece) if isinstance(piece, FusedReports) else 1 for piece in self.pieces)
+
+    def __iter__(self) -> Iterator[UpdateReport]:
+        for piece in self.pieces:
+            if isinstance(piece, FusedReports):
+                yield from piece[:]
+            else:
+                yield piece
+
+    @overload
+    def __getitem__(self, which: int) -> UpdateReport: ...
+    @overload
+    def __getitem__(self, which: slice) -> list[UpdateReport]: ...
+
+    def __getitem__(self, which: int | slice) -> UpdateReport | list[UpdateReport]:
+        """One of them, or those of a slice."""
+        return [*self][which]
+
+    def of(self, sensor: str, aid: str) -> Iterator[UpdateReport]:
+        """Those on one part of the samples of one sensor."""
+        for piece in self.pieces:
+            if isinstance(piece, FusedReports):
+                for own in piece.by_kind():
+                    if own.kinds[0][:2] == (sensor, aid):
+                        yield from own[:]
+            elif (piece.sensor, piece.aid) == (sensor, aid):
+                yield piece
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """State of an estimator at ``t``.
 
@@ -382,6 +464,7 @@ class Estimates(Sequence[Estimate]):
 
 
 Told: TypeAlias = list[Estimate | Estimates]  # on the way, one at a time or several
+Reported: TypeAlias = list[UpdateReport | FusedReports]
 _NUMBERS = ("t", "lat", "lon", "h", "status")
 _FIELDS = ("status", *_NUMBERS[:4], *VECTORS)  # status, and the others as `Estimate` has them
 _USUAL = (Status.ALIGNED | Status.GNSS_FUSED, Status.ALIGNED | Status.DEAD_RECKONING)

@@ -12,7 +12,7 @@ import numpy as np
 from nav.alignment import InitialState
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
-from nav.samples import Array, Estimate, Estimates, ImuSamples, Outcome, Sample, UpdateReport
+from nav.samples import Array, Estimate, Estimates, ImuSamples, Outcome, Reports, Sample, UpdateReport
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig
@@ -27,7 +27,7 @@ class Tracked(NamedTuple):
 
     increments: ImuSamples
     votes: list[UpdateReport]
-    reports: list[UpdateReport]
+    reports: Reports
     estimates: Estimates
 
 

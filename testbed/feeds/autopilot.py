@@ -57,6 +57,7 @@ from nav.samples import (
     Estimate,
     ImuSamples,
     Outcome,
+    Reports,
     Sample,
     Status,
     UpdateReport,
@@ -289,11 +290,11 @@ class AirData:
         self._looks = 0  # in a row that the estimator saw otherwise than the autopilot does
         self.trusted = True
 
-    def take(self, samples: Mapping[str, Sequence[Sample]], reports: Sequence[UpdateReport]) -> None:
+    def take(self, samples: Mapping[str, Sequence[Sample]], reports: Reports) -> None:
         """Add what the sensors deliver, some of it later, and what the estimator says of it."""
         for name in self._sensors:
             self._coming.extend(samples.get(name, ()))
-        self._reports += [one for one in reports if one.sensor == self._airspeed_sensor and one.aid == "airspeed"]
+        self._reports += reports.of(self._airspeed_sensor, "airspeed")
 
     def advance(self, t: float) -> None:
         """Use what has arrived by ``t`` [s]."""

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from nav.samples import Estimates, ImuSamples, Sample
+from nav.samples import Estimates, ImuSamples, Reports, Sample
 from testbed.estimators.lane import Tracked
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.sensors.faults import Faults
@@ -110,7 +110,7 @@ def join(turns: Sequence[Turn]) -> Turn:
             name: Tracked(
                 _join_imu([turn.tracked[name].increments for turn in turns]),
                 [report for turn in turns for report in turn.tracked[name].votes],
-                [report for turn in turns for report in turn.tracked[name].reports],
+                Reports(piece for turn in turns for piece in turn.tracked[name].reports.pieces),
                 Estimates.of(turn.tracked[name].estimates for turn in turns),
             )
             for name in first.tracked

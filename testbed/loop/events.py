@@ -67,9 +67,14 @@ class EventWatch:
             self.emit(sample.t, severity, f"{sample.sensor} {what}")
         self.fix[sample.sensor] = sample.has_fix
 
+    @property
+    def heeds_fused(self) -> bool:
+        """Whether a report on a sample that was simply fused may be an event: the end of refusals."""
+        return bool(self.refusals)
+
     def report(self, estimator: str, report: UpdateReport) -> None:
         """An unsound sample is an event; the gate turns a sound one away now and then, so only a run of those is."""
-        if report.weight > 0.0 and not self.refusals:
+        if report.weight > 0.0 and not self.heeds_fused:
             return  # as most are: nothing ends by it
         what = report.aid if report.aid.startswith(report.sensor) else f"{report.aid} of {report.sensor}"
         key = (estimator, what)

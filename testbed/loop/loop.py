@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nav.samples import Estimate, Estimates, Sample, Status, UpdateReport
+from nav.samples import Estimate, Estimates, FusedReports, Reports, Sample, Status, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -264,11 +264,11 @@ class _Passage:
                 lane.start(handed_over(lane.handover, turn.reference))
             tracked = lane.track(commanded(turn.reference), turn.imu, turn.samples, times)
         self.recorder.reports(name, tracked.votes)
-        self.recorder.reports(name, tracked.reports)
+        self.recorder.reports(name, tracked.reports.pieces)
         backlog.votes.extend(tracked.votes)
-        backlog.unread.extend(tracked.reports)
+        backlog.unread.add(tracked.reports)
         if self.setup.links and name == self.setup.shown:
-            backlog.unshown.extend(tracked.reports)
+            backlog.unshown.add(tracked.reports)
         if lane.failure and name not in self.ended:
             self.ended.add(name)
             self.told.emit(float(turn.reference.t[-1]), "error", f"{name} has ended: {lane.failure}")
@@ -310,7 +310,7 @@ class _Passage:
         for name, one in told.items():
             if k in one.at:
                 self.watch.estimate(name, *one.aligned[one.at[k]])
-            for report in self.backlog[name].read_until(t):
+            for report in self.backlog[name].read_until(t, self.watch):
                 self.watch.report(name, report)
 
     def conclude(self) -> list[str]:
@@ -400,25 +400,48 @@ class _Backlog:
     def __init__(self, behind: float) -> None:
         self._behind = behind
         self.votes: deque[UpdateReport] = deque()  # on redundant units, not looked at for events
-        self.unread: deque[UpdateReport] = deque()  # on samples, neither
-        self.unshown: deque[UpdateReport] = deque()  # that the links have not been given
+        self.unread = _Waiting()  # on samples, neither
+        self.unshown = _Waiting()  # that the links have not been given
 
-    def read_until(self, t: float) -> Iterator[UpdateReport]:
-        """Those to be looked at for events at ``t``."""
-        yield from _take(self.votes, t)
-        yield from _take(self.unread, t - self._behind)
+    def read_until(self, t: float, watch: EventWatch) -> Iterator[UpdateReport]:
+        """Those to be looked at for events at ``t``, as far as the ``watch`` heeds them."""
+        while self.votes and not self.votes[0].t > t:
+            yield self.votes.popleft()
+        yield from self.unread.until(t - self._behind, lambda: watch.heeds_fused)
 
     def shown_until(self, t: float) -> list[UpdateReport]:
         """Those that links are given at ``t``."""
-        return _take(self.unshown, t - self._behind)
+        return [*self.unshown.until(t - self._behind)]
 
 
-def _take(reports: deque[UpdateReport], until: float) -> list[UpdateReport]:
-    """Remove and give the reports on samples up to a time."""
-    taken = []
-    while reports and not reports[0].t > until:  # a time may be NaN
-        taken.append(reports.popleft())
-    return taken
+class _Waiting:
+    """Reports that wait for their time, in their order."""
+
+    def __init__(self) -> None:
+        self._pieces: deque[tuple[UpdateReport | FusedReports, list[float]]] = deque()  # with their times
+        self._used = 0  # of the first piece
+
+    def add(self, reports: Reports) -> None:
+        """Some more of them."""
+        for piece in reports.pieces:
+            self._pieces.append((piece, piece.t.tolist() if isinstance(piece, FusedReports) else [piece.t]))
+
+    def until(self, t: float, fused: Callable[[], bool] = lambda: True) -> Iterator[UpdateReport]:
+        """Remove and give those on samples up to a time, of `FusedReports` only while these are asked for."""
+        while self._pieces:
+            (piece, times), first = self._pieces[0], self._used
+            while self._used < len(times) and not times[self._used] > t:  # a time may be NaN
+                self._used += 1
+            last, ended = self._used, self._used == len(times)
+            if ended:
+                self._pieces.popleft()
+                self._used = 0
+            if not isinstance(piece, FusedReports):
+                yield from (piece,) * (last - first)
+            elif last > first and fused():
+                yield from piece[first:last]
+            if not ended:
+                return
 
 
 class _Latest:

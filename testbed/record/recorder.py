@@ -19,7 +19,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 import numpy as np
 
-from nav.samples import Estimates, ImuSamples, Sample, UpdateReport
+from nav.samples import Estimates, FusedReports, ImuSamples, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.record import tables
@@ -124,12 +124,20 @@ class Recorder:
         if len(estimates):
             self._table(f"estimators/{name}").add(*tables.estimate_columns(estimates))
 
-    def reports(self, name: str, reports: Sequence[UpdateReport]) -> None:
+    def reports(self, name: str, reports: Iterable[UpdateReport | FusedReports]) -> None:
         """Take what became of aiding samples, one group per aid."""
         for report in reports:
-            path = f"estimators/{name}/innovations/{report.aid}"
-            table = self._tables.get(path) or self._table(path, partial(tables.pack_reports, report.aid), "sample_time")
-            table.objects.append(report)
+            if isinstance(report, UpdateReport):
+                self._reports(name, report.aid).objects.append(report)
+                continue
+            for own in report.by_kind():
+                table = self._reports(name, own.kinds[0][1])
+                table.pack()  # those before
+                table.add(*tables.fused_columns(own))
+
+    def _reports(self, name: str, aid: str) -> Table:
+        path = f"estimators/{name}/innovations/{aid}"
+        return self._tables.get(path) or self._table(path, partial(tables.pack_reports, aid), "sample_time")
 
     def faults(self, faults: Sequence[FaultTruth]) -> None:
         """Note what is going to go wrong."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import VECTORS, Estimates, Sample, UpdateReport
+from nav.samples import VECTORS, Estimates, FusedReports, Outcome, Sample, UpdateReport
 from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
 
 if TYPE_CHECKING:
@@ -177,11 +177,7 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     sizes = set(map(len, innovations))
     m = max(sizes)
     if m:
-        unit, dims = AIDS.get(aid, ("unknown", ("component",)))
-        variables["innovation"] = Variable(unit, "measurement - prediction", dims)
-        variables["S"] = Variable(
-            f"({unit})^2", "innovation covariance before the update", ("component", "component_column")
-        )
+        variables |= _innovation(aid)
         if sizes == {m}:
             block["innovation"], block["S"] = _joined(innovations), _vectors(reports, "S")
         else:  # broken samples are refused before an innovation is formed
@@ -198,6 +194,25 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     block["sensor"] = np.resize(_text([*names] if len(names) == 1 else sensors, REPORT["sensor"].dtype), len(reports))
     block["reason"] = _text(list(map(attrgetter("reason"), reports)), REPORT["reason"].dtype)
     return block, variables
+
+
+def fused_columns(reports: FusedReports) -> tuple[Block, dict[str, Variable]]:
+    """Reports of one kind."""
+    ((sensor, aid, m),) = reports.kinds
+    block: Block = {"sample_time": reports.t, "nis": reports.nis, "threshold": reports.threshold}
+    block["innovation"], block["S"] = reports.innovation, reports.S.reshape(-1, m, m)
+    for name, value in (("weight", 1.0), ("outcome", Outcome.FUSED), ("sensor", sensor.encode()), ("reason", b"")):
+        block[name] = np.full(len(reports), value, REPORT[name].dtype)
+    return block, REPORT | _innovation(aid)
+
+
+def _innovation(aid: str) -> dict[str, Variable]:
+    """What the innovation of an aid is, and its covariance."""
+    unit, dims = AIDS.get(aid, ("unknown", ("component",)))
+    return {
+        "innovation": Variable(unit, "measurement - prediction", dims),
+        "S": Variable(f"({unit})^2", "innovation covariance before the update", ("component", "component_column")),
+    }
 
 
 def estimate_columns(estimates: Estimates) -> tuple[Block, dict[str, Variable]]:

@@ -13,7 +13,7 @@ import pymap3d
 import pytest
 from worlds.loop import Watcher, same
 
-from nav.samples import AirspeedSample, BarometerSample, Estimate, Outcome, UpdateReport
+from nav.samples import AirspeedSample, BarometerSample, Estimate, Outcome, Reports, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import autopilot
@@ -263,7 +263,8 @@ def report(weight: float, outcome: Outcome | None = None) -> UpdateReport:
 def test_air_data_knows_only_what_has_arrived() -> None:
     air = AirData("airspeed", "barometer", 1000.0)
     pressure = 80_000.0
-    air.take({"airspeed": [AirspeedSample(0.9, 1.2, 20.0)], "barometer": [BarometerSample(0.8, 1.1, pressure)]}, [])
+    samples = {"airspeed": [AirspeedSample(0.9, 1.2, 20.0)], "barometer": [BarometerSample(0.8, 1.1, pressure)]}
+    air.take(samples, Reports())
     air.advance(1.0)
     assert math.isnan(air.airspeed(1.0))
     assert math.isnan(air.altitude)
@@ -277,7 +278,7 @@ def test_air_data_knows_only_what_has_arrived() -> None:
 
 def hear(air: AirData, t: float, eas: float | None, reports: Sequence[UpdateReport] = ()) -> float:
     """The airspeed [m/s] that is known at ``t`` with one more sample."""
-    air.take({"airspeed": [] if eas is None else [AirspeedSample(t, t, eas)]}, reports)
+    air.take({"airspeed": [] if eas is None else [AirspeedSample(t, t, eas)]}, Reports(reports))
     air.advance(t)
     return air.airspeed(t)
 

@@ -1,4 +1,4 @@
-"""Estimates one after the other are the single ones, in columns."""
+"""Estimates and reports one after the other are the single ones, in columns."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from nav.samples import Array, Estimate, Estimates, Status
+from nav.samples import Array, Estimate, Estimates, FusedReports, Outcome, Reports, Status, UpdateReport
 
 
 def single(t: float, **extra: tuple[Array, Array]) -> Estimate:
@@ -64,3 +64,37 @@ def test_arrays_of_any_kind_are_taken_by_their_values() -> None:
     np.testing.assert_array_equal(found.q_nb, [[0, 1, 2, 3], [0, 2, 4, 6], [0, 1, 2, 3]])
     np.testing.assert_array_equal(found.covariance, [np.ones((9, 9)), turned, np.ones((9, 9))])
     assert {values.dtype for values in (found.v_n, found.q_nb, found.covariance)} == {np.dtype(float)}
+
+
+def fused(t: Array) -> FusedReports:
+    """Velocities of one receiver and, at every other time, pressures."""
+    rng = np.random.default_rng(len(t))
+    kinds = [("gps", "gnss_velocity", 3), ("baro", "barometer", 1)]
+    numbers = rng.normal(size=(len(t), 3)), rng.normal(size=(len(t), 9)), rng.random(len(t)), rng.random(len(t))
+    return FusedReports(kinds, np.arange(len(t)) % 2, t, *numbers)
+
+
+def test_fused_reports_are_single_ones_in_columns() -> None:
+    several = fused(np.arange(5.0))
+    for k, one in enumerate(several):
+        m = 1 if k % 2 else 3
+        assert (one.t, one.sensor, one.aid) == (k, *several.kinds[k % 2][:2])
+        np.testing.assert_array_equal(one.innovation, several.innovation[k, :m])
+        np.testing.assert_array_equal(one.S.reshape(-1), several.S[k, : m * m])
+        assert one.S.shape == (m, m)
+        assert (one.nis, one.threshold) == (several.nis[k], several.threshold[k])
+        assert (one.weight, one.outcome, one.reason) == (1.0, Outcome.FUSED, "")
+    velocities, pressures = several.by_kind()
+    assert (velocities.t.tolist(), pressures.t.tolist()) == ([0, 2, 4], [1, 3])
+    assert pressures.S.shape == (2, 1)
+    np.testing.assert_array_equal(pressures[1].innovation, several[3].innovation)
+
+
+def test_reports_keep_their_order() -> None:
+    broken = UpdateReport(9.0, "baro", "barometer", np.empty(0), np.empty((0, 0)), 1.0, 1.0, 0.0, Outcome.UNSOUND, "!")
+    reports = Reports([fused(np.arange(3.0)), broken, fused(np.array([7.0]))])
+    assert len(reports) == 5
+    assert [one.t for one in reports] == [0, 1, 2, 9, 7]
+    assert reports[3] is broken
+    assert [one.t for one in reports.of("baro", "barometer")] == [1, 9]
+    assert not Reports()
