@@ -20,16 +20,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from nav.samples import Array, ImuSamples
+from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError
-from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
+from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
-from testbed.feeds.stamps import integrated, joined, ordered
+from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
 
 NEEDED = "IMU, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
 GAUSS = 1e-7  # of the milligauss that MAG is in [T]
-GPS_EPOCH = dt.datetime(1980, 1, 6)
+BINARY = b"\xa3\x95"  # how every message begins; text may begin with lines of the ground station
+GPS_EPOCH, WEEK_S = dt.datetime(1980, 1, 6), 604_800
 ACCURACY_WITHIN_S = 0.3  # GPA comes right after the GPS that it belongs to
 
 # The messages by what they become, old names for the second and third unit among them.
@@ -64,16 +65,17 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     require_imu(path, imus, found, NEEDED)
     samples = _aiding(units, notes)
     solution = _solution(messages)
-    return Log(
+    log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
         date=_date(units),
     )  # fmt: skip
+    return at_pace(log, _pace(units))
 
 
 def _messages(path: Path) -> dict[str, list[dict[str, Any]]]:
     """All messages by their names. Raises UserError when there are none."""
     with path.open("rb") as file:
-        text = file.read(4) == b"FMT,"
+        text = file.read(2) != BINARY
     with warnings.catch_warnings(), _silence():
         warnings.simplefilter("ignore", ResourceWarning)  # of a file that the reader gives up on
         found, problem = _parsed(path, text)
@@ -193,7 +195,7 @@ def _aiding(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[s
         samples[name] = _fixes(name, rows, units.get("accuracy", {}).get(name), notes)
     for name, rows in units.get("magnetometer", {}).items():
         t, kept = _times(name, rows, notes)
-        samples[name] = magnetometers(name, t, _vector(rows, "Mag", kept) * GAUSS)
+        samples[name] = magnetometers(name, t, _vector(rows, "Mag", kept) * GAUSS, notes)
     for kind, key, made in (("barometer", "Press", barometers), ("airspeed", "Airspeed", airspeeds)):
         for name, rows in units.get(kind, {}).items():
             if key in rows:
@@ -259,11 +261,26 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]]) -> Reference | None:
 def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:
     """The day of the flight, by the receiver."""
     for rows in units.get("gnss", {}).values():
-        for week, ms in (("GWk", "GMS"), ("Week", "TimeMS")):
-            if week in rows and ms in rows:
-                known = np.flatnonzero(rows[week] > 0)
-                if len(known):
-                    k = known[-1]
-                    since = dt.timedelta(weeks=float(rows[week][k]), milliseconds=float(rows[ms][k]))
-                    return (GPS_EPOCH + since).date()
+        told = _satellite_time(rows)
+        told = told[np.isfinite(told)]
+        if len(told):
+            return (GPS_EPOCH + dt.timedelta(seconds=float(told[-1]))).date()
     return None
+
+
+def _satellite_time(rows: Rows) -> Array:
+    """When fixes were valid by the receiver itself [s since 1980], NaN where it does not say it."""
+    for week, ms in (("GWk", "GMS"), ("Week", "TimeMS")):
+        if week in rows and ms in rows:
+            return np.where(rows[week] > 0, rows[week] * WEEK_S + rows[ms] / 1e3, np.nan)
+    return np.full(len(next(iter(rows.values()), ())), np.nan)
+
+
+def _pace(units: Mapping[str, Mapping[str, Rows]]) -> float:
+    """How fast the autopilot's clock runs, by the first receiver that tells."""
+    for rows in units.get("gnss", {}).values():
+        t, kept = _times("", rows, [])
+        fixed = rows["Status"][kept] >= FixType.FIX_3D if "Status" in rows else np.ones(len(t), bool)
+        if (found := pace(t[fixed], _satellite_time(rows)[kept][fixed])) is not None:
+            return found
+    return 1.0

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
-from testbed.feeds.recorded import rate
+from testbed.errors import UserError
+from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
@@ -110,6 +111,10 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
     place = os.path.relpath(log.path.resolve(), out.resolve().parent)
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
+    try:
+        first_place(log, 0.0)
+    except UserError:
+        lines.append("# start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 400.0 }  # the log doesn't say where: give it")
     if truth is not None and truth.columns:
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]
     for name, keys in own.items():

@@ -19,16 +19,20 @@ Reader: TypeAlias = Callable[[Path, Mapping[str, Stream]], Log]
 
 
 class Format(NamedTuple):
-    """What a format is called, how a file of it begins, and the module beside this one that reads it."""
+    """What a format is called, how a file of it begins, and the module beside this one that reads it.
+
+    ``line`` is how its own first line begins, of a text before which a ground station has put lines of its own.
+    """
 
     name: str
     begins: tuple[bytes, ...]
     module: str
+    line: bytes = b""
 
 
 FORMATS = (
     Format("run.nc", (b"\x89HDF\r\n\x1a\n",), "rerun"),
-    Format("ArduPilot DataFlash", (b"\xa3\x95", b"FMT,"), "ardupilot"),
+    Format("ArduPilot DataFlash", (b"\xa3\x95", b"FMT,"), "ardupilot", b"FMT,"),
     Format("PX4 ULog", (b"ULog\x01\x12\x35",), "px4"),
     Format("npz", (b"PK\x03\x04",), "table"),
     Format("MATLAB", (b"MATLAB 5.0 MAT-file",), "table"),
@@ -82,7 +86,7 @@ def known(path: Path) -> Format:
     if size > LARGEST_BYTES:
         raise UserError(f"{path}: has {size / 2**30:.1f} GiB, of which at most 1 is read: cut it to the flight")
     for one in FORMATS:
-        if head.startswith(one.begins):
+        if head.startswith(one.begins) or (one.line and b"\n" + one.line in head):
             return one
     if _is_text(head):
         return CSV

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -106,6 +106,28 @@ def beginning(imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], re
     if reference is not None and len(reference.t):
         times.append(float(reference.t[0]))
     return min(times)
+
+
+def at_pace(log: Log, pace: float) -> Log:
+    """The same in seconds as they are, of a log whose clock runs ``pace`` times as fast; told, if that is not 1.
+
+    Rates are sensors' own, whatever the clock: increments are as much longer as the time that they are over.
+    """
+    if pace == 1.0:
+        return log
+    imus = {
+        name: ImuSamples(imu.t / pace, imu.dt / pace, imu.dtheta / pace, imu.dv / pace)
+        for name, imu in log.imus.items()
+    }
+    samples = {
+        name: [replace(one, t=one.t / pace, t_arrival=one.t_arrival / pace) for one in own]
+        for name, own in log.samples.items()
+    }
+    solution = None if log.solution is None else replace(log.solution, t=log.solution.t / pace)
+    slow = (
+        f"its clock runs {abs(pace - 1):.1%} too {'fast' if pace > 1 else 'slow'} by the receiver's: times are mended"
+    )
+    return replace(log, imus=imus, samples=samples, solution=solution, t0=log.t0 / pace, notes=[*log.notes, slow])
 
 
 def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, int], needed: str) -> None:

@@ -177,12 +177,12 @@ def _fixes(name: str, rows: Rows, notes: list[str]) -> Samples:
 def _field(name: str, rows: Rows, notes: list[str]) -> Samples:
     t, kept = ordered(name, _seconds(rows), notes)
     own = _vector(rows, "x", "y", "z") if "x" in rows else _array(rows, "magnetometer_ga")
-    return magnetometers(name, t, own[kept] * GAUSS)
+    return magnetometers(name, t, own[kept] * GAUSS, notes)
 
 
 def _combined_field(name: str, rows: Rows, notes: list[str]) -> Samples:
     t, kept = _newly(rows, "magnetometer_timestamp_relative")
-    return magnetometers(name, t, _array(rows, "magnetometer_ga")[kept] * GAUSS)
+    return magnetometers(name, t, _array(rows, "magnetometer_ga")[kept] * GAUSS, notes)
 
 
 def _combined_altitude(name: str, rows: Rows, notes: list[str]) -> Samples:

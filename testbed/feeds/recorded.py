@@ -45,7 +45,7 @@ def located(scenario: Scenario) -> Scenario:
     _require_sensors(scenario, log, scenario.truth.start_s)
     found: dict[str, Any] = {}
     if scenario.truth.start is None:
-        found["truth.start"] = (log.start or _start(log, scenario.truth.start_s)).model_dump()
+        found["truth.start"] = (log.start or first_place(log, scenario.truth.start_s)).model_dump()
     for name, section in scenario.sensors.items():
         if "rate_hz" not in section.model_fields_set:
             found[f"sensors.{name}.rate_hz"] = rate(log, name)
@@ -78,8 +78,8 @@ def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
             raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
 
 
-def _start(log: Log, start_s: float) -> Place:
-    """Where a log begins: by its solution, or else by its GNSS."""
+def first_place(log: Log, start_s: float) -> Place:
+    """Where a log begins: by its solution, or else by its GNSS. Raises UserError when it does not say it."""
     solution = log.solution.columns if log.solution is not None else {}
     if log.solution is not None and "lat" in solution:
         known = np.flatnonzero(np.isfinite(solution["lat"]) & (log.solution.t >= log.t0 + start_s))

@@ -63,9 +63,14 @@ def barometers(name: str, t: Array, pressure: Array) -> list[Sample]:
     return [BarometerSample(s, s, p, name) for s, p in zip(t.tolist(), pressure.tolist(), strict=True)]
 
 
-def magnetometers(name: str, t: Array, field_b: Array) -> list[Sample]:
-    """Magnetic fields (N, 3) [T], body axes."""
-    return [MagnetometerSample(s, s, field_b[k].copy(), name) for k, s in enumerate(t.tolist())]
+def magnetometers(name: str, t: Array, field_b: Array, notes: list[str]) -> list[Sample]:
+    """Magnetic fields (N, 3) [T], body axes. No field at all is that of a sensor that is not there: left out, noted."""
+    there = field_b.any(axis=1)
+    if not there.all():
+        said = f"{np.sum(~there)} samples have no field at all" if there.any() else "it never has a field"
+        notes.append(f"{name}: {said}: left out")
+    rows = np.flatnonzero(there)
+    return [MagnetometerSample(s, s, field_b[k].copy(), name) for k, s in zip(rows, t[rows].tolist(), strict=True)]
 
 
 def airspeeds(name: str, t: Array, eas: Array) -> list[Sample]:

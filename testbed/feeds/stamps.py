@@ -22,6 +22,9 @@ WRAP_SHARE = 0.02  # of it, by which a jump may miss it
 STRAY = 8  # rows by which times may be out of order
 GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
 PIECE = 1.5  # usual increments: the longest that there may be
+# A clock that is off by more than any quartz is by temperature runs by a wrong frequency. By how much must be alike in
+# half of what is seen, over as long as jitter of 0.1 s is small beside it.
+CLOCK_OFF, CLOCK_ALIKE, CLOCK_S = 0.005, 0.2, 30.0
 
 
 def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, Rows]:
@@ -77,6 +80,24 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     left = len(t) - (part.stop - part.start)
     notes.append(f"{name}: time goes back {len(begins)} times: the longest part is kept, {left} rows are left out")
     return t[part], rows[part]
+
+
+def pace(t: Array, told: Array) -> float | None:
+    """How fast the clock of ascending times (N,) [s] runs by a better one, ``told`` (N,), NaN where it is silent.
+
+    Seconds of the first for each of the second; 1 where they agree to `CLOCK_OFF`, None where nothing can be said.
+    """
+    known = np.isfinite(told)
+    t, told = t[known], told[known]
+    half = len(t) // 2
+    since = told[half:] - told[: len(told) - half]
+    long: Mask = since >= CLOCK_S
+    if half < STRAY or 2 * long.sum() < len(since):
+        return None
+    ratios = (t[half:] - t[: len(t) - half])[long] / since[long]
+    lower, middle, upper = np.percentile(ratios, [25, 50, 75])
+    off = abs(middle - 1)
+    return float(middle) if off > CLOCK_OFF and upper - lower < CLOCK_ALIKE * off else 1.0
 
 
 def _note_gaps(name: str, t: Array, notes: list[str]) -> None:

@@ -21,6 +21,7 @@ from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, Magnetome
 from testbed.feeds.log import Log
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
 
+MOVING = ("moving", "flying")  # the phases in which it does
 WINDOW_S = 1.0  # over which a vehicle is judged to be at rest
 REST_RATE, REST_FORCE = 0.02, 0.3  # deviation from the mean within a window [rad/s, m/s^2]
 REST_SPEED, FLYING_SPEED, FLYING_HEIGHT = 1.0, 6.0, 8.0  # of GNSS [m/s, m/s, m]
@@ -49,7 +50,10 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class Phase:
-    """A stretch of the flight: ``rest``, ``moving`` or ``flying``; from the log's beginning [s]."""
+    """A stretch of the flight: ``rest``, ``moving``, ``flying`` or ``silent``, from the log's beginning [s].
+
+    In the last the inertial unit is not heard, and no receiver says that it flies.
+    """
 
     name: str
     start: float
@@ -102,7 +106,7 @@ def survey(log: Log) -> Survey:
     """Measure what is in a log."""
     phases = _phases(log)
     resting = max((p for p in phases if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
-    moving = [p for p in phases if p.name != "rest"]
+    moving = [p for p in phases if p.name in MOVING]
     noise = {name: still for name, imu in log.imus.items() if (still := _noise(log, imu, resting)) is not None}
     vibration = {name: felt for name, imu in log.imus.items() if (felt := _vibration(log, imu, moving)) is not None}
     times = {name: imu.t for name, imu in log.imus.items()}
@@ -161,6 +165,8 @@ def _phases(log: Log) -> list[Phase]:
         high = float(np.max(place[near, 2] - np.median(place[:5, 2]), initial=0.0)) if len(place) else 0.0
         if fast > FLYING_SPEED or (high > FLYING_HEIGHT and not still):
             names.append("flying")
+        elif rows[k + 1] == rows[k]:
+            names.append("silent")
         else:
             names.append("rest" if still and fast < REST_SPEED else "moving")
     changes = [0, *[k for k in range(1, count) if names[k] != names[k - 1]], count]
@@ -210,6 +216,8 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     from scipy import signal  # takes long to load, and a run has no need of it; the same of the one below
 
     part = between(log, imu, longest)
+    if part.stop - part.start < 2:
+        return None
     rate_hz = 1 / float(np.median(imu.dt[part]))
     force = imu.dv[part] / imu.dt[part, None]
     frequency, density = signal.welch(force, rate_hz, nperseg=min(1024, len(force)), axis=0)

@@ -85,7 +85,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         elif kind == "reference":
             reference = _reference(t, values)
         else:
-            samples[name] = _samples(name, kind, t, values)
+            samples[name] = _samples(name, kind, t, values, notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
     return Log(path, "table", imus, samples, reference, beginning(imus, samples, reference), found, notes)
 
@@ -203,14 +203,14 @@ def _column(table: Table, where: str, name: str) -> Array:
     raise UserError(f"{where}: {unknown('column', name, list(table))}")
 
 
-def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array]) -> Samples:
+def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes: list[str]) -> Samples:
     """The samples of one aiding sensor."""
     match kind:
         case "barometer":
             pressure = values.get("pressure")
             return barometers(name, t, isa_pressure(values["height"]) if pressure is None else pressure)
         case "magnetometer":
-            return magnetometers(name, t, values["field"])
+            return magnetometers(name, t, values["field"], notes)
         case "airspeed":
             eas = values.get("airspeed")
             return airspeeds(name, t, eas_of(values["pressure"]) if eas is None else eas)

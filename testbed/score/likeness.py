@@ -12,7 +12,7 @@ from scipy import signal
 
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
-from testbed.feeds.survey import LEAST_REST_S, Survey, between
+from testbed.feeds.survey import LEAST_REST_S, MOVING, Survey, between
 from testbed.record.reader import load
 from testbed.score import accuracy, detection
 from testbed.sensors.units import DEG, DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
@@ -119,7 +119,7 @@ def _inertial(name: str, *both: Survey) -> Iterator[Row]:
 
 def _moving_spectrum(found: Survey, imu: ImuSamples) -> tuple[Array, tuple[Array, Array]]:
     """Frequencies [Hz] and the densities of rate [rad^2/s^2/Hz] and force over the longest stretch that is no rest."""
-    moving = max((p for p in found.phases if p.name != "rest"), key=lambda p: p.end - p.start, default=None)
+    moving = max((p for p in found.phases if p.name in MOVING), key=lambda p: p.end - p.start, default=None)
     if moving is None or moving.end - moving.start < LEAST_REST_S:
         return np.empty(0), (np.empty(0), np.empty(0))
     part = between(found.log, imu, moving)

@@ -1,0 +1,133 @@
+"""Small logs with what recordings of others were found to have: a clock at a wrong pace, dead sensors, lines before."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds.log_writers import dataflash, dataflash_text, us
+
+from testbed import Scenario, run
+from testbed.errors import UserError
+from testbed.feeds import draft, formats
+from testbed.feeds.log import Log
+from testbed.feeds.stamps import pace
+from testbed.feeds.survey import survey
+from testbed.motion.logged import LogTruth
+
+SECONDS, IMU_HZ, GNSS_HZ = 60.0, 50, 5
+SPEED, TURN = 12.0, 0.2  # of what flies in circles [m/s, rad/s]
+SLOW = 24 / 26  # a board whose clock takes a quartz of 26 MHz for one of 24
+FIRST_MS, WEEK = 100_000_000, 1820
+
+Messages = list[tuple[str, tuple[Any, ...]]]
+
+
+def circling(clock: float = 1.0, field: float = 300.0, silent: tuple[float, float] = (0.0, 0.0)) -> Messages:
+    """A log of level circles, stamped by a clock of that pace; no IMU in ``silent``; the field in mG."""
+    found: list[tuple[float, str, tuple[Any, ...]]] = []
+    for k in range(1, int(SECONDS * IMU_HZ) + 1):
+        t = k / IMU_HZ
+        if not silent[0] < t < silent[1]:
+            found.append((t, "IMU", (us(clock * t), 0, 0.0, 0.0, TURN, 0.0, SPEED * TURN, -9.81)))
+    for k in range(1, int(SECONDS * GNSS_HZ) + 1):
+        t = k / GNSS_HZ
+        course = TURN * t
+        north, east = SPEED / TURN * np.sin(course), SPEED / TURN * (1 - np.cos(course))
+        place = 47 + np.degrees(north / 6.378e6), 8 + np.degrees(east / 6.378e6) / np.cos(np.radians(47)), 500.0
+        told = us(clock * t), 0, 3, FIRST_MS + round(t * 1e3), WEEK, 10, 1.0
+        found.append((t, "GPS", (*told, *place, SPEED, np.degrees(course) % 360, 0.0)))
+        found.append((t, "MAG", (us(clock * t), 0, field * np.cos(course), -field * np.sin(course), field)))
+    found.sort(key=lambda one: one[0])
+    return [(name, values) for _, name, values in found]
+
+
+def read(messages: Messages, folder: Path) -> Log:
+    return formats.read(dataflash(messages, folder / "flight.bin"), {})
+
+
+def test_a_clock_of_a_wrong_pace_is_mended_by_the_receivers_time(tmp_path: Path) -> None:
+    right, slow = read(circling(), tmp_path), read(circling(SLOW), tmp_path)
+    assert not any("clock" in note for note in right.notes)
+    assert [note for note in slow.notes if "its clock runs 7.7% too slow" in note]
+    for log in (right, slow):
+        assert np.allclose(log.imus["imu"].t, np.arange(1, SECONDS * IMU_HZ + 1) / IMU_HZ, rtol=1e-4, atol=1e-4)
+    for what in ("dtheta", "dv"):  # rates are rates, over the time that it truly was
+        whole = [getattr(log.imus["imu"], what).sum(axis=0) for log in (right, slow)]
+        assert np.allclose(*whole, rtol=1e-4, atol=1e-9)
+    for name in ("gnss", "magnetometer"):
+        pairs = zip(right.samples[name], slow.samples[name], strict=True)
+        assert max(abs(a.t - b.t) + abs(a.t_arrival - b.t_arrival) for a, b in pairs) < 0.01
+    assert abs(slow.t0 - right.t0) < 0.01
+
+
+@pytest.mark.parametrize("drift", [1e-4, -3e-3])
+def test_a_clock_that_drifts_as_clocks_do_is_left_alone(drift: float) -> None:
+    told = np.arange(500) / 5
+    assert pace((1 + drift) * told, told) == 1.0
+
+
+def test_a_receiver_whose_time_says_nothing_of_a_clock_is_not_believed() -> None:
+    t = np.arange(500) / 5
+    assert pace(t, np.full(500, np.nan)) is None
+    assert pace(t[:100], t[:100]) is None  # too short
+    halting = t + np.floor(t / 20) * 20  # it jumps, as when it gets to know leap seconds or the week
+    assert pace(t, halting) == 1.0
+
+
+def test_the_scenario_of_a_slow_clock_lasts_as_long_as_the_flight(tmp_path: Path) -> None:
+    (tmp_path / "flight.toml").write_text(draft.scenario(survey(read(circling(SLOW), tmp_path)), tmp_path / "x", None))
+    scenario = Scenario.load(tmp_path / "flight.toml")
+    assert abs(scenario.duration_s - SECONDS) < 0.2
+
+
+def test_a_magnetometer_without_a_field_is_left_out(tmp_path: Path) -> None:
+    dead = read(circling(field=0.0), tmp_path)
+    assert "magnetometer" not in dead.samples
+    assert "magnetometer: it never has a field: left out" in dead.notes
+    assert "magnetometer" not in draft.sections(survey(dead))
+    messages = circling()
+    first = next(k for k, (name, _) in enumerate(messages) if name == "MAG")
+    messages[first] = ("MAG", (*messages[first][1][:2], 0.0, 0.0, 0.0))
+    once = read(messages, tmp_path)
+    assert len(once.samples["magnetometer"]) == SECONDS * GNSS_HZ - 1
+    assert "magnetometer: 1 samples have no field at all: left out" in once.notes
+
+
+@pytest.mark.parametrize(
+    "before", ["", "9\n\nArduCopter V3.1 (5c6503e2)\nFree RAM: 1044\nAPM 2\n", "ArduPlane V2.7\r\n"]
+)
+def test_text_after_lines_of_a_ground_station_is_known(before: str, tmp_path: Path) -> None:
+    path = dataflash_text(circling(), tmp_path / "flight.log")
+    path.write_bytes(before.encode() + path.read_bytes())
+    log = formats.read(path, {})
+    assert log.format == "ArduPilot DataFlash"
+    assert len(log.imus["imu"]) == SECONDS * IMU_HZ
+    assert log.samples.keys() == {"gnss", "magnetometer"}
+
+
+def test_a_long_silence_is_a_phase_and_nothing_is_measured_of_it(tmp_path: Path) -> None:
+    messages = [one for one in circling(silent=(3.0, 57.0)) if one[0] != "GPS"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = survey(read(messages, tmp_path))
+    longest = max(found.phases, key=lambda phase: phase.end - phase.start)
+    assert longest.name == "silent"
+    assert longest.end - longest.start >= 53
+    assert not found.vibration
+
+
+def test_a_log_that_does_not_say_where_it_was_has_a_line_for_it(tmp_path: Path) -> None:
+    lost = [one for one in circling() if one[0] != "GPS"]
+    text = draft.scenario(survey(read(lost, tmp_path)), tmp_path / "x", None)
+    (line,) = [line for line in text.splitlines() if line.startswith("# start = ")]
+    (tmp_path / "flight.toml").write_text(text.replace(line, line.removeprefix("# ")))
+    truth = Scenario.load(tmp_path / "flight.toml").truth
+    assert isinstance(truth, LogTruth)
+    assert truth.start is not None
+    (tmp_path / "flight.toml").write_text(text)
+    with pytest.raises(UserError, match="nowhere"):
+        run(Scenario.load(tmp_path / "flight.toml"))
