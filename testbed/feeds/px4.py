@@ -1,9 +1,11 @@
 """PX4's ULog (.ulg), by pyulog.
 
-Of several ways in which PX4 logs the same sensor that with the most samples is taken: integrated increments
-(vehicle_imu), sensor_combined, or raw sensor_gyro and sensor_accel; likewise for GNSS, magnetometer, barometer and
-airspeed. Instances are sensors of their own, such as ``imu2``. The reference is what the EKF said of attitude and local
-position. Times are the autopilot's: of the samples themselves where it logs them.
+Of several ways in which PX4 logs the same sensor that with the most samples of one instance is taken: integrated
+increments (vehicle_imu), sensor_combined, or raw sensor_gyro and sensor_accel; likewise for GNSS, barometer and
+airspeed. What is raw is neither calibrated nor turned into body axes: of inertial units it is taken where the others
+are much slower, of magnetometers where there is nothing else. Instances are sensors of their own, such as ``imu2``. The
+reference is what the EKF said of attitude and local position. Times are the autopilot's: of the samples themselves
+where it logs them.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import contextlib
 import datetime as dt
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,6 +31,10 @@ from testbed.motion.logged import Stream
 NEEDED = "vehicle_imu, sensor_combined, or sensor_gyro and sensor_accel"
 GAUSS = 1e-4  # [T]
 NEVER = 2**31 - 1  # a relative time of what is not there
+# Counts that are alike: of them the first way is taken. A way that is calibrated and in body axes is used from a lower
+# share of the most samples on, than one that is raw.
+ALIKE, RAW_SHARE = 0.9, 0.1
+USED_FROM = {"vehicle_magnetometer": 0.0, "sensor_combined": 0.0}
 OLDEST_MBAR = 2000.0  # pressures below it are in the millibars of early logs
 
 Rows: TypeAlias = Mapping[str, Array]  # the fields of one instance of a topic
@@ -45,7 +51,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     require_imu(path, imus, found, NEEDED)
     samples: dict[str, Samples] = {}
     for kind, sources in SOURCES.items():
-        chosen = max(sources, key=lambda source: _most(topics, source[0], source[1]))
+        counts = [_most(topics, source[0], source[1]) for source in sources]
+        chosen = sources[_chosen(counts, [USED_FROM.get(source[0], ALIKE) for source in sources])]
         for number, rows in topics.get(chosen[0], {}).items():
             if chosen[1] not in rows or (kind != "gnss" and len(rows["timestamp"]) < 2):
                 continue
@@ -76,8 +83,15 @@ def _topics(path: Path) -> dict[str, dict[int, Rows]]:
 
 
 def _most(topics: Topics, name: str, key: str) -> int:
-    """How many samples the instances of a topic have that has a field."""
-    return sum(len(rows["timestamp"]) for rows in topics.get(name, {}).values() if key in rows)
+    """How many samples an instance of a topic has, the most, that has a field."""
+    return max((len(rows["timestamp"]) for rows in topics.get(name, {}).values() if key in rows), default=0)
+
+
+def _chosen(counts: Sequence[int], shares: Sequence[float]) -> int:
+    """Of several ways by their counts: the first that has its share of the most, or that which has the most."""
+    most = max(counts)
+    enough = (k for k, (n, share) in enumerate(zip(counts, shares, strict=True)) if n > 1 and n >= share * most)
+    return next(enough, counts.index(most))
 
 
 def _seconds(rows: Rows, key: str = "") -> Array:
@@ -99,13 +113,12 @@ def _array(rows: Rows, name: str) -> Array:
 
 def _imus(topics: Topics, notes: list[str]) -> dict[str, ImuSamples]:
     """The inertial units, by the way in which the most samples of them were logged."""
-    ways = [(_most(topics, name, key), way) for name, key, way in (
-        ("vehicle_imu", "delta_angle[0]", _of_increments),
-        ("sensor_combined", "gyro_rad[0]", _of_combined),
-        ("sensor_gyro", "x", _of_raw),
-    )]  # fmt: skip
-    most, way = max(ways, key=lambda one: one[0])
-    return way(topics, notes) if most else {}
+    corrected = (("vehicle_imu", "delta_angle[0]", _of_increments), ("sensor_combined", "gyro_rad[0]", _of_combined))
+    counts = [_most(topics, name, key) for name, key, _ in corrected]
+    raw = _most(topics, "sensor_gyro", "x")
+    if raw and max(counts) < RAW_SHARE * raw:
+        return _of_raw(topics, notes)
+    return corrected[_chosen(counts, (ALIKE, 0.0))][2](topics, notes) if max(counts) else {}
 
 
 def _of_increments(topics: Topics, notes: list[str]) -> dict[str, ImuSamples]:
@@ -224,11 +237,11 @@ def _tube(name: str, rows: Rows, notes: list[str]) -> Samples:
 
 # By kind: topic, a field that it must have, and what makes samples of it.
 SOURCES: Mapping[str, tuple[tuple[str, str, Making], ...]] = {
-    "gnss": (("vehicle_gps_position", "eph", _fixes), ("sensor_gps", "eph", _fixes)),
+    "gnss": (("sensor_gps", "eph", _fixes), ("vehicle_gps_position", "eph", _fixes)),
     "magnetometer": (
         ("vehicle_magnetometer", "magnetometer_ga[0]", _field),
-        ("sensor_mag", "x", _field),
         ("sensor_combined", "magnetometer_ga[0]", _combined_field),
+        ("sensor_mag", "x", _field),
     ),
     "barometer": (
         ("vehicle_air_data", "baro_pressure_pa", _pressure("baro_pressure_pa")),

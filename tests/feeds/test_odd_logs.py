@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worlds.log_writers import dataflash, dataflash_text, us
+from worlds.log_writers import dataflash, dataflash_text, ulog, us
 
+from nav.samples import MagnetometerSample
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import draft, formats
@@ -131,3 +132,44 @@ def test_a_log_that_does_not_say_where_it_was_has_a_line_for_it(tmp_path: Path) 
     (tmp_path / "flight.toml").write_text(text)
     with pytest.raises(UserError, match="nowhere"):
         run(Scenario.load(tmp_path / "flight.toml"))
+
+
+def autopilot_of(raw_hz: float, corrected_hz: float) -> Messages:
+    """PX4 with two magnetometers and gyros logged raw, a quarter turn about down off, and as it corrected them."""
+    found: list[tuple[float, str, tuple[Any, ...]]] = []
+    for k in range(1, int(20 * corrected_hz) + 1):
+        t = k / corrected_hz
+        step = round(1e6 / corrected_hz)
+        turned, pushed = (0.1 / corrected_hz, 0.0, 0.0), (0.0, 0.0, -9.81 / corrected_hz)
+        found.append((t, "vehicle_imu", (us(t), *turned, *pushed, step, step)))
+        found.append((t, "vehicle_magnetometer", (us(t), 0.2, 0.0, 0.4)))
+    for k in range(1, int(20 * raw_hz) + 1):
+        t = k / raw_hz
+        for unit in ("", ":1"):
+            found.append((t, f"sensor_mag{unit}", (us(t), 0.0, 0.9, 0.4)))
+            found.append((t, f"sensor_gyro{unit}", (us(t), 0.0, 0.1, 0.0)))
+            found.append((t, f"sensor_accel{unit}", (us(t), 0.0, 0.0, -9.81)))
+    found.sort(key=lambda one: one[0])
+    return [(name, values) for _, name, values in found]
+
+
+@pytest.mark.parametrize("raw_hz", [49.0, 400.0])
+def test_what_the_autopilot_corrected_is_taken_before_what_is_raw(raw_hz: float, tmp_path: Path) -> None:
+    """Though there are more samples of the raw ones, of both units together or of each."""
+    log = formats.read(ulog(autopilot_of(raw_hz, 50.0), tmp_path / "flight.ulg"), {})
+    assert list(log.imus) == ["imu"]
+    assert list(log.samples) == ["magnetometer"]
+    imu = log.imus["imu"]
+    assert np.allclose(imu.dtheta / imu.dt[:, None], [0.1, 0.0, 0.0], atol=1e-4)
+    for one in log.samples["magnetometer"]:
+        assert isinstance(one, MagnetometerSample)
+        assert np.allclose(one.field_b, [20e-6, 0.0, 40e-6])
+
+
+def test_raw_units_are_taken_where_the_corrected_ones_are_slow(tmp_path: Path) -> None:
+    log = formats.read(ulog(autopilot_of(200.0, 2.0), tmp_path / "flight.ulg"), {})
+    assert list(log.imus) == ["imu", "imu2"]
+    assert list(log.samples) == ["magnetometer"]
+    raw = [one for one in autopilot_of(200.0, 2.0) if one[0] != "vehicle_magnetometer"]
+    alone = formats.read(ulog(raw, tmp_path / "raw.ulg"), {})
+    assert list(alone.samples) == ["magnetometer", "magnetometer2"]

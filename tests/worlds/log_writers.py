@@ -115,6 +115,9 @@ ULOG = {
                              "float s_variance_m_s;float eph;float epv;float hdop;float vdop;float vel_n_m_s;"
                              "float vel_e_m_s;float vel_d_m_s;uint8_t fix_type;uint8_t satellites_used;", "<Q4i8f2B"),
     "vehicle_magnetometer": ("uint64_t timestamp;float[3] magnetometer_ga;", "<Q3f"),
+    "sensor_mag": ("uint64_t timestamp;float x;float y;float z;", "<Q3f"),
+    "sensor_gyro": ("uint64_t timestamp;float x;float y;float z;", "<Q3f"),
+    "sensor_accel": ("uint64_t timestamp;float x;float y;float z;", "<Q3f"),
     "vehicle_air_data": ("uint64_t timestamp;float baro_pressure_pa;", "<Qf"),
     "airspeed": ("uint64_t timestamp;float indicated_airspeed_m_s;", "<Qf"),
     "vehicle_attitude": ("uint64_t timestamp;float[4] q;", "<Q4f"),
@@ -162,8 +165,8 @@ def _moved(first: Mapping[str, Any], r: Mapping[str, Any]) -> tuple[float, float
 
 
 def ulog(messages: Sequence[tuple[str, Sequence[Any]]], path: Path) -> Path:
-    """A ULog."""
-    numbers = {name: k for k, name in enumerate(ULOG)}
+    """A ULog; messages of ``topic:1`` are of the second instance of the topic."""
+    numbers = {name: k for k, name in enumerate(dict.fromkeys([*ULOG, *(name for name, _ in messages)]))}
 
     def message(kind: bytes, body: bytes) -> bytes:
         return struct.pack("<H", len(body)) + kind + body
@@ -174,9 +177,11 @@ def ulog(messages: Sequence[tuple[str, Sequence[Any]]], path: Path) -> Path:
         for name, (fields, _) in ULOG.items():
             file.write(message(b"F", f"{name}:{fields}".encode()))
         for name, number in numbers.items():
-            file.write(message(b"A", struct.pack("<BH", 0, number) + name.encode()))
+            topic, _, instance = name.partition(":")
+            file.write(message(b"A", struct.pack("<BH", int(instance or 0), number) + topic.encode()))
         for name, values in messages:
-            file.write(message(b"D", struct.pack("<H", numbers[name]) + struct.pack(ULOG[name][1], *values)))
+            body = struct.pack(ULOG[name.partition(":")[0]][1], *values)
+            file.write(message(b"D", struct.pack("<H", numbers[name]) + body))
     return path
 
 
