@@ -22,6 +22,7 @@ from nav.aids.barometer import barometer
 from nav.aids.base import Kind, PlainAid
 from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
 from nav.aids.magnetometer import magnetometer
+from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import whiten
 from nav.earth import pressure_altitude
 from nav.error_model import Indices
@@ -29,17 +30,7 @@ from nav.increments import COINCIDENT, Increments, Step
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
-from nav.samples import (
-    Array,
-    Estimates,
-    FusedReports,
-    GnssSample,
-    Reported,
-    Sample,
-    Status,
-    Told,
-    UpdateReport,
-)
+from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
 from nav.state import State, absorb, parts, propagate
 
 # What a step is, in place of the number of an aid; and where its numbers begin.

@@ -21,6 +21,7 @@ from nav.aids import Aid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Measurement, Ruling, refusals, report_on, without_position
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
+from nav.columns import Estimates, Reported, Told
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
@@ -43,20 +44,7 @@ from nav.reference import (
     forget,
     nothing_known,
 )
-from nav.samples import (
-    NO_SENSOR,
-    Array,
-    Estimate,
-    Estimates,
-    GnssSample,
-    ImuSamples,
-    Outcome,
-    Reported,
-    Sample,
-    Status,
-    Told,
-    UpdateReport,
-)
+from nav.samples import NO_SENSOR, Array, Estimate, GnssSample, ImuSamples, Outcome, Sample, Status, UpdateReport
 from nav.state import State
 from nav.weighting import InOrder, Policy, Weight
 

@@ -11,10 +11,11 @@ import heapq
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast
 
+from nav.columns import Estimates, Reported, Reports, Told
 from nav.increments import COINCIDENT, Increments, Step, joined, share_of
-from nav.samples import Estimate, Estimates, ImuSamples, Reported, Reports, Sample, Told, UpdateReport
+from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
 
 
@@ -54,7 +55,6 @@ class Estimator(Protocol):
         ...
 
 
-@runtime_checkable
 class TakesSteps(Protocol):
     """An estimator that takes many steps at once, as one after the other would have been, but in less time."""
 
@@ -110,8 +110,8 @@ class FusionHorizon:
         reports: Reported = []
         estimates: Told = []
         estimator = self.estimator
-        if isinstance(estimator, TakesSteps) and estimator.in_steps and self._ahead.next:
-            self._take(estimator, times, reports, estimates)
+        if getattr(estimator, "in_steps", False) and self._ahead.next:
+            self._take(cast(TakesSteps, estimator), times, reports, estimates)
             return Reports(reports), Estimates.of(estimates)
         for t in times:
             self._use(t, reports)

@@ -21,6 +21,7 @@ from nav.aids.gnss import has_velocity
 from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
+from nav.columns import Estimates, Reported, Told
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
@@ -47,16 +48,13 @@ from nav.samples import (
     NO_SENSOR,
     Array,
     Estimate,
-    Estimates,
     GnssSample,
     ImuSamples,
     MagnetometerSample,
     Outcome,
     PositionSample,
-    Reported,
     Sample,
     Status,
-    Told,
     UpdateReport,
     WindSample,
 )
@@ -486,8 +484,10 @@ class Ins:
     def _described(self, wholes: Array, t: Array, status: Sequence[Status], doubt: Array) -> Estimates:
         """The estimates of N settled states (N, numbers), with a ``doubt`` (9,) of their motion."""
         assert self._state is not None
-        q_nb, v_n, lla, imu, x, P, first = known(wholes, *self._state.shape)
+        n = self._state.shape[2]
+        q_nb, v_n, lla, imu, filters, first = known(wholes, *self._state.shape)
+        x = filters[:, 0]
         x[:, : imu.shape[1]] = imu
-        covariance, sigma = spread(wholes, first, x.shape[1], self.config.mounting_sigma**2, doubt)
+        covariance, sigma = spread(wholes, first, n, self.config.mounting_sigma**2, doubt)
         extra = {name: (x[:, where], sigma[:, where]) for name, where in self._extra}
-        return described(t, status, q_nb, v_n, lla, x, P, self.model, covariance, sigma, extra)
+        return described(t, status, (q_nb, v_n, lla), x, (wholes, first), self.model, covariance, sigma, extra)

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from nav._jit import njit
+from nav.columns import Estimates
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, reset, weights_by_covariance
 from nav.local_filter import LocalFilter
 from nav.reference import REPORTED, Reference, described, spread, turned
-from nav.samples import Array, Estimates, Status
+from nav.samples import Array, Status
 from nav.state import State, inject, known, parts
 
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
@@ -96,19 +97,19 @@ class MasterFilter:
         self, wholes: Array, shape: tuple[int, int, int], t: Array, status: Sequence[Status], off: Array
     ) -> Estimates:
         """The estimates of settled states (N, numbers), which are changed, with a doubt ``off`` (9,) of the motion."""
-        common, filters, n = shape
+        common = shape[0]
         model, masters = self._filters[0].model, np.empty((len(wholes), common, common))
         for k, whole in enumerate(wholes):
             state = State(*shape, whole)
             master = self.combine(state, self._everyone)
             inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
             masters[k] = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
-        q_nb, v_n, lla, imu, *_, first = known(wholes, *shape)
-        covariance, sigma = spread(masters.reshape(len(t), -1), 0, common, self._config.mounting_sigma**2, off)
-        x, deviation = wholes[:, first - filters * n : first].reshape(-1, filters, n), deviations(wholes, *shape)
+        q_nb, v_n, lla, imu, x, _ = known(wholes, *shape)
+        rows, deviation = masters.reshape(len(t), -1), deviations(wholes, *shape)
+        covariance, sigma = spread(rows, 0, common, self._config.mounting_sigma**2, off)
         extra = {name: (imu[:, at], sigma[:, at]) for name, at in self._common}
         extra |= {name: (x[:, row, where], deviation[:, row, where]) for name, row, where in self._extra}
-        return described(t, status, q_nb, v_n, lla, imu, masters, model, covariance, sigma, extra)
+        return described(t, status, (q_nb, v_n, lla), imu, (rows, 0), model, covariance, sigma, extra)
 
 
 @njit

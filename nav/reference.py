@@ -14,6 +14,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.alignment import Alignment, InitialState
+from nav.columns import Estimates
 from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel, Indices, sensor_errors
 from nav.rotation import (
     dcm_from_quat,
@@ -23,7 +24,7 @@ from nav.rotation import (
     quat_multiply,
     rotvec_from_quat,
 )
-from nav.samples import Array, Estimate, Estimates, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
+from nav.samples import Array, Estimate, GnssSample, ImuSamples, MagnetometerSample, Sample, Status
 from nav.state import State, inject, propagate, sigma_step, working
 from nav.unscented import Scaling, carry, scratch
 
@@ -265,21 +266,20 @@ def nothing_known(t: float, status: Status) -> Estimate:
 
 
 def described(
-    t: Array, status: Sequence[int], q_nb: Array, v_n: Array, lla: Array, x: Array, P: Array, model: ErrorModel,
-    covariance: Array, sigma: Array, extra: dict[str, tuple[Array, Array]],
+    t: Array, status: Sequence[int], motion: tuple[Array, Array, Array], x: Array, P: tuple[Array, int],
+    model: ErrorModel, covariance: Array, sigma: Array, extra: dict[str, tuple[Array, Array]],
 ) -> Estimates:  # fmt: skip
-    """The estimates of N nominal states with estimated sensor errors ``x`` (N, n) and covariances ``P`` (N, n, n).
+    """The estimates of N nominal states with estimated sensor errors ``x`` (N, n) and covariances ``P``.
 
-    These are laid out as ``model``; ``covariance`` and ``sigma`` are those of `spread`. Of each argument each estimate
-    has a row. Nothing of them is a view of the states, which are larger.
+    These are laid out as ``model``. ``motion`` is q_nb, v_n and (lat, lon, h); ``covariance`` and ``sigma`` are those
+    that `spread` finds in the rows ``P[0]``, from the place ``P[1]`` on. Each estimate has a row of each.
     """
     gyro_bias, sigma_gyro = _with_drift(x, P, model, sigma, "gyro")
     accel_bias, sigma_accel = _with_drift(x, P, model, sigma, "accel")
-    lat, lon, h = lla.T.copy()
+    q_nb, v_n, (lat, lon, h) = motion[0], motion[1], motion[2].T
     return Estimates(
-        t.copy(), lat, lon, h, v_n.copy(), q_nb.copy(), gyro_bias.copy(), accel_bias.copy(), covariance,
-        sigma_gyro.copy(), sigma_accel.copy(), np.array(status, np.int64),
-        {name: (value.copy(), deviation.copy()) for name, (value, deviation) in extra.items()},
+        t, lat, lon, h, v_n, q_nb, gyro_bias, accel_bias, covariance, sigma_gyro, sigma_accel,
+        np.array(status, np.int64), extra,
     )  # fmt: skip
 
 
@@ -301,14 +301,18 @@ def forget(P: Array, start: int, variance: Array) -> None:
     P[block, block] = np.diag(variance)
 
 
-def _with_drift(x: Array, P: Array, model: ErrorModel, sigma: Array, sensor: str) -> tuple[Array, Array]:
+def _with_drift(
+    x: Array, P: tuple[Array, int], model: ErrorModel, sigma: Array, sensor: str
+) -> tuple[Array, Array]:  # fmt: skip
     """Biases (N, 3) of one kind of inertial sensor, its in-run part included, and the 1-sigma."""
     bias = model.slices[f"{sensor}_bias"]
     drift = model.slices.get(f"{sensor}_drift")
     if drift is None:
         return x[:, bias], sigma[:, bias]
-    common = np.diagonal(P[:, bias, drift], axis1=1, axis2=2)
-    variance = sigma[:, bias] ** 2 + sigma[:, drift] ** 2 + 2 * common
+    rows, first = P
+    step = x.shape[1] + 1
+    start = first + bias.start * x.shape[1] + drift.start  # of their covariances, on a diagonal of P
+    variance = sigma[:, bias] ** 2 + sigma[:, drift] ** 2 + 2 * rows[:, start : start + 3 * step : step]
     return x[:, bias] + x[:, drift], np.sqrt(variance)
 
 

@@ -71,24 +71,23 @@ class State:
 
 
 class Known(NamedTuple):
-    """What each of N states says of the motion, of the inertial sensors and of its first filter, where its P begins."""
+    """What each of N states says of the motion, of the inertial sensors and of its filters; and where its P begins."""
 
     q_nb: Array  # (N, 4)
     v_n: Array
     lla: Array
     imu: Array  # (N, common)
-    x: Array  # (N, n)
-    P: Array  # (N, n, n)
+    x: Array  # (N, filters, n)
     first: int
 
 
 def known(wholes: Array, common: int, filters: int, n: int) -> Known:
-    """Views of ``wholes`` (N, numbers), each the whole of a `State`."""
+    """A copy of what is short of ``wholes`` (N, numbers), each the whole of a `State`; covariances are far larger."""
     x = FIXED + common
     P = x + filters * n
+    short = wholes[:, :P].copy()
     return Known(
-        wholes[:, :4], wholes[:, 4:7], wholes[:, 7:10], wholes[:, FIXED:x], wholes[:, x : x + n],
-        wholes[:, P : P + n * n].reshape(-1, n, n), P,
+        short[:, :4], short[:, 4:7], short[:, 7:10], short[:, FIXED:x], short[:, x:].reshape(-1, filters, n), P
     )  # fmt: skip
 
 

@@ -35,9 +35,10 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from nav.columns import Estimates
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.rotation import euler_from_quat
-from nav.samples import AirspeedSample, Estimates
+from nav.samples import AirspeedSample
 from testbed.bridges.address import address, bound
 from testbed.bridges.gps_input import GpsInput
 from testbed.bridges.listener import Listener, listeners

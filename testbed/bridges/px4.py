@@ -34,8 +34,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from nav.columns import Estimates
 from nav.earth import SEA_LEVEL_DENSITY, isa_temperature, pressure_altitude
-from nav.samples import AirspeedSample, BarometerSample, Estimates, GnssSample, MagnetometerSample
+from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.bridges.address import address, bound
 from testbed.bridges.listener import listeners
 from testbed.bridges.steps import Step, Stepper, moved

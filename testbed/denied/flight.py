@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from nav.columns import Estimates
 from nav.earth import position_difference_n
-from nav.samples import Array, Estimates
+from nav.samples import Array
 from testbed import sensors
 from testbed.data import write_file
 from testbed.denied.table import EVERY_S, Case

@@ -10,9 +10,10 @@ from typing import NamedTuple, Protocol, cast
 import numpy as np
 
 from nav.alignment import InitialState
+from nav.columns import Estimates, Reports
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
-from nav.samples import Array, Estimate, Estimates, ImuSamples, Outcome, Reports, Sample, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig

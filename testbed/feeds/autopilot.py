@@ -47,6 +47,7 @@ import numpy as np
 
 from nav import aids
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
+from nav.columns import Reports
 from nav.earth import gravity, pressure_altitude, radii, wrap_longitude
 from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
@@ -57,7 +58,6 @@ from nav.samples import (
     Estimate,
     ImuSamples,
     Outcome,
-    Reports,
     Sample,
     Status,
     UpdateReport,
@@ -189,8 +189,9 @@ class Autopilot:
             self._air.take(samples, tracked[self._position].reports)
         if ends:
             self._feed_back(t, block, {name: _sound(one.estimates[-1]) for name, one in tracked.items()})
-        kept = {name: one._replace(estimates=one.estimates[: len(wanted)]) for name, one in tracked.items()}
-        return Turn(block, imu, samples, kept)
+        if len(times) > len(wanted):
+            tracked = {name: one._replace(estimates=one.estimates[: len(wanted)]) for name, one in tracked.items()}
+        return Turn(block, imu, samples, tracked)
 
     def _integrate(self, imu: ImuSamples) -> None:
         """Add what is possible of the increments; rates are unknown when nothing is."""

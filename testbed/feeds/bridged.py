@@ -7,7 +7,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Protocol
 
-from nav.samples import Estimates
+from nav.columns import Estimates
 from testbed.feeds.feed import Feed, Surfaces, Turn
 
 OURS, THEIRS = "ours", "theirs"  # whose samples of a kind of sensor a far end has

@@ -9,7 +9,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from nav.samples import Estimates, ImuSamples, Reports, Sample
+from nav.columns import Estimates, Reports
+from nav.samples import ImuSamples, Sample
 from testbed.estimators.lane import Tracked
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.sensors.faults import Faults
@@ -110,7 +111,7 @@ def join(turns: Sequence[Turn]) -> Turn:
             name: Tracked(
                 _join_imu([turn.tracked[name].increments for turn in turns]),
                 [report for turn in turns for report in turn.tracked[name].votes],
-                Reports(piece for turn in turns for piece in turn.tracked[name].reports.pieces),
+                Reports.joined(turn.tracked[name].reports for turn in turns),
                 Estimates.of(turn.tracked[name].estimates for turn in turns),
             )
             for name in first.tracked

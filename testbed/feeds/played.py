@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import Array, Estimates
+from nav.columns import Estimates
+from nav.samples import Array
 from testbed.errors import UserError
 from testbed.feeds.feed import Surfaces, Turn
 from testbed.feeds.piloted import TAKES_OVER, is_step

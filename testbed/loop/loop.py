@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nav.samples import Estimate, Estimates, FusedReports, Reports, Sample, Status, UpdateReport
+from nav.columns import Estimates, FusedReports, Reports
+from nav.samples import Estimate, Sample, Status, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -380,8 +381,7 @@ class _Told(NamedTuple):
         """Of the ``rows`` that were wanted, and of those that are ``shown``."""
         aligned = (estimates.status & Status.ALIGNED).astype(bool)
         at = {row: k for k, row in enumerate(rows)}
-        there = [row for row in shown if row in at]
-        own = dict(zip(there, estimates[[at[row] for row in there]], strict=True)) if there else {}
+        own = {row: estimates[at[row]] for row in shown if row in at}
         return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)), own)
 
     def of_rows(self, rows: Sequence[int]) -> Estimates:

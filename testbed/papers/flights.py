@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from nav.columns import Estimates
 from nav.earth import position_difference_n
 from nav.ins import Ins
-from nav.samples import Array, Estimates, ImuSamples, Outcome, UpdateReport
+from nav.samples import Array, ImuSamples, Outcome, UpdateReport
 from testbed import sensors
 from testbed.estimators import registry
 from testbed.estimators.federated import FederatedSection

@@ -27,7 +27,8 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 import numpy as np
 
-from nav.samples import Estimates, FusedReports, ImuSamples, Sample, UpdateReport
+from nav.columns import Estimates, FusedReports
+from nav.samples import ImuSamples, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.record import tables

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import VECTORS, Estimates, FusedReports, Outcome, Sample, UpdateReport
+from nav.columns import VECTORS, Estimates, FusedReports
+from nav.samples import Outcome, Sample, UpdateReport
 from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
 
 if TYPE_CHECKING:

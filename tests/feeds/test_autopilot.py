@@ -13,7 +13,8 @@ import pymap3d
 import pytest
 from worlds.loop import Watcher, same
 
-from nav.samples import AirspeedSample, BarometerSample, Estimate, Outcome, Reports, UpdateReport
+from nav.columns import Reports
+from nav.samples import AirspeedSample, BarometerSample, Estimate, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import autopilot

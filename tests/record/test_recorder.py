@@ -22,7 +22,8 @@ from worlds import synthetic_run
 from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import Estimates, ImuSamples, Outcome, UpdateReport
+from nav.columns import Estimates
+from nav.samples import ImuSamples, Outcome, UpdateReport
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record

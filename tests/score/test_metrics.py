@@ -17,7 +17,8 @@ from scipy.stats import chi2
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import NO_SENSOR, Estimates, FixType, GnssSample, Outcome
+from nav.columns import Estimates
+from nav.samples import NO_SENSOR, FixType, GnssSample, Outcome
 from testbed import Scenario
 from testbed import run as fly
 from testbed.errors import UserError

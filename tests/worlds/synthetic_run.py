@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from nav.columns import Estimates
 from nav.samples import (
     AirspeedSample,
     BarometerSample,
     Estimate,
-    Estimates,
     FixType,
     GnssSample,
     ImuSamples,

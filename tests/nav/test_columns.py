@@ -7,7 +7,8 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from nav.samples import Array, Estimate, Estimates, FusedReports, Outcome, Reports, Status, UpdateReport
+from nav.columns import Estimates, FusedReports, Reports
+from nav.samples import Array, Estimate, Outcome, Status, UpdateReport
 
 
 def single(t: float, **extra: tuple[Array, Array]) -> Estimate:
