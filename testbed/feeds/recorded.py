@@ -17,7 +17,7 @@ from testbed.feeds import formats
 from testbed.feeds.feed import Turn
 from testbed.feeds.log import SAMPLES, Log, Reference
 from testbed.feeds.reference import ReferenceMotion, of_receiver, with_rates
-from testbed.feeds.stamps import at_times, bridged
+from testbed.feeds.stamps import at_times, begun, bridged
 from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
@@ -225,14 +225,15 @@ def _with_attitude(found: Reference, solution: Reference, start: float) -> Refer
 def _increments(scenario: Scenario, log: Log, start: float) -> dict[str, ImuSamples]:
     """The increments of each unit from the start on, those of spares at the times of the unit that they stand in for.
 
-    A unit whose increments are not all of one length is given in pieces none of which is longer than the first.
+    What a unit felt before it began, if later, is unknown. One whose increments are not all of one length is given in
+    pieces none of which is longer than the first.
     """
     found = {}
     for name, section in scenario.sensors.items():
         if isinstance(section, ImuConfig):
             own = log.imus[name]
             moved = own if start == 0.0 else replace(own, t=own.t - start)
-            found[name] = bridged(_cut(moved, 0.0, math.inf))
+            found[name] = bridged(begun(_cut(moved, 0.0, math.inf), 0.0))
     for estimator in scenario.estimator:
         for spare in estimator.spare_imus:
             if spare in found and not np.array_equal(found[spare].t, found[estimator.imu].t):

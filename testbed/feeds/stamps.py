@@ -6,6 +6,7 @@ time goes back for good, the clock was set or the vehicle started again: the lon
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 import numpy as np
@@ -20,6 +21,7 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0)
 WRAP_SHARE = 0.02  # of it, by which a jump may miss it
 STRAY = 8  # rows by which times may be out of order
+EDGE_S = 1e-6  # times closer than this are one
 GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
 PIECE = 1.5  # usual increments: the longest that there may be
 # A clock that is off by more than any quartz is by temperature runs by a wrong frequency. By how much must be alike in
@@ -130,6 +132,22 @@ def integrated(t: Array, gyro: Array, accel: Array, form: str) -> ImuSamples:
     if form == "instantaneous":
         gyro, accel = (np.vstack([x[:1], 0.5 * (x[1:] + x[:-1])]) if len(x) else x for x in (gyro, accel))
     return ImuSamples(t, dt, gyro * dt[:, None], accel * dt[:, None])
+
+
+def begun(imu: ImuSamples, t: float) -> ImuSamples:
+    """The same from ``t`` [s] on: before its first increment nothing is known: NaN in steps of the usual length."""
+    if not len(imu):
+        return imu
+    first = float(imu.t[0] - imu.dt[0])
+    if first - t < EDGE_S:
+        return imu
+    count = math.ceil((first - t) / float(np.median(imu.dt)))
+    dt = np.full(count, (first - t) / count)
+    unknown = np.full((count, 3), np.nan)
+    return ImuSamples(
+        np.concatenate([t + np.cumsum(dt), imu.t]), np.concatenate([dt, imu.dt]),
+        np.vstack([unknown, imu.dtheta]), np.vstack([unknown, imu.dv]),
+    )  # fmt: skip
 
 
 def bridged(imu: ImuSamples) -> ImuSamples:

@@ -134,6 +134,17 @@ def test_a_log_that_does_not_say_where_it_was_has_a_line_for_it(tmp_path: Path) 
         run(Scenario.load(tmp_path / "flight.toml"))
 
 
+@pytest.mark.parametrize("later", [0.03, 0.31, 7.0])
+def test_an_inertial_unit_may_begin_later_than_the_log(later: float, tmp_path: Path) -> None:
+    """Every sensor is heard from the beginning on, and estimators know that no increments were."""
+    text = draft.scenario(survey(read(circling(silent=(0.0, later)), tmp_path)), tmp_path / "x", None)
+    (tmp_path / "flight.toml").write_text(text)
+    result = run(Scenario.load(tmp_path / "flight.toml", {"duration_s": 20.0}))
+    own = result.dataset["estimators/ins"].to_dataset(inherit=False)
+    aligned = own.time.values[np.isfinite(own.q_nb.values).all(axis=1)]
+    assert later < aligned[0] < later + 4.0
+
+
 def autopilot_of(raw_hz: float, corrected_hz: float) -> Messages:
     """PX4 with two magnetometers and gyros logged raw, a quarter turn about down off, and as it corrected them."""
     found: list[tuple[float, str, tuple[Any, ...]]] = []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nav.samples import ImuSamples
-from testbed.feeds.stamps import at_times, bridged, integrated, ordered
+from testbed.feeds.stamps import at_times, begun, bridged, integrated, ordered
 
 T = np.arange(1, 401) / 50
 
@@ -69,6 +69,19 @@ def test_no_increment_is_longer_than_the_first_and_nothing_is_lost(seed: int) ->
     assert np.allclose(ready.t[1:] - ready.dt[1:], ready.t[:-1], rtol=0, atol=1e-12)
     assert np.allclose(ready.dtheta[1:].sum(axis=0), imu.dtheta[1:].sum(axis=0), rtol=1e-12)
     assert set(imu.t.tolist()) <= set(ready.t.tolist())
+
+
+@pytest.mark.parametrize("before", [0.004, 0.03, 2.0])
+def test_before_the_first_increment_nothing_is_known(before: float) -> None:
+    imu = steady(T)
+    whole = begun(imu, -before)
+    first = len(whole) - len(imu)
+    assert np.isnan(whole.dtheta[:first]).all()
+    assert np.isnan(whole.dv[:first]).all()
+    assert np.array_equal(whole.dtheta[first:], imu.dtheta)
+    assert np.allclose(np.concatenate([[-before], whole.t[:-1]]), whole.t - whole.dt, rtol=0, atol=1e-9)
+    assert whole.dt.max() <= 0.02 + 1e-9
+    assert begun(imu, 0.0) is imu
 
 
 def test_over_a_gap_nothing_is_known() -> None:
