@@ -110,18 +110,26 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
 
 
 def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
-    """The way from where the estimator was aligned, None when it never was, or only at the end."""
+    """The way from where the estimator was aligned, None when it never was, or only at the end.
+
+    Where nobody knows the motion it is that of the next time at which somebody does, or the last; None where
+    nobody ever does.
+    """
     own, t = f"estimators/{name}", column(dataset, "truth/time")
     aligned = np.flatnonzero(column(dataset, f"{own}/status") & Status.ALIGNED)
     start = float(column(dataset, f"{own}/time")[aligned[0]]) if len(aligned) else np.inf
     if t[-1] - start < 2 * SHORTEST_S:
         return None
     edges = np.linspace(start, t[-1], min(SEGMENTS, int((t[-1] - start) / SHORTEST_S)) + 1)
-    row = np.searchsorted(t, (edges[:-1] + edges[1:]) / 2)
-    lla = np.column_stack([column(dataset, f"truth/{key}")[row] for key in ("lat", "lon", "h")])
-    q_nb, v_n, airspeed, dv, dtheta = (
-        column(dataset, f"truth/{key}")[row] for key in ("q_nb", "v_n", "airspeed", "dv", "dtheta")
-    )
+    motion = {key: column(dataset, f"truth/{key}") for key in ("lat", "lon", "h", "q_nb", "v_n", "dv", "dtheta")}
+    known = np.flatnonzero(np.isfinite(np.column_stack([*motion.values()])).all(axis=1) & (t > t[0]))
+    if not len(known):
+        return None
+    after = np.clip(np.searchsorted(t[known], (edges[:-1] + edges[1:]) / 2), 0, len(known) - 1)
+    row = known[after]
+    lla = np.column_stack([motion[key][row] for key in ("lat", "lon", "h")])
+    q_nb, v_n, dv, dtheta = (motion[key][row] for key in ("q_nb", "v_n", "dv", "dtheta"))
+    airspeed = column(dataset, "truth/airspeed")[row]
     interval = (t[row] - t[row - 1])[:, None]
     sigma = np.concatenate(
         [column(dataset, f"{own}/sigma_{what}_n")[aligned[0]] for what in ("attitude", "velocity", "position")]
@@ -162,7 +170,9 @@ def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visi
     further, n = ahrs.further, STATES + ahrs.further.count
     F, measurements = np.tile(np.diag(np.concatenate([np.zeros(STATES), -further.decay_rate])), (len(level), 1, 1)), []
     own = f"estimators/{name}"
-    seen = np.interp(way.middle, column(dataset, f"{own}/time"), column(dataset, f"{own}/judged_acceleration").ravel())
+    judged = column(dataset, f"{own}/judged_acceleration").ravel()
+    known = np.isfinite(judged)
+    seen = np.interp(way.middle, column(dataset, f"{own}/time")[known], judged[known])
     for k, q_nb in enumerate(way.q_nb):
         earth_n = earth_rate_n(float(way.lla[k, 0]))
         C_nb = dcm_from_quat(q_nb)

@@ -18,6 +18,7 @@ from testbed.feeds.log import Log
 from testbed.feeds.stamps import pace
 from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
+from testbed.score.observability import of_run
 
 SECONDS, IMU_HZ, GNSS_HZ = 60.0, 50, 5
 SPEED, TURN = 12.0, 0.2  # of what flies in circles [m/s, rad/s]
@@ -143,6 +144,24 @@ def test_an_inertial_unit_may_begin_later_than_the_log(later: float, tmp_path: P
     own = result.dataset["estimators/ins"].to_dataset(inherit=False)
     aligned = own.time.values[np.isfinite(own.q_nb.values).all(axis=1)]
     assert later < aligned[0] < later + 4.0
+
+
+@pytest.mark.parametrize("until", [0.0, 20.0, 35.0])
+def test_what_can_be_seen_where_nobody_knows_the_motion(until: float, tmp_path: Path) -> None:
+    """Of a log without attitude nothing is said; where the autopilot falls silent the last that it said is taken."""
+    messages = circling()
+    for k in range(1, int(until * GNSS_HZ)):
+        t = k / GNSS_HZ
+        course = np.degrees(TURN * t) % 360
+        velocity = SPEED * np.cos(TURN * t), SPEED * np.sin(TURN * t), 0.0
+        messages.append(("XKF1", (us(t), 0, 0.0, 0.0, course, *velocity)))
+        messages.append(("POS", (us(t), 47.0, 8.0, 500.0)))
+    (tmp_path / "flight.toml").write_text(draft.scenario(survey(read(messages, tmp_path)), tmp_path / "x", None))
+    seen = of_run(run(Scenario.load(tmp_path / "flight.toml", {"duration_s": 45.0})).dataset)
+    assert list(seen) == (["ins"] if until else [])
+    for one in seen.values():
+        assert np.isfinite(one.share).all()
+        assert one.rank[-1] >= 6
 
 
 def autopilot_of(raw_hz: float, corrected_hz: float) -> Messages:
