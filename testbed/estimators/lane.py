@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 
+from nav._jit import njit
 from nav.alignment import InitialState
 from nav.columns import Estimates, Reports
 from nav.horizon import FusionHorizon
@@ -167,8 +168,11 @@ def handover_errors(given: Handover | None, arm_b: Array, seed: int) -> Handover
     return HandoverErrors(arm_b, sigma, stream(seed, "start", "handover"))
 
 
+@njit
 def _turned_back(C_sb: Array, x_s: Array) -> Array:
-    """C_sb' x of each row; written out, since the sums of a matrix product depend on the number of rows."""
-    with np.errstate(all="ignore"):  # a broken unit may say anything
-        x_b: Array = x_s[:, 0:1] * C_sb[0] + x_s[:, 1:2] * C_sb[1] + x_s[:, 2:3] * C_sb[2]
+    """C_sb' x of each row, whatever a broken unit says; the order of the sums does not depend on how many there are."""
+    x_b = np.empty(x_s.shape)
+    for k in range(len(x_s)):
+        for i in range(3):
+            x_b[k, i] = x_s[k, 0] * C_sb[0, i] + x_s[k, 1] * C_sb[1, i] + x_s[k, 2] * C_sb[2, i]
     return x_b

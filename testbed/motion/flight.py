@@ -191,44 +191,51 @@ class Flight:
         self, first: int, rows: int, raw: array[float], commands: list[tuple[int, tuple[float, float, float, float]]]
     ) -> TruthBlock:
         """Rows as read from JSBSim, and the last row before them, to columns."""
-        block = TruthBlock.empty(first, rows)
         if rows == 0:
-            return block
+            return TruthBlock.empty(first, 0)
         table = np.concatenate((np.array(self._last), np.frombuffer(raw))).reshape(rows + 1, WIDTH)
         table *= self._aircraft.units
         self._last = raw[-WIDTH:].tolist()
         t = (first - 1 + np.arange(rows + 1)) / self.rate_hz
-        v_n, wind_n, controls = table[:, 3:6], table[:, 12:15], table[:, 19:23]
+        columns, v_n, wind_n = table.T.copy(), table[:, 3:6].copy(), table[:, 12:15].copy()
         q_nb, air = _attitude_and_air(table[:, 6:9], v_n, wind_n)
-        dtheta, dv = increments(t, table[:, 0].copy(), table[:, 1].copy(), table[:, 2].copy(), v_n.copy(), q_nb)
+        dtheta, dv = increments(t, columns[0], columns[1], columns[2], v_n, q_nb)
         if first == 0:
             dtheta[1], dv[1] = 0.0, 0.0  # no interval ends at the first row of a run
-        servos = np.minimum(np.abs(np.diff(controls, axis=0)) * self.rate_hz / SERVO_RATE, 1.0)
-        block.t[:] = t[1:]
-        block.lat[:], block.lon[:], block.h[:] = table[1:, 0], table[1:, 1], table[1:, 2]
-        block.v_n[:], block.q_nb[:], block.omega_b[:] = v_n[1:], q_nb[1:], table[1:, 9:12]
-        block.dtheta[:], block.dv[:] = dtheta[1:], dv[1:]
-        block.wind_n[:] = wind_n[1:]
-        block.airspeed[:], block.alpha[:], block.beta[:] = air[1:].T
-        block.pressure[:], block.temperature[:] = table[1:, 15], table[1:, 16]
-        block.density[:] = block.pressure / (GAS_CONSTANT * block.temperature)
-        block.engine_rpm[:], block.fuel[:] = table[1:, 17], table[1:, 18]
-        block.controls[:] = controls[1:]
-        load = self._aircraft.envelope.current
-        block.current[:] = load.payload_a + 4 * load.servo_idle_a
-        for servo in range(4):
-            block.current[:] += load.servo_running_a * servos[:, servo]
-        block.current[:] += table[1:, 23]
-        repeats = [steps for steps, _ in commands]
-        held = np.repeat(np.array([values for _, values in commands]), repeats, axis=0)
-        block.commands[:], block.leg[:] = held[:, :3], held[:, 3]
-        return block
+        load, now = self._aircraft.envelope.current, columns[:, 1:]
+        idle = load.payload_a + 4 * load.servo_idle_a
+        held = np.repeat(np.array([values for _, values in commands]), [steps for steps, _ in commands], axis=0)
+        return TruthBlock(
+            first,
+            t=t[1:],
+            lat=now[0],
+            lon=now[1],
+            h=now[2],
+            v_n=v_n[1:],
+            q_nb=q_nb[1:],
+            omega_b=table[1:, 9:12].copy(),
+            dtheta=dtheta[1:],
+            dv=dv[1:],
+            wind_n=wind_n[1:],
+            airspeed=air[0, 1:],
+            alpha=air[1, 1:],
+            beta=air[2, 1:],
+            pressure=now[15],
+            temperature=now[16],
+            density=now[15] / (GAS_CONSTANT * now[16]),
+            engine_rpm=now[17],
+            current=_current(columns[19:], self.rate_hz, idle, load.servo_running_a),
+            fuel=now[18],
+            controls=table[1:, 19:23].copy(),
+            commands=held[:, :3].copy(),
+            leg=held[:, 3].copy(),
+        )
 
 
 @njit
 def _attitude_and_air(euler: Array, v_n: Array, wind_n: Array) -> tuple[Array, Array]:
-    """Quaternions (N, 4), and (N, 3) true airspeed [m/s], angles of attack and sideslip [rad]."""
-    q_nb, air = np.empty((len(euler), 4)), np.empty((len(euler), 3))
+    """Quaternions (N, 4), and (3, N) true airspeed [m/s], angles of attack and sideslip [rad]."""
+    q_nb, air = np.empty((len(euler), 4)), np.empty((3, len(euler)))
     air_n = np.empty(3)
     for k in range(len(euler)):
         q = quat_from_euler(euler[k, 0], euler[k, 1], euler[k, 2])
@@ -239,8 +246,20 @@ def _attitude_and_air(euler: Array, v_n: Array, wind_n: Array) -> tuple[Array, A
         air_b = quat_rotate(quat_conjugate(q), air_n)
         speed = math.sqrt(air_b[0] * air_b[0] + air_b[1] * air_b[1] + air_b[2] * air_b[2])
         across = min(max(air_b[1] / speed, -1.0), 1.0) if speed > 0.0 else 0.0
-        air[k, 0], air[k, 1], air[k, 2] = speed, math.atan2(air_b[2], air_b[0]), math.asin(across)
+        air[0, k], air[1, k], air[2, k] = speed, math.atan2(air_b[2], air_b[0]), math.asin(across)
     return q_nb, air
+
+
+@njit
+def _current(columns: Array, rate_hz: float, idle: float, running: float) -> Array:
+    """Current (N,) [A] from ``columns`` (5, N + 1), of four actuators, more the faster they run, and motor."""
+    current = np.full(columns.shape[1] - 1, idle)
+    for k in range(len(current)):
+        for servo in range(4):
+            rate = abs(columns[servo, k + 1] - columns[servo, k]) * rate_hz / SERVO_RATE
+            current[k] += running * (1.0 if rate > 1.0 else rate)
+        current[k] += columns[4, k + 1]
+    return current
 
 
 def _loss_of_control(state: Feedback, lowest: float) -> str:
