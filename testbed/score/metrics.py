@@ -5,7 +5,8 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
 * Rows from `SETTLING_S` after the estimator first called itself aligned.
 * Keys without prefix: while GNSS has a fix (or all the time, in a run without GNSS receiver), but not the first
   `RECOVERY_WINDOW_S` after an outage, which ``recovery_s`` judges by itself.
-* Keys with ``outage_`` in front: while no receiver has a fix, up to the arrival of the next fix.
+* Keys with ``outage_`` in front: while no receiver has a fix, up to the arrival of the next fix. An autopilot with a
+  receiver of its own (``--ardupilot`` without ``--gps-input``) has no outage.
 * An estimate is of the point where its IMU sits, and is compared with the true position and velocity of that point.
 * Horizontal errors are the length of the 2-D error; ``roll_pitch`` is the angle between the true and the estimated
   vertical; ``heading`` is the rotation about the vertical; ``velocity`` is the length of the 3-D error.
@@ -50,6 +51,8 @@ import numpy as np
 from nav import earth
 from nav.samples import Array, has_fix
 from testbed.errors import UserError
+from testbed.estimators.outside import OutsideSection
+from testbed.feeds.bridged import THEIRS
 from testbed.motion import aircraft, legs
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import ON_GROUND
@@ -137,12 +140,24 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
     result: dict[str, float] = {}
     windows = outages(dataset)
     bounds = bound.of_run(dataset) if windows else {}
+    undenied = _undenied(dataset)
     for name in names(dataset):
-        own = _estimator(dataset, name, windows, settling_s)
+        own = _estimator(dataset, name, [] if name in undenied else windows, settling_s)
         if name in bounds and "aligned_s" in own:
             own |= bound.marks(bounds[name], windows, OUTAGE_MARKS_S)
         result |= {f"{name}.{key}": float(value) for key, value in own.items()}
     return result | {f"flight.{key}": float(value) for key, value in _flight(dataset, windows).items()}
+
+
+def _undenied(dataset: xarray.DataTree) -> set[str]:
+    """The estimators of a far end that has a receiver of its own: what the run denies, it does not deny them."""
+    far_end = json.loads(dataset.attrs.get("far_end") or "{}")
+    if far_end.get("sensors", {}).get("gnss") != THEIRS:
+        return set()
+    try:
+        return {one.name for one in scenario_of(dataset).estimator if isinstance(one, OutsideSection)}
+    except UserError:  # `unscored` says so
+        return set()
 
 
 def unscored(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> list[str]:

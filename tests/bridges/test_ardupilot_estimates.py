@@ -12,15 +12,16 @@ from worlds.loop import same
 from testbed import RunResult, Scenario, run
 from testbed.bridges.ardupilot import ArduPilot
 from testbed.errors import UserError
-from testbed.score import accuracy, bound
+from testbed.score import accuracy, bound, metrics
 
 DURATION_S, PLACED_S = 12.0, 3.0
+DENIED_S = [8.0, 10.0]
 
 
 def scenario(*, theirs: bool = True) -> Scenario:
     ours = [{"name": "ins", "aids": ["gnss", "barometer", "magnetometer", "airspeed"]}]
     other = [{"name": "theirs", "kind": "ardupilot"}] if theirs else []
-    changes = {"duration_s": DURATION_S, "sensors.gnss.denied": [], "estimator": ours + other, "expect": {}}
+    changes = {"duration_s": DURATION_S, "sensors.gnss.denied": [DENIED_S], "estimator": ours + other, "expect": {}}
     return Scenario.load("kinematic_u_flight", changes)
 
 
@@ -76,6 +77,14 @@ def test_one_that_does_not_fly_is_armed_once_it_knows_where_it_is(
 def test_ours_have_the_same_bits_beside_it(heard: tuple[RunResult, autopilots.Answering], alone: RunResult) -> None:
     for group in ("truth", "sensors", "estimators/ins"):
         assert same(heard[0].dataset[group], alone.dataset[group])
+
+
+@pytest.mark.ci
+def test_whom_nothing_is_denied_has_no_outage(heard: tuple[RunResult, autopilots.Answering]) -> None:
+    found = metrics.compute(heard[0].dataset, settling_s=1.0)
+    assert found["ins.outage_position_horizontal_max_m"] > 0.0
+    assert found["theirs.position_horizontal_rms_m"] >= 0.0
+    assert not [name for name in found if name.startswith("theirs.outage") or name.startswith("theirs.recovery")]
 
 
 def test_one_that_flies_is_armed_by_whom_it_likes() -> None:
