@@ -26,16 +26,27 @@ from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import whiten
 from nav.earth import pressure_altitude
 from nav.error_model import Indices
-from nav.increments import COINCIDENT, Increments, Step
+from nav.increments import (
+    ADVANCE,
+    COINCIDENT,
+    ESTIMATE,
+    HORIZON,
+    NUMBERS,
+    TIME,
+    WHAT,
+    Increments,
+    Step,
+    row_after,
+    share,
+    take_off,
+)
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
 from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
 from nav.state import State, absorb, parts, propagate
 
-# What a step is, in place of the number of an aid; and where its numbers begin.
-ESTIMATE, ADVANCE, SPLIT = -1, -2, -3
-TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
+SPLIT = -3  # of a step, in place of the number of an aid: it only ends an increment
 WIDTH = NUMBERS + 12
 NOTHING = (0.0,) * 12
 LIMITS = 10  # where the limits of an aid's two parts are among its numbers
@@ -219,14 +230,6 @@ class Batch:
 
 
 @njit
-def row_after(t: Array, time: float, first: int) -> int:
-    """`Increments.row_after`."""
-    while first < len(t) and t[first] <= time + COINCIDENT:
-        first += 1
-    return first
-
-
-@njit
 def follow(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int,
@@ -276,7 +279,7 @@ def follow(
             if bad >= 0:
                 bad_then = max(bad_then, t[row + bad])
             if further > COINCIDENT:
-                _share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
+                share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
                 bad = propagate(  # not with a literal, for which it would be compiled anew
                     draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
                     period * PREDICTED_PERIODS, one_angle, one_push, one_dt, further > COINCIDENT,
@@ -288,11 +291,8 @@ def follow(
             drafted += 1
             continue
         if split:
-            _share(one_dt, one_angle, one_push, dt, dtheta, dv, row, 1 - (t[row] - time) / dt[row])
-            dt[row] -= one_dt[0]
-            for i in range(3):
-                dtheta[row, i] -= one_angle[0, i]
-                dv[row, i] -= one_push[0, i]
+            share(one_dt, one_angle, one_push, dt, dtheta, dv, row, 1 - (t[row] - time) / dt[row])
+            take_off(one_dt, one_angle, one_push, dt, dtheta, dv, row)
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
                 one_push, one_dt, settle,
@@ -322,16 +322,6 @@ def follow(
             _report(reports[written], k, part, nu, S, nis, statistic)
             written += 1
     return len(steps), 0, row, now, last_bad, written, drafted
-
-
-@njit
-def _share(
-    one_dt: Array, one_angle: Array, one_push: Array, dt: Array, dtheta: Array, dv: Array, row: int, share: float
-) -> None:
-    """`nav.increments.share_of` one row, in place."""
-    one_dt[0] = share * dt[row]
-    for i in range(3):
-        one_angle[0, i], one_push[0, i] = share * dtheta[row, i], share * dv[row, i]
 
 
 @njit

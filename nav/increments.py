@@ -8,9 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nav.samples import ImuSamples, Sample
+from nav._jit import inlined, njit
+from nav.samples import Array, ImuSamples, Sample
 
 COINCIDENT = 1e-6  # two times this close are the same [s]
+# A `Step` among the rows of numbers that a kernel is handed: its times, and what it is where that is no sample.
+TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
+ESTIMATE, ADVANCE = -1, -2
 
 
 class Step(NamedTuple):
@@ -93,3 +97,30 @@ def joined(first: ImuSamples, second: ImuSamples) -> ImuSamples:
         np.concatenate([first.dtheta, second.dtheta]),
         np.concatenate([first.dv, second.dv]),
     )
+
+
+@njit
+def row_after(t: Array, time: float, first: int) -> int:
+    """`Increments.row_after`."""
+    while first < len(t) and t[first] <= time + COINCIDENT:
+        first += 1
+    return first
+
+
+@njit
+def share(
+    one_dt: Array, one_angle: Array, one_push: Array, dt: Array, dtheta: Array, dv: Array, row: int, part: float
+) -> None:
+    """`share_of` one row, in place."""
+    one_dt[0] = part * dt[row]
+    for i in range(3):
+        one_angle[0, i], one_push[0, i] = part * dtheta[row, i], part * dv[row, i]
+
+
+@inlined
+def take_off(one_dt: Array, one_angle: Array, one_push: Array, dt: Array, dtheta: Array, dv: Array, row: int) -> None:
+    """Leave of one row what a `share` of it does not have."""
+    dt[row] -= one_dt[0]
+    for i in range(3):
+        dtheta[row, i] -= one_angle[0, i]
+        dv[row, i] -= one_push[0, i]

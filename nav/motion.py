@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from nav._jit import inlined
 from nav.earth import SEA_LEVEL_DENSITY, isa_density, pressure_altitude
 from nav.samples import Array, ImuSamples
 
@@ -56,23 +57,29 @@ class LowDynamics:
         """Judge mean specific force ``f_n`` (3,) [m/s^2], known accelerations taken off, and angular rate ``omega_b``
         (3,) [rad/s]; ``g`` [m/s^2] is gravity. Values that are not finite fail.
         """
-        north, east, down = f_n.tolist()
-        roll_rate, _, yaw_rate = omega_b.tolist()
-        if self.test == "norm":
-            acceleration = abs(math.sqrt(north * north + east * east + down * down) - g)
-        else:
-            acceleration = math.sqrt(north * north + east * east + (down + g) ** 2)
-        roll_rate, yaw_rate = abs(roll_rate), abs(yaw_rate)
-        failed = []
-        if not acceleration <= self.acceleration_limit:
-            failed.append("acceleration")
-        if not yaw_rate <= self.yaw_rate_limit:
-            failed.append("yaw rate")
-        if not roll_rate <= self.roll_rate_limit:
-            failed.append("roll rate")
-        if not autopilot_level:
-            failed.append("autopilot")
-        return Motion(acceleration, yaw_rate, roll_rate, tuple(failed))
+        shown = np.empty(3)
+        passed = passes(f_n, omega_b, g, self.numbers, shown)
+        tests = zip(("acceleration", "yaw rate", "roll rate", "autopilot"), (*passed, autopilot_level), strict=True)
+        acceleration, yaw_rate, roll_rate = shown.tolist()
+        return Motion(acceleration, yaw_rate, roll_rate, tuple(name for name, ok in tests if not ok))
+
+    @property
+    def numbers(self) -> Array:
+        """The limits (3,), and whether acceleration is that of the vector: as `passes` is told them."""
+        limits = self.acceleration_limit, self.yaw_rate_limit, self.roll_rate_limit
+        return np.array([*limits, float(self.test == "vector")])
+
+
+@inlined
+def passes(f_n: Array, omega_b: Array, g: float, limits: Array, shown: Array) -> tuple[bool, bool, bool]:
+    """The three tests of `LowDynamics.judge` with ``limits`` (4,); acceleration, yaw and roll rate into ``shown``."""
+    north, east, down = f_n[0], f_n[1], f_n[2]
+    if limits[3] == 0.0:
+        shown[0] = abs(math.sqrt(north * north + east * east + down * down) - g)
+    else:
+        shown[0] = math.sqrt(north * north + east * east + (down + g) * (down + g))
+    shown[1], shown[2] = abs(omega_b[2]), abs(omega_b[0])
+    return shown[0] <= limits[0], shown[1] <= limits[1], shown[2] <= limits[2]
 
 
 class TurnDetector:
@@ -107,41 +114,57 @@ class TrueAirspeed:
 
     A gust changes airspeed at once and the body's velocity hardly: what is shorter than ``smoothing_s`` [s] says
     nothing of acceleration. Density is that of the standard atmosphere at ``h`` [m], or, once there is a barometer, at
-    the static pressure it shows.
+    the static pressure it shows. ``numbers`` (3,) are all that it knows, for kernels: true over equivalent airspeed,
+    the smoothed equivalent airspeed [m/s], and its time [s].
     """
 
     def __init__(self, h: float, smoothing_s: float) -> None:
         self.smoothing_s = smoothing_s
-        self._per_eas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(h))
-        self._eas = math.nan
-        self._t = -math.inf
+        self.numbers = np.array([math.sqrt(SEA_LEVEL_DENSITY / isa_density(h)), math.nan, -math.inf])
 
     def add_eas(self, t: float, eas: float) -> None:
         """Add an equivalent airspeed [m/s] at ``t`` [s]."""
-        dt = t - self._t
-        self._eas = (
-            eas if dt > AIRSPEED_VALID_S else self._eas + (eas - self._eas) * -math.expm1(-dt / self.smoothing_s)
-        )
-        self._t = t
+        add_eas(self.numbers, t, eas, self.smoothing_s)
 
     def add_pressure(self, pressure: float) -> None:
         """Add a static pressure [Pa]."""
-        self._per_eas = math.sqrt(SEA_LEVEL_DENSITY / isa_density(pressure_altitude(pressure)))
+        self.numbers[0] = true_over_equivalent(pressure)
 
     def lose(self) -> None:
         """Forget the speed: the sensor says nothing that can be used."""
-        self._t = -math.inf
+        self.numbers[2] = -math.inf
 
     def at(self, t: float) -> float:
         """The speed at ``t`` [s], NaN when the newest sample is too old."""
-        return self._per_eas * self._eas if t - self._t <= AIRSPEED_VALID_S else math.nan
+        return true_airspeed(self.numbers, t)
 
 
+def true_over_equivalent(pressure: float) -> float:
+    """Ratio of the airspeeds where the static pressure is so much [Pa]."""
+    return math.sqrt(SEA_LEVEL_DENSITY / isa_density(pressure_altitude(pressure)))
+
+
+@inlined
+def add_eas(numbers: Array, t: float, eas: float, smoothing_s: float) -> None:
+    """`TrueAirspeed.add_eas`."""
+    dt = t - numbers[2]
+    numbers[1] = eas if dt > AIRSPEED_VALID_S else numbers[1] + (eas - numbers[1]) * -math.expm1(-dt / smoothing_s)
+    numbers[2] = t
+
+
+@inlined
+def true_airspeed(numbers: Array, t: float) -> float:
+    """`TrueAirspeed.at`."""
+    speed: float = numbers[0] * numbers[1] if t - numbers[2] <= AIRSPEED_VALID_S else math.nan
+    return speed
+
+
+@inlined
 def acceleration_n(air_velocity_before_n: Array, air_velocity_n: Array, T: float) -> Array:
     """Mean acceleration (3,) [m/s^2] over ``T`` [s] from the velocity through the air [m/s], which points forward.
 
     In a steady wind it is the body's acceleration: the mean of C_nb (omega x [V, 0, 0] + [dV/dt, 0, 0]), integrated
     without error. NaN where a velocity is unknown.
     """
-    mean: Array = (air_velocity_n - air_velocity_before_n) / T
-    return mean
+    now, before = air_velocity_n, air_velocity_before_n
+    return np.array([(now[0] - before[0]) / T, (now[1] - before[1]) / T, (now[2] - before[2]) / T])

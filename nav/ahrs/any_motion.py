@@ -219,7 +219,7 @@ class AnyMotionLevelling:
 
     def feed_back(self, s: State) -> None:
         """Take what was found out of attitude, gyros and velocity."""
-        s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(s.x[PHI : PHI + 3]), s.q_nb))
+        s.q_nb[:] = quat_normalise(quat_multiply(quat_from_rotvec(s.x[PHI : PHI + 3]), s.q_nb))
         s.gyro_bias -= s.x[BIAS:STATES]
         s.in_motion.velocity_n -= s.x[self._velocity]
         s.x[:STATES] = 0.0

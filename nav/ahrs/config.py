@@ -9,6 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from nav._jit import inlined
 from nav.error_model import ImuModel
 from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, Array, BarometerSample, MagnetometerSample
@@ -20,12 +21,13 @@ DEG = math.pi / 180
 Correction: TypeAlias = Callable[[Array, float], Array]  # as `limited`
 
 
+@inlined
 def limited(phi: Array, limit: float) -> Array:
     """What of an attitude error ``phi`` (3,) is corrected at once: each axis by its own error, at most ``limit`` [rad].
 
     Equation 10 (which prints the north axis' error for both level axes).
     """
-    return np.array([min(max(error, -limit), limit) for error in phi.tolist()])
+    return np.array([min(max(phi[0], -limit), limit), min(max(phi[1], -limit), limit), min(max(phi[2], -limit), limit)])
 
 
 @dataclass(frozen=True)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from nav import aids
+from nav.ahrs import steps as kernels
 from nav.ahrs.any_motion import AnyMotionLevelling
-from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig
+from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig, limited
 from nav.ahrs.further import FurtherStates
-from nav.ahrs.state import BIAS, PHI, STATES, UNKNOWN, State, covariance_step, fresh, propagate, transition
+from nav.ahrs.state import BIAS, CORRECTIONS, FIXED, LEVELLINGS, PERIOD_END, PHI, STATES, State, fresh, propagate
+from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
-from nav.error_model import PAPERS, ErrorModel
+from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Step
 from nav.kalman import update
-from nav.motion import TrueAirspeed, acceleration_n
-from nav.rotation import quat_from_euler, quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
+from nav.motion import TrueAirspeed, true_over_equivalent
+from nav.rotation import quat_from_euler, quat_multiply, quat_rotate
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -30,13 +33,11 @@ from nav.samples import (
     UpdateReport,
 )
 
+COUNTED = "mode_counter", "correction_counter"  # periods of low dynamics, and corrections
 JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what the last period was judged by
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
-COINCIDENT = 1e-6  # two times this close are the same [s]
 KNOWN = Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY
-NO_ATTITUDE = np.full(4, np.nan)
-NO_COVARIANCE = np.full((9, 9), np.nan)
 
 
 class Ahrs:
@@ -49,7 +50,7 @@ class Ahrs:
 
     def __init__(self, config: AhrsConfig, field_n: Array | None = None) -> None:
         self.config = config
-        self._commanded = (np.empty(0), np.empty(0, bool))  # times, and whether level flight was commanded up to each
+        self._busy = np.empty(0)  # times up to which something else than level flight was commanded
         self.t = math.nan
         self._state: State | None = None
         self._airspeed = TrueAirspeed(config.h, config.airspeed_smoothing_s)
@@ -58,28 +59,30 @@ class Ahrs:
         self._g = float(gravity(config.lat, config.h))
         self._earth_n = earth_rate_n(config.lat)
         imu = config.imu
-        model = ErrorModel(imu)
         self.further = FurtherStates(config)
-        n = STATES + self.further.count
-        self._stays = np.eye(n)
-        self._variance_rate = np.zeros(n)
-        self._variance_rate[:STATES] = model.density[model.places(PAPERS["jiang2021"])] ** 2
+        self._n = STATES + self.further.count
+        self._sees_heading = field_n is not None and "magnetometer" in config.aids
+        self._model = kernels.model(config, self.further, self._g, field_n, self._sees_heading)
         self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
         self._accel_bias = self.further.accel_bias
         biased = self._accel_bias.start == self._accel_bias.stop  # accelerometers, by what no state stands for
         self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2 if biased else 0.0] * 2 + [0.0])
-        self._H_level = np.zeros((2, n))
-        self._H_level[0, PHI + 1], self._H_level[1, PHI] = self._g, -self._g
-        H = np.zeros((1, n))
-        if field_n is not None:
-            H[0, PHI : PHI + 2] = field_n[:2] * field_n[2] / (field_n[0] ** 2 + field_n[1] ** 2)
-        H[0, PHI + 2] = -1.0
+        rows = self._model.rows
+        self._H_level = rows[kernels.LEVEL_ROW : kernels.LEVEL_ROW + 2]
+        H = rows[kernels.HEADING_ROW, None]
         self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, n) and R (1,) of a heading
         told = config.any_motion
         self._any_motion = (
             None if told is None else AnyMotionLevelling(config, told, self.further, self._g, self._earth_n, H)
         )
         self._last_bad = -math.inf
+        self._usual = (
+            told is None and config.correction is limited
+        )  # levels in low dynamics, and corrects by equation 10
+        # sensor, name and axes of what a report is on; and of which kind those of each magnetometer are
+        self._kinds = [("accelerometer", LEVEL, 2)]
+        self._kind_of: dict[str, int] = {}
+        self._report = np.empty((1, kernels.REPORT))
 
     @property
     def aligned(self) -> bool:
@@ -98,11 +101,11 @@ class Ahrs:
 
     def start(self, t: float, q_nb: Array) -> None:
         """Begin at a given attitude, known as well as the configuration's sigmas say, instead of levelling."""
-        self._state = state = fresh(t + self.config.period_s, STATES + self.further.count)
+        self._state = state = fresh(t + self.config.period_s, self._n)
         state.levelled = True
-        state.q_nb = np.array(q_nb, dtype=float)
-        state.P = self._initial_covariance()
-        state.air_velocity_n = self._air_velocity_n(state, t)
+        state.q_nb[:] = q_nb
+        state.P[:] = self._initial_covariance()
+        state.air_velocity_n[:] = kernels.air_velocity(state.q_nb, self._airspeed.numbers, t)
         self.t = t
 
     def flight_control(self, t: Array, level: Mask) -> None:
@@ -111,10 +114,8 @@ class Ahrs:
         Its word is taken for periods to come, which it must hence reach before the increments do; without it, or beyond
         its end, the sensors judge alone.
         """
-        times, before = self._commanded
         since = 0.0 if math.isnan(self.t) else self.t - 2 * self.config.period_s
-        kept = slice(int(np.searchsorted(times, since)), None)
-        self._commanded = (np.concatenate([times[kept], t]), np.concatenate([before[kept], level]))
+        self._busy = np.concatenate([self._busy[self._busy >= since], t[~np.asarray(level)]])
 
     def propagate(self, imu: ImuSamples) -> list[UpdateReport]:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates.
@@ -126,11 +127,68 @@ class Ahrs:
             return reports
         if self._state is None:
             start = float(imu.t[0] - imu.dt[0])
-            self._state = fresh(start + self.config.levelling_s, STATES + self.further.count)
-            self._state.air_velocity_n = self._air_velocity_n(self._state, start)
+            self._state = state = fresh(start + self.config.levelling_s, self._n)
+            state.air_velocity_n[:] = kernels.air_velocity(state.q_nb, self._airspeed.numbers, start)
         self._last_bad = max(self._last_bad, self._run(self._state, imu, reports))
         self.t = float(imu.t[-1])
         return reports
+
+    @property
+    def in_steps(self) -> bool:
+        """Whether it takes many steps at once: it has an attitude, and levels as usual."""
+        return self.aligned and self._usual
+
+    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
+        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+        s, imu, plan = self._state, ahead.imu, self._plan(steps)
+        if s is None or not len(plan):
+            return 0
+        periods = self._periods(ahead.ends[-1] + ahead.longest - ahead.t)  # what is predicted counts
+        told = np.empty((len(plan) + periods, kernels.REPORT))
+        asked = np.count_nonzero(plan[:, WHAT] == ESTIMATE)
+        wholes, when = np.empty((asked, len(s.whole))), np.empty((asked, 2))
+        taken, ahead.next, ahead.t, self._last_bad, written, drafted = kernels.follow(
+            s.whole, s.n, *self._model, self._airspeed.numbers, self._busy, imu.t, imu.dt, imu.dtheta, imu.dv,
+            ahead.next, ahead.t, ahead.longest, self._last_bad, plan, told, wholes, when,
+        )  # fmt: skip
+        self.t = ahead.t
+        if written:
+            reports.append(self._reports(told[:written]))
+        if drafted:
+            estimates.append(self._described(wholes[:drafted], *when[:drafted].T.copy()))
+        return taken
+
+    def _plan(self, steps: Sequence[Step]) -> Array:
+        """The first of the ``steps`` that look plain, as rows for `nav.ahrs.steps.follow`."""
+        flat: list[float] = []
+        nothing = 0.0, 0.0, 0.0, 0.0
+        for t, horizon, sample in steps:
+            if sample is None:
+                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *nothing)
+                continue
+            if t != horizon or aids.problem(sample):  # too late, or not sound
+                break
+            match sample:
+                case MagnetometerSample():
+                    flat += (t, t, kernels.MAGNETIC, *sample.field_b.tolist(), self._kind(sample.sensor))
+                case AirspeedSample():
+                    eas = sample.eas if sample.eas >= self.config.airspeed_min else math.nan
+                    flat += (t, t, kernels.AIRSPEED, eas, *nothing[1:])
+                case BarometerSample():
+                    flat += (t, t, kernels.DENSITY, true_over_equivalent(sample.pressure), *nothing[1:])
+        return np.array(flat).reshape(-1, kernels.WIDTH)
+
+    def _kind(self, sensor: str) -> int:
+        """The place of a magnetometer's reports among the kinds."""
+        if sensor not in self._kind_of:
+            self._kind_of[sensor] = len(self._kinds)
+            self._kinds.append((sensor, MAGNETIC_HEADING, 1))
+        return self._kind_of[sensor]
+
+    def _reports(self, rows: Array) -> FusedReports:
+        """The reports that kernels wrote."""
+        kind, t, nis = rows[:, 0].astype(np.int64), rows[:, 1], rows[:, 2]
+        return FusedReports(self._kinds, kind, t, rows[:, 3:6], rows[:, 6:], nis, np.full(len(rows), math.inf))
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample's kind is an aid."""
@@ -167,7 +225,7 @@ class Ahrs:
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
-        return self._estimate(self._state.present() if self._state is not None else None, self.t, self._last_bad)
+        return self._estimate(self._state, self.t, self._last_bad)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments, the filter itself staying where it is."""
@@ -185,7 +243,9 @@ class Ahrs:
         last_bad = -math.inf
         start, n = 0, len(imu)
         while start < n:
-            end = int(imu.t.searchsorted(s.period_end - COINCIDENT)) + 1
+            if s.levelled and self._usual:
+                return max(last_bad, self._advance(s, imu, start, reports))
+            end = int(imu.t.searchsorted(s.counts[PERIOD_END] - COINCIDENT)) + 1
             rows = slice(start, min(end, n))
             bad = propagate(
                 s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,
@@ -198,6 +258,20 @@ class Ahrs:
                 self._end_period(s, float(imu.t[end - 1]), reports)
         return last_bad
 
+    def _advance(self, s: State, imu: ImuSamples, start: int, reports: list[UpdateReport]) -> float:
+        """Propagate a levelled state of a filter that levels as usual by the increments from ``start`` on."""
+        rows = np.empty((self._periods(float(imu.t[-1] - imu.t[start])), kernels.REPORT))
+        bad, written = kernels.advance(
+            s.whole, s.n, *self._model, self._airspeed.numbers, self._busy, imu.t[start:], imu.dtheta[start:],
+            imu.dv[start:], imu.dt[start:], -math.inf, rows,
+        )  # fmt: skip
+        reports += self._reports(rows[:written])[:]
+        return bad
+
+    def _periods(self, T: float) -> int:
+        """How many may end within ``T`` [s], at most."""
+        return 3 + int(T / self.config.period_s)
+
     def _end_period(self, s: State, t: float, reports: list[UpdateReport]) -> None:
         """Level by what the period has shown, and begin the next."""
         if s.levelled:
@@ -208,27 +282,15 @@ class Ahrs:
                 self._level_in_motion(s, self._any_motion, t, reports)
         else:
             self._find_level(s, t)
-        s.angle[:] = 0.0
-        s.force[:] = 0.0
-        s.sums[:] = 0.0
-        s.elapsed[1:] = 0.0
-        s.air_velocity_n = self._air_velocity_n(s, t)
         period = self.config.period_s if s.levelled else self.config.levelling_s
-        while s.period_end <= t + COINCIDENT:
-            s.period_end += period
-
-    def _air_velocity_n(self, s: State, t: float) -> Array:
-        speed = self._airspeed.at(t)
-        return UNKNOWN if math.isnan(speed) else quat_rotate(s.q_nb, np.array([speed, 0.0, 0.0]))
+        kernels.begin_period(
+            s.q_nb, s.air_velocity_n, s.counts, s.angle, s.force, s.elapsed, s.sums, self._airspeed.numbers, t, period
+        )
 
     def _steady_force(self, s: State, t: float) -> tuple[Array, bool]:
         """Mean specific force over the period, less the acceleration that airspeed tells, and whether it told any."""
-        T = float(s.elapsed[1])
-        f_n = s.force / T
-        acceleration = acceleration_n(s.air_velocity_n, self._air_velocity_n(s, t), T)
-        if math.isnan(acceleration[0]):
-            return f_n, False
-        return f_n - acceleration, True
+        air = self._airspeed.numbers
+        return kernels.steady_force(s.q_nb, s.force, s.air_velocity_n, air, t, float(s.elapsed[1]))
 
     def _find_level(self, s: State, t: float) -> None:
         """Roll and pitch from specific force; heading from the magnetic field or from outside.
@@ -245,17 +307,17 @@ class Ahrs:
             unaccelerated = abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit
             tilt_variance = config.tilt_sigma**2 if unaccelerated else math.nan
         if no_field or math.isnan(tilt_variance):
-            s.q_nb = np.array([1.0, 0.0, 0.0, 0.0])
+            s.q_nb[:] = 1.0, 0.0, 0.0, 0.0
             s.field_n[:] = 0.0
             return
         roll, pitch = math.atan2(-f_0[1], -f_0[2]), math.atan2(f_0[0], math.hypot(f_0[1], f_0[2]))
         heading = config.heading
-        if self._field_n is not None and "magnetometer" in self._aids:
+        if self._field_n is not None and self._sees_heading:
             level = quat_rotate(quat_from_euler(roll, pitch, 0.0), s.field_n)
             heading = _azimuth(self._field_n) - _azimuth(level)
         s.levelled = True
-        s.q_nb = quat_multiply(quat_from_euler(roll, pitch, heading), s.q_nb)
-        s.P = self._initial_covariance()
+        s.q_nb[:] = quat_multiply(quat_from_euler(roll, pitch, heading), s.q_nb)
+        s.P[:] = self._initial_covariance()
         if self._any_motion is not None:
             s.P[PHI, PHI] = s.P[PHI + 1, PHI + 1] = tilt_variance
             s.P[PHI + 2, PHI + 2] += float(np.square(self.heading_measurement[0][0, :2]).sum()) * tilt_variance
@@ -272,19 +334,18 @@ class Ahrs:
 
     def _level(self, s: State, t: float, reports: list[UpdateReport]) -> None:
         """Take horizontal specific force for tilt if the motion allows (equation 7), then correct the attitude."""
-        config = self.config
-        f_n, compensated = self._steady_force(s, t)
-        limits = config.compensated_motion if compensated else config.motion
-        omega_b = s.angle / s.elapsed[1] - s.gyro_bias
-        motion = limits.judge(f_n, omega_b, self._g, self._level_commanded(t - float(s.elapsed[1]), t))
-        s.shown[:] = motion.acceleration, motion.yaw_rate, motion.roll_rate
-        if not motion.low:
-            s.correction_counter = 0
-            return
-        s.mode_counter += 1
-        H, R = self.level_measurement(s.q_nb, omega_b, compensated)
-        reports.append(_fuse(s, H, R, f_n[:2], t, "accelerometer", LEVEL))
-        self._feed_back(s)
+        commanded = not kernels.is_busy(self._busy, t - float(s.elapsed[1]), t)
+        report = self._report[0]
+        low = kernels.level(
+            s.q_nb, s.gyro_bias, s.air_velocity_n, s.shown, s.counts, s.angle, s.force, s.elapsed, s.x, s.P,
+            *self._model, self._airspeed.numbers, commanded, t, report,
+        )  # fmt: skip
+        if low:
+            reports += self._reports(self._report.copy())[:]
+            due, phi = kernels.outstanding(s.x, s.P, self._model.told, self._model.places)
+            if due:
+                step = self.config.correction(phi, self.config.phi_limit)
+                kernels.correct(s.q_nb, s.gyro_bias, s.counts, s.x, step, self._model.places)
 
     def _level_in_motion(self, s: State, how: AnyMotionLevelling, t: float, reports: list[UpdateReport]) -> None:
         """Level by what a period of any motion shows, turn by the field's mean, and correct all that was found."""
@@ -296,7 +357,7 @@ class Ahrs:
         how.watch(s, f_n, omega_b, T)
         acceleration = how.acceleration(s, compensated)
         s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
-        s.mode_counter += 1
+        s.counts[LEVELLINGS] += 1
         H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, T)
         reports.append(_fuse(s, H, R, how.unexplained(s, f_n[:2], T), t, "accelerometer", LEVEL))
         how.move(s, f_n[:2], T)
@@ -309,7 +370,7 @@ class Ahrs:
             s.in_motion.fields = 0
         how.rest(s, T)
         how.feed_back(s)
-        s.correction_counter += 1
+        s.counts[CORRECTIONS] += 1
 
     def level_measurement(
         self, q_nb: Array, omega_b: Array, compensated: bool, acceleration: float = 0.0, T: float = 1.0
@@ -319,108 +380,62 @@ class Ahrs:
 
         In any motion also by the horizontal ``acceleration`` expected [m/s^2], rms of an axis, over ``T`` [s].
         """
-        variance = self.config.force_sigma**2
-        if compensated:
-            variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b)
-        H = self._H_level.copy()
-        self.further.columns(H, q_nb)
+        H, R = kernels.level_measurement(q_nb, omega_b, compensated, *self._model)
         if self._any_motion is not None:
             return self._any_motion.level_measurement(H, omega_b, compensated, acceleration, T)
-        return H, np.full(2, variance)
-
-    def _level_commanded(self, start: float, end: float) -> bool:
-        """Whether nothing but level flight was commanded from ``start`` to ``end`` [s], as far as is known."""
-        times, level = self._commanded
-        first, stop = np.searchsorted(times, (start + COINCIDENT, end + COINCIDENT))
-        return bool(level[first:stop].all())
-
-    def _feed_back(self, s: State) -> None:
-        """Move estimated errors into attitude and gyro bias, in small steps (equations 10, 11)."""
-        config = self.config
-        if max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) >= config.correction_sigma**2:
-            return
-        phi = s.x[PHI : PHI + 3].copy()
-        if "magnetometer" not in self._aids:
-            phi[2] = 0.0  # nothing sees the heading: what the filter thinks of it, and of its gyro, is a guess
-        step = config.correction(phi, config.phi_limit)
-        s.q_nb = quat_normalise(quat_multiply(quat_from_rotvec(step), s.q_nb))  # C = (I + [phi x]) C_hat
-        s.x[PHI : PHI + 3] -= step
-        s.correction_counter += 1
-        if config.gyro_bias_feedback:
-            seen = slice(BIAS, STATES if "magnetometer" in self._aids else BIAS + 2)
-            s.gyro_bias[: seen.stop - BIAS] -= s.x[seen]
-            s.x[seen] = 0.0
+        return H, R
 
     def _update_magnetometer(self, sample: MagnetometerSample) -> list[UpdateReport]:
-        """Take the direction of the levelled field for heading; while levelling, collect it.
-
-        Azimuth of C_nb_hat m_b less that of the reference m_n: -phi_D + m_D (m_N phi_N + m_E phi_E) / (m_N^2 + m_E^2).
-        """
-        s, m_n = self._state, self._field_n
-        if s is None or m_n is None:
+        """Take the direction of the levelled field for heading; while levelling, collect it."""
+        s = self._state
+        if s is None:
             return []
-        levelled = quat_rotate(s.q_nb, sample.field_b)
-        if not s.levelled or self._any_motion is not None:
-            s.field_n += levelled
-            s.in_motion.fields += 1
-            s.in_motion.sensor = sample.sensor
-            return []
-        self._settle(s)
-        z = math.remainder(_azimuth(levelled) - _azimuth(m_n), 2 * math.pi)
-        return [_fuse(s, *self.heading_measurement, np.array([z]), sample.t, sample.sensor, MAGNETIC_HEADING)]
+        if s.levelled and self._any_motion is None:
+            kind = self._kind(sample.sensor)
+            kernels.turn(s.whole, s.n, *self._model, sample.field_b, self._report[0], kind, sample.t)
+            return self._reports(self._report.copy())[:]
+        s.field_n += quat_rotate(s.q_nb, sample.field_b)
+        s.in_motion.fields += 1
+        s.in_motion.sensor = sample.sensor
+        return []
 
     def _settle(self, s: State) -> None:
         """Bring error states and covariance up to the time of the attitude."""
-        if s.elapsed[0] > 0:
-            T, period, _ = s.elapsed.tolist()
-            whole, half_noise = self._stays.copy(), 0.5 * T * self._variance_rate
-            whole[PHI : PHI + 3, :STATES] = transition(s.turned, self._earth_n, T)
-            self.further.step(whole, half_noise, T)
-            self.further.turn(whole, s.turned, float(s.angle[2]) / period)
-            if self._any_motion is not None:
-                half_noise[PHI : PHI + 3] += self._any_motion.half_noise(s)
-            covariance_step(s, whole, half_noise)
+        turning = self._any_motion.half_noise(s) if self._any_motion is not None else 0.0
+        kernels.settle(s.x, s.P, s.turned, s.angle, s.elapsed, *self._model, turning)
 
     def _estimate(self, s: State | None, t: float, last_bad: float) -> Estimate:
-        """The estimate at ``t`` from a state of its own.
+        """The estimate at ``t`` from a state, which stays as it is."""
+        if s is None or not s.levelled:
+            status = Status.ALIGNING | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else Status.ALIGNING
+            return Estimate.of(t, status=status)
+        settled = s.copy()
+        self._settle(settled)
+        return self._described(settled.whole[None], np.array([t]), np.array([last_bad]))[0]
+
+    def _described(self, wholes: Array, t: Array, last_bad: Array) -> Estimates:
+        """The estimates at ``t`` (N,) of settled states, each the whole of one of ``wholes``.
 
         The attitude is what it is before the corrections still outstanding, so they are part of its error; so is the
         tilt of accelerometers that are biased, which no state stands for.
         """
-        bad = t - last_bad <= BAD_SAMPLE_S
-        if s is None or not s.levelled:
-            return Estimate(
-                t, math.nan, math.nan, math.nan, UNKNOWN, NO_ATTITUDE, UNKNOWN, UNKNOWN, NO_COVARIANCE, UNKNOWN,
-                UNKNOWN, Status.ALIGNING | Status.BAD_SAMPLE if bad else Status.ALIGNING,
-            )  # fmt: skip
-        self._settle(s)
-        phi = s.x[PHI : PHI + 3]
-        covariance = NO_COVARIANCE.copy()
-        covariance[6:, 6:] = s.P[PHI : PHI + 3, PHI : PHI + 3] + phi[:, None] * phi + self._floor
-        zero, sigma = np.zeros(1), np.sqrt(s.P.diagonal())
-        judged = zip(JUDGED, s.shown[:, None], strict=True)
-        accel_bias, sigma_accel_bias = np.zeros(3), self._sigma_accel_bias
+        N, n, zero = len(t), self._n, np.zeros((len(t), 1))
+        q_nb, gyro_bias, shown, counts = wholes[:, :4], wholes[:, 4:7], wholes[:, 13:16], wholes[:, 16:19]
+        x, P = wholes[:, FIXED : FIXED + n], wholes[:, FIXED + n :].reshape(N, n, n)
+        phi = x[:, PHI : PHI + 3]
+        covariance = np.full((N, 9, 9), np.nan)
+        covariance[:, 6:, 6:] = P[:, PHI : PHI + 3, PHI : PHI + 3] + phi[:, :, None] * phi[:, None] + self._floor
+        sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        accel_bias, sigma_accel_bias = np.zeros((N, 3)), np.tile(self._sigma_accel_bias, (N, 1))
         if self._accel_bias.start < self._accel_bias.stop:
-            accel_bias, sigma_accel_bias = -s.x[self._accel_bias], sigma[self._accel_bias]
-        return Estimate(
-            t=t,
-            lat=math.nan,
-            lon=math.nan,
-            h=math.nan,
-            v_n=UNKNOWN,
-            q_nb=s.q_nb,
-            gyro_bias=s.gyro_bias - s.x[BIAS:STATES],
-            accel_bias=accel_bias,
-            covariance=covariance,
-            sigma_gyro_bias=sigma[BIAS:STATES],
-            sigma_accel_bias=sigma_accel_bias,
-            status=KNOWN | Status.BAD_SAMPLE if bad else KNOWN,
-            extra={
-                "mode_counter": (np.array([float(s.mode_counter)]), zero),
-                "correction_counter": (np.array([float(s.correction_counter)]), zero),
-                **{name: (value, zero) for name, value in judged},
-            },
-        )
+            accel_bias, sigma_accel_bias = -x[:, self._accel_bias], sigma[:, self._accel_bias]
+        unknown, nowhere, bad = np.full((N, 3), np.nan), np.full(N, np.nan), t - last_bad <= BAD_SAMPLE_S
+        values = counts[:, LEVELLINGS, None], counts[:, CORRECTIONS, None], *np.split(shown, 3, axis=1)
+        return Estimates(
+            t, nowhere, nowhere, nowhere, unknown, q_nb.copy(), gyro_bias - x[:, BIAS:STATES], accel_bias, covariance,
+            sigma[:, BIAS:STATES], sigma_accel_bias, np.where(bad, KNOWN | Status.BAD_SAMPLE, KNOWN),
+            {name: (value.copy(), zero) for name, value in zip((*COUNTED, *JUDGED), values, strict=True)},
+        )  # fmt: skip
 
 
 def _fuse(s: State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:

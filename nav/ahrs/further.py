@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from nav._jit import inlined
 from nav.ahrs.config import AhrsConfig
 from nav.ahrs.state import PHI, STATES
 from nav.earth import gravity
@@ -59,30 +60,19 @@ class FurtherStates:
             slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES))
         )
         self.count = sum(sizes)
-        self._places = np.arange(STATES, STATES + self.count)
+        own = self.misalignment, self.accel_bias, self.gust
+        self.places = [place.start if place.stop > place.start else -1 for place in own]  # of the first three, as begun
         self.names = [name for names, size in zip(NAMES, sizes, strict=True) for name in names[:size]]
         self.sigma = np.repeat(sigmas, sizes)  # (k,) at the start
         fading = -math.log((power - variance) / (power + variance)) / config.period_s if sizes[2] else 0.0
         self.decay_rate = np.repeat([0.0, 0.0, fading, 0.0], sizes)  # (k,) [1/s]
-
-    def step(self, whole: Array, half_noise: Array, T: float) -> None:
-        """Put what fades in ``T`` [s] into the transition ``whole`` (n, n), and half of what comes in into (n,).
-
-        Half comes in before the decay and half after, and the variance of gusts stays.
-        """
-        if not self.count:
-            return
-        kept = np.exp(-T * self.decay_rate)
-        whole[self._places, self._places] = kept
-        half_noise[STATES:] = self.sigma**2 * (1 - kept**2) / (1 + kept**2)
 
     def turn(self, whole: Array, turned: Array, yaw_rate: float) -> None:
         """Put what the misaligned gyros make of ``yaw_rate`` [rad/s] into the transition ``whole`` (n, n).
 
         ``turned`` (3, 3) is the integral of C_nb.
         """
-        if self.misalignment.stop > self.misalignment.start:
-            whole[PHI : PHI + 3, self.misalignment] = turned * yaw_rate
+        misaligned(whole, turned, yaw_rate, self.places[0])
 
     def drive(self, F: Array) -> None:
         """Put what tilt makes of the velocity into the system matrix ``F`` (n, n) [1/s]."""
@@ -90,9 +80,26 @@ class FurtherStates:
             north, east = range(self.velocity.start, self.velocity.stop)
             F[north, PHI + 1], F[east, PHI] = self._g, -self._g
 
-    def columns(self, H: Array, q_nb: Array) -> None:
-        """Put theirs into ``H`` (2, n) of the mean horizontal specific force of a body at the attitude ``q_nb``."""
-        if self.accel_bias.stop > self.accel_bias.start:
-            H[:, self.accel_bias] = -dcm_from_quat(q_nb)[:2]
-        if self.gust.stop > self.gust.start:
-            H[:, self.gust] = -np.eye(2)
+
+@inlined
+def misaligned(whole: Array, turned: Array, yaw_rate: float, start: int) -> None:
+    """`FurtherStates.turn`: the states begin at ``start``, -1 without any."""
+    if start >= 0:
+        for i in range(3):
+            for j in range(3):
+                whole[PHI + i, start + j] = turned[i, j] * yaw_rate
+
+
+@inlined
+def columns(H: Array, q_nb: Array, accel_bias: int, gust: int) -> None:
+    """Put theirs into ``H`` (2, n) of the mean horizontal specific force of a body at the attitude ``q_nb``.
+
+    The states begin at ``accel_bias`` and ``gust``, -1 without any.
+    """
+    if accel_bias >= 0:
+        C_nb = dcm_from_quat(q_nb)
+        for i in range(2):
+            for j in range(3):
+                H[i, accel_bias + j] = -C_nb[i, j]
+    if gust >= 0:
+        H[0, gust] = H[1, gust + 1] = -1.0

@@ -2,147 +2,124 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeVar
+import dataclasses
+from typing import Any
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import inlined, njit
 from nav.rotation import rotation_coefficients
 from nav.samples import Array
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 UNKNOWN = np.full(3, np.nan)
+FIXED = 52  # numbers in a `State` of any size
+PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
 
 
-@dataclass
+@dataclasses.dataclass
 class InMotion:
     """What `nav.ahrs.any_motion` keeps in mind: velocity, accelerations, the magnetic field, rest."""
 
-    velocity_n: Array  # (2,) north and east, beside what airspeed tells
-    force_n: Array  # (2,) horizontal specific force, smoothed [m/s^2]
-    mean_force_n: Array  # (2,) its mean of the last seconds
-    force_variance: float  # about that mean, of one axis
-    turn_rate: float  # about the vertical, mean of the last seconds [rad/s]
-    rate_square: float  # of the rate about any axis, mean of the last seconds
-    excess: float  # of the square of the specific force over that of gravity, mean of the last seconds [m^2/s^4]
-    fields: int  # samples in `State.field_n` since the period began
-    sensor: str  # whose they are
-    field: Array  # (2,) level and downward part of what counts as the undisturbed field [T], NaN before the first
-    field_s: float  # for how long it has been learned
-    other: Array  # (2,) the same of a field that may replace it
-    other_s: float  # for how long that has been seen
-    quiet: int  # periods in a row
+    velocity_n: Array = dataclasses.field(
+        default_factory=lambda: np.zeros(2)
+    )  # north and east, beside what airspeed tells
+    force_n: Array = dataclasses.field(
+        default_factory=lambda: np.zeros(2)
+    )  # horizontal specific force, smoothed [m/s^2]
+    mean_force_n: Array = dataclasses.field(default_factory=lambda: np.zeros(2))  # its mean of the last seconds
+    force_variance: float = 0.0  # about that mean, of one axis
+    turn_rate: float = 0.0  # about the vertical, mean of the last seconds [rad/s]
+    rate_square: float = 0.0  # of the rate about any axis, mean of the last seconds
+    excess: float = 0.0  # of the square of the specific force over that of gravity, mean of the last seconds [m^2/s^4]
+    fields: int = 0  # samples in `State.field_n` since the period began
+    sensor: str = ""  # whose they are
+    field: Array = dataclasses.field(
+        default_factory=lambda: UNKNOWN[:2]
+    )  # level and downward part of the undisturbed field [T]
+    field_s: float = 0.0  # for how long it has been learned
+    other: Array = dataclasses.field(default_factory=lambda: UNKNOWN[:2])  # the same of a field that may replace it
+    other_s: float = 0.0  # for how long that has been seen
+    quiet: int = 0  # periods in a row
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""
-        return copied(self)
+        arrays: dict[str, Any] = {
+            name: value.copy() for name, value in vars(self).items() if isinstance(value, np.ndarray)
+        }
+        return dataclasses.replace(self, **arrays)
 
 
-@dataclass
 class State:
-    """Everything that moves. While levelling, n stands for the body axes at the first increment."""
+    """Everything that moves. While levelling, n stands for the body axes at the first increment.
 
-    levelled: bool
-    period_end: float  # [s]
-    mode_counter: int  # periods of low dynamics
-    correction_counter: int  # corrections since the last period that was none
-    shown: Array  # (3,) acceleration, yaw rate and roll rate that the last period was judged by, as `nav.motion.Motion`
+    The arrays are views of one, the ``whole``, which a kernel is handed, and finds them in (`parts`).
+    """
+
     q_nb: Array
-    x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
-    P: Array  # (n, n)
     gyro_bias: Array  # (3,) taken off the gyros
     air_velocity_n: Array  # (3,) at the start of the period, NaN when unknown
     field_n: Array  # (3,) sum of magnetic fields while levelling
+    shown: Array  # (3,) acceleration, yaw rate and roll rate that the last period was judged by, as `nav.motion.Motion`
+    counts: Array  # (3,) end of the period [s], periods of low dynamics, corrections since the last that was none
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
     turned: Array  # (3, 3) integral of C_nb since the last covariance step
     angle: Array  # (3,) integral of angular rate over the period, body axes
     force: Array  # (3,) integral of specific force over the period, n
     elapsed: Array  # (3,) seconds since the last covariance step, since the start of the period; increments since then
     sums: Array  # (3, 3) integrals over the period of specific force and of the squares of rate and of it, body axes
-    in_motion: InMotion
+    x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
+    P: Array  # (n, n)
+
+    def __init__(self, n: int, whole: Array, levelled: bool, in_motion: InMotion) -> None:
+        self.n, self.whole, self.levelled, self.in_motion = n, whole, levelled, in_motion
+        (
+            self.q_nb, self.gyro_bias, self.air_velocity_n, self.field_n, self.shown, self.counts, self.rates,
+            self.turned, self.angle, self.force, self.elapsed, self.sums, self.x, self.P,
+        ) = parts(whole, n)  # fmt: skip
 
     def copy(self) -> State:
         """The same in arrays of its own."""
-        return copied(self)
-
-    def present(self) -> State:
-        """The same, to be settled and handed out, but not propagated: what that changes or shows is its own."""
-        own = {name: getattr(self, name).copy() for name in ("shown", "q_nb", "x", "P", "turned", "elapsed")}
-        return State(**vars(self) | own)
-
-
-T = TypeVar("T", State, InMotion)
-_OWN = np.ndarray, InMotion  # of what a copy has its own
-
-
-def copied(state: T) -> T:
-    """The same in arrays of its own."""
-    values: list[Any] = [x.copy() if isinstance(x, _OWN) else x for x in vars(state).values()]
-    return type(state)(*values)
+        return State(self.n, self.whole.copy(), self.levelled, self.in_motion.copy())
 
 
 def fresh(period_end: float, n: int) -> State:
     """Nothing is known but when the levelling ends; ``n`` error states."""
-    return State(
-        levelled=False,
-        period_end=period_end,
-        mode_counter=0,
-        correction_counter=0,
-        shown=UNKNOWN.copy(),
-        q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
-        x=np.zeros(n),
-        P=np.zeros((n, n)),
-        gyro_bias=np.zeros(3),
-        air_velocity_n=UNKNOWN,
-        field_n=np.zeros(3),
-        rates=np.zeros((2, 3)),
-        turned=np.zeros((3, 3)),
-        angle=np.zeros(3),
-        force=np.zeros(3),
-        elapsed=np.zeros(3),
-        sums=np.zeros((3, 3)),
-        in_motion=InMotion(
-            velocity_n=np.zeros(2),
-            force_n=np.zeros(2),
-            mean_force_n=np.zeros(2),
-            force_variance=0.0,
-            turn_rate=0.0,
-            rate_square=0.0,
-            excess=0.0,
-            fields=0,
-            sensor="",
-            field=UNKNOWN[:2],
-            field_s=0.0,
-            other=UNKNOWN[:2],
-            other_s=0.0,
-            quiet=0,
-        ),
-    )
+    state = State(n, np.zeros(FIXED + n * (n + 1)), False, InMotion())
+    state.q_nb[0] = 1.0
+    state.air_velocity_n[:] = state.shown[:] = UNKNOWN
+    state.counts[PERIOD_END] = period_end
+    return state
 
 
+@njit
+def parts(
+    whole: Array, n: int
+) -> tuple[
+    Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array
+]:  # fmt: skip
+    """The parts of the ``whole`` of a `State` as views, in the order of the class."""
+    x = FIXED + n
+    return (
+        whole[:4], whole[4:7], whole[7:10], whole[10:13], whole[13:16], whole[16:19], whole[19:25].reshape(2, 3),
+        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:43], whole[43:FIXED].reshape(3, 3),
+        whole[FIXED:x], whole[x:].reshape(n, n),
+    )  # fmt: skip
+
+
+@inlined
 def transition(turned: Array, earth_n: Array, T: float) -> Array:
     """Rows of phi (3, 6) in the transition over ``T`` [s]: [I - [w_ie x] T, integral of C_nb] (equations 5, 6, 8)."""
-    north, east, down = (earth_n * T).tolist()
-    c_n, c_e, c_d = turned.tolist()
-    return np.array([[1.0, down, -east, *c_n], [-down, 1.0, north, *c_e], [east, -north, 1.0, *c_d]])
-
-
-def covariance_step(s: State, whole: Array, half_noise: Array) -> None:
-    """Take error states and covariance through the transition ``whole`` (n, n), and begin the next.
-
-    ``half_noise`` (n,) is half of the variance that comes in, which it does before and after, as in `kalman.predict`.
-    """
-    variances = s.P.ravel()[:: len(s.x) + 1]
-    s.x[:] = whole @ s.x
-    variances += half_noise
-    s.P[:] = whole @ s.P @ whole.T
-    variances += half_noise
-    s.P += s.P.T.copy()
-    s.P *= 0.5
-    s.turned[:] = 0.0
-    s.elapsed[0] = 0.0
+    north, east, down = earth_n[0] * T, earth_n[1] * T, earth_n[2] * T
+    rows = np.zeros((3, STATES))
+    rows[0, 0] = rows[1, 1] = rows[2, 2] = 1.0
+    rows[0, 1], rows[0, 2], rows[1, 2] = down, -east, north
+    rows[1, 0], rows[2, 0], rows[2, 1] = -down, east, -north
+    for i in range(3):
+        for j in range(3):
+            rows[i, BIAS + j] = turned[i, j]
+    return rows
 
 
 @njit

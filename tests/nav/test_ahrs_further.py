@@ -11,6 +11,7 @@ from worlds.ahrs import DEG, DEGPH, DT, GUST_S, MG, PAPER, TURN, fly, imu, level
 
 from nav.ahrs import STATES, Ahrs
 from nav.ahrs.further import FurtherStates
+from nav.earth import OMEGA_IE
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
 from nav.motion import LowDynamics
@@ -65,6 +66,31 @@ def test_gusts_stay_as_strong_as_they_are_while_nobody_looks(T):
     state = filter_._state.copy()
     filter_._settle(state)
     np.testing.assert_allclose(np.sqrt(np.diag(state.P))[STATES:], filter_.further.sigma, rtol=1e-9)
+
+
+def test_a_step_against_dense_matrices():
+    """P <- T (P + Q/2) T' + Q/2, x <- T x, with T of the turn, of the misaligned gyros and of gusts that fade."""
+    filter_, rng = Ahrs(MISALIGNED), np.random.default_rng(1)
+    filter_.start(0.0, np.array([1.0, 0, 0, 0]))
+    state, n = filter_._state, STATES + 8
+    root = rng.normal(size=(n, n))
+    turned, x, P, T = rng.normal(size=(3, 3)), rng.normal(size=n), root @ root.T, 0.7
+    state.turned[:], state.x[:], state.P[:], state.elapsed[:], state.angle[2] = turned, x, P, (T, 0.9, 180), 0.3
+    earth_n = np.array([math.cos(PAPER.lat), 0.0, -math.sin(PAPER.lat)]) * OMEGA_IE
+    whole, Q = np.eye(n), np.zeros(n)
+    whole[:3, :3] += np.cross(np.eye(3), earth_n).T * T
+    whole[:3, 3:6] = turned
+    whole[:3, 6:9] = turned * 0.3 / 0.9
+    whole[12:, 12:] *= (kept := math.exp(-T * filter_.further.decay_rate[-1]))
+    model = MODELLED.imu
+    Q[:3], Q[3:6] = model.gyro_noise**2 * T, model.gyro_bias_walk**2 * T
+    Q[12:] = 2 * filter_.further.sigma[-1] ** 2 * (1 - kept**2) / (1 + kept**2)
+    filter_._settle(state)
+    np.testing.assert_allclose(state.x, whole @ x, rtol=1e-12)
+    np.testing.assert_allclose(state.P, whole @ (P + np.diag(Q) / 2) @ whole.T + np.diag(Q) / 2, rtol=1e-12, atol=1e-13)
+    np.testing.assert_array_equal(state.P, state.P.T)
+    assert not state.turned.any()
+    assert state.elapsed[0] == 0
 
 
 def test_force_columns_against_finite_differences():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from worlds.ins import CONSUMER, DT, FIELD_N, airspeed, barometer, flight, gnss, imu, magnetometer
 
+from nav.ahrs import Ahrs, AhrsConfig, AnyMotion
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, PositionFixAid
 from nav.detection import ChiSquare, Eraim
 from nav.federated import Federated
@@ -13,7 +14,8 @@ from nav.federation import Config, Local
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.monitor import MonitoredAid
-from nav.samples import FixType, ImuSamples, PositionSample
+from nav.motion import LowDynamics
+from nav.samples import FixType, ImuSamples, Outcome, PositionSample
 
 ARM = (0.5, 0.1, -0.3)
 AIDS = (
@@ -196,6 +198,71 @@ def test_so_does_a_federation(change, detector):
         assert all(
             same(x.suspected, y.suspected) for x, y in zip(a.monitors.values(), b.monitors.values(), strict=True)
         )
+
+
+LOOSE = LowDynamics(1.0, 0.1, 0.1)  # this flight is level now and then
+ATTITUDE = AhrsConfig(CONSUMER, 0.83, aids=("magnetometer",), motion=LOOSE, gyro_bias_feedback=True, phi_limit=0.01)
+THREE = ("magnetometer", "airspeed", "barometer")
+FURTHER = {"gyro_misalignment_sigma": 3e-3, "accel_bias_sigma": 0.03, "gust_sigma": 0.2}
+
+
+@pytest.mark.parametrize(
+    ("change", "offset_s", "spoilt", "advised"),
+    [
+        ({}, 0.0, False, False),
+        ({}, 0.0123, True, False),
+        ({"aids": THREE}, 0.0, True, True),
+        ({"aids": THREE[1:], "heading": 1.0, "compensated_motion": LowDynamics(2.0, 1.0, 1.0)}, 0.0123, True, False),
+        ({"aids": THREE, **FURTHER, "period_s": 0.37, "gyro_bias_feedback": False}, 0.0, True, False),
+        ({"aids": ()}, 0.0, True, False),
+        ({"motion": LowDynamics(4.0, 0.3, 0.3, "vector"), "correction_sigma": 1e-4}, 0.0, False, False),
+        ({"any_motion": AnyMotion(), "period_s": 0.2}, 0.0, True, False),
+        ({"correction": lambda phi, limit: 0.5 * phi}, 0.0, False, False),
+    ],
+)
+def test_so_does_an_attitude_filter(change, offset_s, spoilt, advised):
+    config = dataclasses.replace(ATTITUDE, **change)
+    times = np.arange(0.1, DURATION - 1, 0.1).tolist()
+    results = []
+    for one_by_one, block_s in ((True, 1.0), (False, 1.0), (False, 7.3)):
+        increments, samples = sound()
+        if spoilt:
+            samples = rough(increments, samples)
+        samples = [
+            dataclasses.replace(
+                s, t=s.t + offset_s, t_arrival=s.t_arrival + offset_s + 0.3 * within(s, s.sensor, 80, 81)
+            )
+            for s in samples
+        ]
+        ahrs = Ahrs(config, FIELD_N)
+        if advised:
+            ahrs.flight_control(increments.t, np.sin(increments.t) < 0.5)
+        results.append(run(one_by_one, ahrs, increments, samples, block_s, times))
+    (reports, estimates, ahrs), *others = results
+    assert ahrs.aligned
+    assert ahrs.in_steps is not ({"any_motion", "correction"} & change.keys() != set())
+    assert sum(report.aid == "level" for report in reports) > 10
+    assert (Outcome.UNSOUND in {report.outcome for report in reports}) is bool(config.aids)
+    for some, told, other in others:
+        assert len(some) == len(reports)
+        assert len(told) == len(estimates)
+        assert all(map(same, reports, some))
+        assert all(map(same, estimates, told))
+        assert same(ahrs._state.whole, other._state.whole)
+        assert same(ahrs._airspeed.numbers, other._airspeed.numbers)
+
+
+def test_an_attitude_filter_takes_a_sound_flight_at_once():
+    increments, samples = sound()
+    ahrs = Ahrs(dataclasses.replace(ATTITUDE, aids=THREE), FIELD_N)
+    horizon, updates = FusionHorizon(ahrs, lag_s=0.1), []
+    cut = round(30 / DT)
+    for rows in (slice(0, cut), slice(cut, None)):
+        block = ImuSamples(*(getattr(increments, name)[rows] for name in ("t", "dt", "dtheta", "dv")))
+        horizon.push(block, [s for s in samples if block.t[0] - DT < s.t <= block.t[-1]])
+        ahrs.update = lambda sample: updates.append(sample) or []
+    assert ahrs.t == increments.t[-1] - 0.1
+    assert not updates
 
 
 def test_most_of_a_sound_flight_is_taken_at_once():
