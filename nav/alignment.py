@@ -18,7 +18,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
-from nav.aids.gnss import has_velocity
+from nav.aids.gnss import WHITE_SHARE, has_velocity
 from nav.aids.magnetometer import FIELD_SIZE
 from nav.earth import displacement_n, earth_rate_n, gravity, radii, transport_rate_n, wrap_longitude
 from nav.error_model import CROSS, MOTION, PHI, POS, VEL, ErrorModel, ImuModel
@@ -327,7 +327,7 @@ class Alignment:
         C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
         J = [_attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, which) for which in range(4)]
 
-        variance_v = np.diag(fix.sigma_velocity_n**2)
+        variance_v = np.diag(_whole(fix.sigma_velocity_n, self.aids.gnss_velocity))
         up = dv_n / np.linalg.norm(dv_n)
         gyro_turn = (self.imu.gyro_bias_sigma * T) ** 2 + self.imu.gyro_noise**2 * T
         P = np.zeros((MOTION, MOTION))
@@ -339,10 +339,11 @@ class Alignment:
             + heading.heading_sigma**2 * np.outer(up, up)
             + gyro_turn * np.eye(3)
         )
-        P[phi, vel] = J[_DV_N] @ variance_v
+        # Slow errors are in both fixes alike: a tilt goes with what is left of the last one.
+        P[phi, vel] = J[_DV_N] @ (variance_v - np.diag(self.aids.gnss_velocity**2))
         P[vel, phi] = P[phi, vel].T
         P[vel, vel] = variance_v
-        P[pos, pos] = np.diag(fix.sigma_position_n**2)
+        P[pos, pos] = np.diag(_whole(fix.sigma_position_n, self.aids.gnss_position))
 
         # Every estimated error is zero, so its error is minus what it is: hence the signs.
         correlated = {name: np.zeros((MOTION, 3)) for name in ("gnss_position_error", "gnss_velocity_error")}
@@ -367,6 +368,15 @@ class Alignment:
             covariance=P,
             correlated=correlated,
         )
+
+
+def _whole(reported: Array, correlated: Array) -> Array:
+    """Variances (3,) of what a receiver says to be as good as ``reported`` (3,), ``correlated`` (3,) being slow errors.
+
+    A receiver may claim to be better than its slow errors are told to be. What begins at its fix has both them and its
+    white noise (`nav.aids.gnss.white`): with less, and correlated with them, it would be no covariance.
+    """
+    return np.maximum(reported**2, correlated**2 + WHITE_SHARE * reported**2)
 
 
 def _triad(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array) -> Array:

@@ -208,3 +208,32 @@ def test_a_receiver_without_velocity_aligns_slower_and_claims_less():
     assert 0.5 < sigma[3] < 5.0
     assert np.linalg.norm(error(estimates[-1], truth)[:3]) < 5.0
     assert ins.problem == ""
+
+
+@pytest.mark.parametrize("says", [0.02, 0.5, 0.95, 1.0, 3.0])
+def test_a_receiver_that_claims_less_than_its_slow_errors_begins_with_a_covariance(says):
+    """As receivers of today do: by what they say of position and velocity, over what slow errors are told to be."""
+    truth, rng = flight(30), np.random.default_rng(3)
+    increments_, _, _ = imu(truth, CONSUMER, rng)
+    slow_p, slow_v = np.array([1.0, 1.0, 2.4]), np.full(3, 0.1)
+    aid = GnssAid(position_error_sigma=tuple(slow_p), velocity_error_sigma=tuple(slow_v))
+    ins = Ins(InsConfig(CONSUMER, (aid, COMPASS)), lambda *_: FIELD_N)
+    horizon = FusionHorizon(ins)
+    samples = [
+        replace(one, sigma_position_n=says * slow_p, sigma_velocity_n=says * slow_v)
+        for one in gnss(truth, rng, 4.0, sigma_v=0.02)
+    ]
+    samples += magnetometer(truth, rng, np.zeros(3))
+    reports = []
+    for k in range(60):
+        rows = slice(50 * k, 50 * k + 50)
+        block = ImuSamples(increments_.t[rows], increments_.dt[rows], increments_.dtheta[rows], increments_.dv[rows])
+        reports += horizon.push(block, [s for s in samples if 0.25 * k - 1e-6 <= s.t < 0.25 * (k + 1) - 1e-6])
+        if ins.aligned:
+            P = ins._state.P[0]
+            sigma = np.sqrt(np.diag(P))
+            known = sigma > 0
+            correlation = P[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])
+            assert np.linalg.eigvalsh(correlation)[0] > -1e-9
+    assert len(reports) > 50
+    assert np.isfinite([one.nis for one in reports]).all()
