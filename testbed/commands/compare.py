@@ -32,10 +32,11 @@ Folder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for report.htm
 def compare(runs: Compared, out: Folder = RUNS / "compare", force: Force = False) -> None:
     """Show runs beside each other (builds, settings, seeds), or the estimators of one, and which differences count."""
     from testbed.report import compare as pages
+    from testbed.report import differences
 
     found = [_case(path, name) for path, name in zip(runs, _names(runs), strict=True)]
     cases = [case for case, _ in found]
-    blocks = pages.blocks(cases)
+    blocks = differences.blocks(cases)
     for block in blocks:
         console().print(pages.console_table(block))
     if not blocks:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from testbed.report import interactive, tables
+from testbed.report import differences, interactive, tables
 from testbed.report.figures import CHAPTERS
 from testbed.report.interactive.contents import events
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
+from testbed.score.differences import Case
 from testbed.score.remarks import remarks
 
 if TYPE_CHECKING:
@@ -89,6 +90,8 @@ def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
     """What the page says beside its figures."""
     attributes = run.dataset.attrs
     contents = interactive.contents([interactive.Shown("", run)])
+    summary = tables.summary(metrics)
+    beside = Case("", summary.names, [(0, metrics)])
     return {
         "contents": contents,
         "script": script_of(contents),
@@ -97,7 +100,8 @@ def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "seed": attributes.get("seed", ""),
         "complete": bool(attributes.get("complete", 1)),
         "remarks": remarks(run.dataset, metrics),
-        "summary": tables.summary(metrics),
+        "summary": summary,
+        "against": differences.told(differences.blocks([beside])),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),
         "events": [(t, f"{t:.1f} s", how, what) for t, how, what in events(run)],

@@ -23,7 +23,10 @@ SIGNIFICANT = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Runs that are alike but for their seeds: for each, its seed and its metrics. ``estimators`` are those of all."""
+    """Runs that are alike but for their seeds: for each, its seed and its metrics. ``estimators`` are those of all.
+
+    Without a ``name`` its estimators go by their own.
+    """
 
     name: str
     estimators: Sequence[str]
@@ -46,7 +49,7 @@ class Side:
     estimator: str
 
     def __str__(self) -> str:
-        return f"{self.case.name}: {self.estimator}"
+        return f"{self.case.name}: {self.estimator}" if self.case.name else self.estimator
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,12 +19,13 @@ from worlds.synthetic_run import Errors, circle, scenario
 from nav.samples import Outcome
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
-from testbed.report import campaign_figures, style, tables
+from testbed.report import campaign_figures, differences, style, tables
 from testbed.report import page as report
 from testbed.report.figures import consistency, imu
 from testbed.report.run import Run
 from testbed.results import start_anew
 from testbed.score import metrics
+from testbed.score.differences import Case
 from testbed.sensors.faults import FaultTruth
 
 DENIED = ((40.0, 70.0),)
@@ -292,3 +293,14 @@ def test_whiskers_are_where_the_caption_says() -> None:
     campaign_figures._boxes(axes, [errors, []], "#123456")
     ends = [line.get_ydata() for line in axes.get_lines() if len(line.get_ydata()) == 2]
     assert {np.percentile(errors, 5), np.percentile(errors, 95)} <= {float(y) for own in ends for y in own}
+
+
+def test_a_page_tells_which_estimator_is_better_than_the_first() -> None:
+    worse, better = "position_horizontal_rms_m", "heading_rms_deg"
+    found = {f"ins.{worse}": 1.0, f"other.{worse}": 3.0, f"ins.{better}": 2.0, f"other.{better}": 1.0}
+    case = Case("", ["ins", "other"], [(0, found)])
+    ((block, rows),) = differences.told(differences.blocks([case]))
+    assert block.head[1:3] == ("ins", "other")
+    assert (block.count("better"), block.count("worse")) == (1, 1)
+    assert [cells[3:5] for _, cells in rows] == [["+200.0 %", "worse"], ["-50.0 %", "better"]]
+    assert block.note == differences.ALONE
