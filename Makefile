@@ -6,6 +6,8 @@ CLIENTS := .venv-clients
 LOWEST := .venv-lowest
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-emit-index-url
 export OPENBLAS_NUM_THREADS ?= 1
+# Hundreds of tests start a process of their own, and each would compile every module that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test test-ci test-all lint bench docs wheel-test setup lock clean
 
