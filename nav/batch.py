@@ -123,6 +123,7 @@ class Batch:
                     told.append([*plain[1], *[0.0] * (LIMITS + 2 - len(plain[1]))])
         self._first = np.array(first, np.int64)
         self._kinds, self._told = np.array(kinds, np.int64).reshape(-1, 8), np.array(told).reshape(-1, LIMITS + 2)
+        self._wholes = np.empty((0, 0))  # states on the way to estimates, many times as long as these: used again
 
     def take(
         self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Sequence[Step], ahead: Increments,
@@ -139,7 +140,9 @@ class Batch:
         imu, (common, filters, n) = ahead.imu, state.shape
         told = np.empty((2 * len(plan), REPORT))
         asked = np.count_nonzero(plan[:, WHAT] == ESTIMATE)
-        wholes, when = np.empty((asked, len(state.whole))), np.empty((asked, 2))
+        if len(self._wholes) < asked:
+            self._wholes = np.empty((asked, len(state.whole)))
+        wholes, when = self._wholes[:asked], np.empty((asked, 2))
         done = Done(
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,

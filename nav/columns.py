@@ -53,6 +53,14 @@ class FusedReports(Sequence[UpdateReport]):
         S = self.S[k, : m * m].reshape(m, m)
         return UpdateReport(float(self.t[k]), sensor, aid, self.innovation[k, :m], S, *numbers, 1.0, Outcome.FUSED)
 
+    def part(self, first: int, last: int) -> FusedReports:
+        """Those from the first to before the last, as columns."""
+        own = slice(first, last)
+        return FusedReports(
+            self.kinds, self.kind[own], self.t[own], self.innovation[own], self.S[own], self.nis[own],
+            self.threshold[own],
+        )  # fmt: skip
+
     def by_kind(self) -> Iterator[FusedReports]:
         """Those of one kind after the other, as columns of as many numbers as it has."""
         for number, (sensor, aid, m) in enumerate(self.kinds):
@@ -194,8 +202,9 @@ class Estimates(Sequence[Estimate]):
     def __getitem__(self, which: int | slice | Sequence[int]) -> Estimate | Estimates:
         """One of them, or those of a slice or of a list of indices."""
         if not isinstance(which, int):
-            columns = {name: getattr(self, name)[which] for name in (*_NUMBERS, *VECTORS)}
-            return Estimates(**columns, extra={name: (x[which], s[which]) for name, (x, s) in self.extra.items()})
+            rows = which if isinstance(which, slice) else np.asarray(which, int)  # once for all columns
+            columns = {name: getattr(self, name)[rows] for name in (*_NUMBERS, *VECTORS)}
+            return Estimates(**columns, extra={name: (x[rows], s[rows]) for name, (x, s) in self.extra.items()})
         k = range(len(self))[which]
         extra = {name: (x[k], sigma[k]) for name, (x, sigma) in self.extra.items()}
         for name, (x, sigma) in self.extra.items():

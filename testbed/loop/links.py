@@ -7,11 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+import numpy as np
+import numpy.typing as npt
+
+from nav.columns import Estimates, FusedReports
+from nav.samples import Array, ImuSamples, Sample, UpdateReport
 from testbed.errors import UserError
 from testbed.estimators.section import EstimatorSection
 from testbed.loop.requests import Request
-from testbed.motion.table import TruthBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,10 +27,41 @@ class Progress:
     activity: str
 
 
-class Publisher(Protocol):
-    """Whoever watches a run: handed plain data every ``period_s`` of simulated time.
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """An estimator beside the shown one: ``at`` (N,) says which of its estimates is of which row, -1 where none is."""
 
-    ``others_every`` says at which calls it looks at the estimators beside the shown one: the first and each so many.
+    name: str
+    at: npt.NDArray[np.intp]
+    estimates: Estimates
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """N rows of a run, one after the other, and what became known by each.
+
+    ``ticks`` (N,) are their numbers; ``truth`` are columns of `testbed.motion.table.COLUMNS` at them, ``estimates``
+    those of the shown estimator, ``imu`` increments up to the last row or beyond. ``samples`` are those that arrived,
+    in their order, and ``reports`` the shown estimator's updates, each after the number of the row by which it was
+    there: for a stretch of reports (M,) of them.
+    """
+
+    ticks: npt.NDArray[np.int64]
+    truth: Mapping[str, Array]
+    estimates: Estimates
+    imu: ImuSamples | None
+    others: Sequence[Beside]
+    samples: Sequence[tuple[int, Sample]]
+    reports: Sequence[tuple[npt.NDArray[np.intp], UpdateReport | FusedReports]]
+
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+
+class Publisher(Protocol):
+    """Whoever watches a run: handed rows of it that are ``period_s`` of simulated time apart.
+
+    ``others_every`` says at which rows it looks at the estimators beside the shown one: the first and each so many.
     ``asks`` says whether it may ever ask for something; without, `requests` is not called.
     """
 
@@ -35,18 +69,8 @@ class Publisher(Protocol):
     others_every: int
     asks: bool
 
-    def publish(
-        self,
-        truth: TruthBlock,
-        estimate: Estimate,
-        samples: Mapping[str, Sample],
-        imu: ImuSamples | None,
-        others: Sequence[tuple[str, Estimate]],
-        reports: Sequence[UpdateReport],
-    ) -> None:
-        """One row of truth; the shown estimator's estimate and its reports since the last call; the newest sample of
-        each sensor; increments up to the row or beyond; the other estimators' estimates, where they are looked at.
-        """
+    def publish(self, rows: Stretch) -> None:
+        """The next rows, as many as are known: one when the run keeps to the clock, some seconds of it when not."""
         ...
 
     def requests(self) -> Sequence[Request]:

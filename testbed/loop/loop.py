@@ -6,18 +6,17 @@ Data goes one way; what is heard from downstream are requests (`testbed.loop.req
 from __future__ import annotations
 
 import gc
-import heapq
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from nav.columns import Estimates, FusedReports, Reports
-from nav.samples import Estimate, Sample, Status, UpdateReport
+from nav.columns import Estimates
+from nav.samples import Sample, Status
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -31,6 +30,7 @@ from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
 from testbed.loop.requests import Recorded, Request
 from testbed.loop.settings import Parts
+from testbed.loop.showing import Arrivals, Backlog, Showing
 from testbed.motion.table import MotionSource
 from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
@@ -42,7 +42,8 @@ from testbed.sensors.imu import ImuConfig
 if TYPE_CHECKING:
     import xarray
 
-BATCH_S = 5.0  # simulated time per turn of the loop when nobody is watching
+BATCH_S = 20.0  # simulated time per turn of the loop when nobody can interfere
+HEARD_S = 5.0  # and when somebody can, or with another's motion: as much is lost when that breaks
 PACED_S = 0.1  # and when it keeps to the clock, or a far end follows
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REHEARSAL_S = 5.0  # that an estimator aligns in
@@ -197,7 +198,8 @@ class _Passage:
         others = publish * math.gcd(*(link.others_every for link in setup.links))
         events = max(1, round(EVENTS_S * rate_hz))
         self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), events, publish, others)
-        self.batch = round((BATCH_S if setup.far_end is None else PACED_S) * rate_hz)
+        alone = BATCH_S if setup.source is None and not director.listens else HEARD_S
+        self.batch = round((alone if setup.far_end is None else PACED_S) * rate_hz)
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
         self.lanes = setup.build(_own(scenario, setup.far_end), scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
@@ -207,13 +209,16 @@ class _Passage:
         ending.callback(self.recorder.close)
         self.told = Listeners(setup.links, setup.progress, scenario.duration_s, self.recorder.event)
         self.recorder.attributes |= self.feed.origin
-        self.watch = EventWatch.of(self.told.emit, self.feed.faults.truth, scenario)
+        self.watch = EventWatch.of(self._emit, self.feed.faults.truth, scenario)
         self.leg_names = scenario.leg_names
         plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)
         director.begin(Executor(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
-        self.latest = _Latest()
-        self.arrived: list[Sample] = []  # not looked at for events
-        self.backlog = {name: _Backlog(self._behind(one)) for name, one in self.lanes.items()}
+        self.arrivals = Arrivals()
+        self.arrived: deque[Sample] = deque()  # not looked at for events
+        behind = {name: self._behind(one) for name, one in self.lanes.items()}
+        self.backlog = {name: Backlog(one) for name, one in behind.items()}
+        self.showing = Showing(setup.links, publish, behind[setup.shown] if setup.shown else 0.0)
+        self.row = 0  # of the turn, that is looked at for events
         self.ended: set[str] = set()  # estimators that have ended by an error of their own
 
     def _behind(self, lane: Lane) -> float:
@@ -232,22 +237,16 @@ class _Passage:
             return False
         if self.tick == 0 and self.setup.out is not None:
             start_anew(self.setup.out, [RECORD])  # from here on what an earlier run left there would not fit the record
-        for own in turn.samples.values():
-            self.latest.add(own)
         rows = self.cadence.rows(self.tick, len(block))
         fewer = self.cadence.rows(self.tick, len(block), shown=False)
         wanted = {name: rows if name in (self.setup.shown, *turn.tracked) else fewer for name in self.lanes}
         tracked = {name: self._track(name, turn, block.t[wanted[name]].tolist()) for name in self.lanes}
         self._record(turn)
         recorded = range(-self.tick % self.cadence.record, len(block), self.cadence.record)
-        shown = (
-            range(-self.tick % self.cadence.publish, len(block), self.cadence.publish) if self.cadence.publish else ()
-        )
-        told = {name: _Told.of(tracked[name].estimates, wanted[name], shown) for name in self.lanes}
+        told = {name: _Told.of(tracked[name].estimates, wanted[name]) for name in self.lanes}
         for name, one in told.items():
             self.recorder.estimates(name, one.of_rows(recorded))
-        for k in rows:
-            self._hand_out(turn, tracked, told, k)
+        self._hand_out(turn, tracked, told)
         self.tick += len(block)
         t = float(block.t[-1])
         if self.director.pacer is not None:
@@ -257,7 +256,7 @@ class _Passage:
 
     def _track(self, name: str, turn: Turn, times: Sequence[float]) -> Tracked:
         """What one estimator makes of a turn, with its reports recorded."""
-        lane, backlog = self.lanes[name], self.backlog[name]
+        lane = self.lanes[name]
         if name in turn.tracked:
             tracked = turn.tracked[name]
         else:
@@ -266,10 +265,7 @@ class _Passage:
             tracked = lane.track(commanded(turn.reference), turn.imu, turn.samples, times)
         self.recorder.reports(name, tracked.votes)
         self.recorder.reports(name, tracked.reports.pieces)
-        backlog.votes.extend(tracked.votes)
-        backlog.unread.add(tracked.reports)
-        if self.setup.links and name == self.setup.shown:
-            backlog.unshown.add(tracked.reports)
+        self.backlog[name].add(tracked.votes, tracked.reports)
         if lane.failure and name not in self.ended:
             self.ended.add(name)
             self.told.emit(float(turn.reference.t[-1]), "error", f"{name} has ended: {lane.failure}")
@@ -286,32 +282,39 @@ class _Passage:
             self.recorder.samples(name, own)
         self.recorder.steered(turn.steered)
 
-    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], told: Mapping[str, _Told], k: int) -> None:
-        """Row ``k`` of a turn, with what estimators that were asked told: events, links."""
-        t = float(turn.reference.t[k])
-        self.arrived += self.latest.until(t)
-        if (self.tick + k) % self.cadence.events == 0:
-            self._look(t, float(turn.reference.leg[k]), told, k)
-        shown = self.setup.shown
-        if self.cadence.publish and (self.tick + k) % self.cadence.publish == 0 and shown is not None:
-            due = self.backlog[shown].shown_until(t)
-            now = [(name, one.shown[k]) for name, one in told.items() if name != shown and k in one.shown]
-            row = turn.reference.rows(k, k + 1)
-            for link in self.setup.links:
-                link.publish(row, told[shown].shown[k], self.latest.by_sensor, tracked[shown].increments, now, due)
+    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], told: Mapping[str, _Told]) -> None:
+        """The rows of a turn, with what estimators that were asked told: to who looks for events, and to links."""
+        block, shown = turn.reference, self.setup.shown
+        for own in turn.samples.values():
+            self.arrivals.add(own)
+        arrived = self.arrivals.until(float(block.t[-1]))
+        self.arrived += arrived
+        if self.cadence.publish and shown is not None:
+            own_rows = told[shown].at, told[shown].estimates, tracked[shown].increments
+            others = {name: (one.at, one.estimates) for name, one in told.items() if name != shown}
+            self.showing.hear(arrived, tracked[shown].reports)
+            self.showing.begin(self.tick, block, own_rows, others)
+        for row in range(-self.tick % self.cadence.events, len(block), self.cadence.events):
+            self.row = row
+            self._look(float(block.t[row]), float(block.leg[row]), told, row)
+        self.showing.until(len(block))
+
+    def _emit(self, t: float, severity: str, text: str) -> None:
+        """Tell and record an event, after the rows before it."""
+        self.showing.until(self.row)
+        self.told.emit(t, severity, text)
 
     def _look(self, t: float, leg: float, told: Mapping[str, _Told], k: int) -> None:
         """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
-            self.told.emit(*event)
-        for sample in self.arrived:
-            self.watch.sample(sample)
-        self.arrived.clear()
+            self._emit(*event)
+        while self.arrived and self.arrived[0].t_arrival <= t:
+            self.watch.sample(self.arrived.popleft())
         self.watch.row(t, leg, self.leg_names)
         for name, one in told.items():
             if k in one.at:
                 self.watch.estimate(name, *one.aligned[one.at[k]])
-            for report in self.backlog[name].read_until(t, self.watch):
+            for report in self.backlog[name].until(t, lambda: self.watch.heeds_fused):
                 self.watch.report(name, report)
 
     def conclude(self) -> list[str]:
@@ -367,22 +370,18 @@ class _Passage:
 
 
 class _Told(NamedTuple):
-    """What an estimator told in a turn: where each row of the turn is among it; time, and whether it is aligned; and
-    what links are shown, by row.
-    """
+    """What an estimator told in a turn, and where each row of the turn is among it; time, and whether it is aligned."""
 
     estimates: Estimates
     at: dict[int, int]
     aligned: list[tuple[float, bool]]
-    shown: dict[int, Estimate]
 
     @classmethod
-    def of(cls, estimates: Estimates, rows: Sequence[int], shown: Sequence[int]) -> _Told:
-        """Of the ``rows`` that were wanted, and of those that are ``shown``."""
+    def of(cls, estimates: Estimates, rows: Sequence[int]) -> _Told:
+        """Of the ``rows`` that were wanted."""
         aligned = (estimates.status & Status.ALIGNED).astype(bool)
         at = {row: k for k, row in enumerate(rows)}
-        own = {row: estimates[at[row]] for row in shown if row in at}
-        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)), own)
+        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)))
 
     def of_rows(self, rows: Sequence[int]) -> Estimates:
         """Those of some rows."""
@@ -392,76 +391,3 @@ class _Told(NamedTuple):
 def _own(scenario: Scenario, far_end: FarEnd | None) -> tuple[EstimatorSection, ...]:
     """The estimators that do not run in the far end."""
     return tuple(one for one in scenario.estimator if far_end is None or one.name not in far_end.estimators)
-
-
-class _Backlog:
-    """Reports of one estimator that have not been handed on: ``behind`` [s] is how long after a sample it is used."""
-
-    def __init__(self, behind: float) -> None:
-        self._behind = behind
-        self.votes: deque[UpdateReport] = deque()  # on redundant units, not looked at for events
-        self.unread = _Waiting()  # on samples, neither
-        self.unshown = _Waiting()  # that the links have not been given
-
-    def read_until(self, t: float, watch: EventWatch) -> Iterator[UpdateReport]:
-        """Those to be looked at for events at ``t``, as far as the ``watch`` heeds them."""
-        while self.votes and not self.votes[0].t > t:
-            yield self.votes.popleft()
-        yield from self.unread.until(t - self._behind, lambda: watch.heeds_fused)
-
-    def shown_until(self, t: float) -> list[UpdateReport]:
-        """Those that links are given at ``t``."""
-        return [*self.unshown.until(t - self._behind)]
-
-
-class _Waiting:
-    """Reports that wait for their time, in their order."""
-
-    def __init__(self) -> None:
-        self._pieces: deque[tuple[UpdateReport | FusedReports, list[float]]] = deque()  # with their times
-        self._used = 0  # of the first piece
-
-    def add(self, reports: Reports) -> None:
-        """Some more of them."""
-        for piece in reports.pieces:
-            self._pieces.append((piece, piece.t.tolist() if isinstance(piece, FusedReports) else [piece.t]))
-
-    def until(self, t: float, fused: Callable[[], bool] = lambda: True) -> Iterator[UpdateReport]:
-        """Remove and give those on samples up to a time, of `FusedReports` only while these are asked for."""
-        while self._pieces:
-            (piece, times), first = self._pieces[0], self._used
-            while self._used < len(times) and not times[self._used] > t:  # a time may be NaN
-                self._used += 1
-            last, ended = self._used, self._used == len(times)
-            if ended:
-                self._pieces.popleft()
-                self._used = 0
-            if not isinstance(piece, FusedReports):
-                yield from (piece,) * (last - first)
-            elif last > first and fused():
-                yield from piece[first:last]
-            if not ended:
-                return
-
-
-class _Latest:
-    """The newest sample of each sensor that has arrived by a time, however far ahead the sensors were computed."""
-
-    def __init__(self) -> None:
-        self.by_sensor: dict[str, Sample] = {}
-        self._pending: list[tuple[float, int, Sample]] = []
-        self._count = 0
-
-    def add(self, samples: Sequence[Sample]) -> None:
-        for sample in samples:
-            heapq.heappush(self._pending, (sample.t_arrival, self._count, sample))
-            self._count += 1
-
-    def until(self, t: float) -> list[Sample]:
-        """Samples that arrive up to ``t``, in order of arrival."""
-        arrived = []
-        while self._pending and self._pending[0][0] <= t:
-            sample = heapq.heappop(self._pending)[2]
-            self.by_sensor[sample.sensor] = sample
-            arrived.append(sample)
-        return arrived

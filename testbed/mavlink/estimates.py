@@ -8,11 +8,12 @@ from functools import cache
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from nav.earth import SEA_LEVEL_DENSITY, STANDARD_GRAVITY, pressure_altitude
-from nav.rotation import dcm_from_quat, skew
+from nav._jit import njit
+from nav.earth import SEA_LEVEL_DENSITY, STANDARD_GRAVITY
+from nav.rotation import dcm_from_quat, dot, skew
 from nav.samples import Array, Status
 from testbed.mavlink.encode import Fields, latitudes_e7, longitudes_e7
-from testbed.mavlink.snapshot import ATTITUDE, POSITION, VELOCITY, Rows, Snapshot, root
+from testbed.mavlink.snapshot import ATTITUDE, DOWN, POSITION, VELOCITY, Rows, Snapshot, root
 
 TERRAIN_UNKNOWN = -10000.0  # ALTITUDE: below -1000 means unknown
 _UPPER = np.flatnonzero(np.triu(np.ones((6, 6))))  # upper right triangle of 6 x 6, row by row
@@ -88,16 +89,15 @@ def vfr_hud(r: Rows) -> Fields:
     }
 
 
-def altitude(s: Snapshot) -> Fields | None:
+def altitude(r: Rows) -> Fields:
     """Estimated height, and the barometer's own for the one that never jumps."""
-    if s.point is None or s.local_n is None:
-        return None
+    up = -r.local_n[:, 2]
     return {
-        "time_usec": s.usec,
-        "altitude_monotonic": pressure_altitude(s.pressure) if s.pressure > 0 else math.nan,
-        "altitude_amsl": s.point[2],
-        "altitude_local": -s.local_n[2],
-        "altitude_relative": -s.local_n[2],
+        "time_usec": r.usec,
+        "altitude_monotonic": r.pressure_altitude,
+        "altitude_amsl": r.point[:, 2],
+        "altitude_local": up,
+        "altitude_relative": up,
         "altitude_terrain": TERRAIN_UNKNOWN,
         "bottom_clearance": -1,  # no measurement
     }
@@ -105,9 +105,9 @@ def altitude(s: Snapshot) -> Fields | None:
 
 def wind_cov(s: Snapshot) -> Fields | None:
     """Estimated wind, from an estimator that has wind states."""
-    if "wind" not in s.estimate.extra or s.point is None:
+    if s.wind is None or s.point is None:
         return None
-    wind, sigma = s.estimate.extra["wind"]
+    wind, sigma = s.wind
     return {
         "time_usec": s.usec,
         "wind_x": float(wind[0]),
@@ -128,19 +128,16 @@ def odometry(r: Rows) -> Fields:
     change sign. Velocity: v_b = C_nb' v_n gives dv_b = C_nb' (dv_n - v_n x phi).
     """
     P = r.covariance
-    C_bn = np.array([dcm_from_quat(q).T for q in r.q_nb])
+    J, v_b = _body_velocity(r.q_nb, r.v_n)
     pose = np.empty((len(r), 6, 6))
     pose[:, :3, :3] = P[:, POSITION, POSITION]
     pose[:, :3, 3:] = -P[:, POSITION, ATTITUDE]
     pose[:, 3:, 3:] = P[:, ATTITUDE, ATTITUDE]
-    J = np.empty((len(r), 3, 6))
-    J[:, :, :3] = C_bn
-    J[:, :, 3:] = -C_bn @ np.array([skew(v) for v in r.v_n])
     velocity = np.zeros((len(r), 6, 6))
     velocity[:, :3, :3] = J @ P[:, VELOCITY.start :, VELOCITY.start :] @ J.transpose(0, 2, 1)
     velocity.reshape(-1, 36)[:, _RATES] = r.gyro_bias_variance
     x, y, z = r.local_n.T
-    vx, vy, vz = (C_bn @ r.v_n[:, :, None])[:, :, 0].T
+    vx, vy, vz = v_b.T
     return {
         "time_usec": r.usec,
         "frame_id": mav.MAV_FRAME_LOCAL_NED,
@@ -161,12 +158,27 @@ def odometry(r: Rows) -> Fields:
     }
 
 
+@njit
+def _body_velocity(q_nb: Array, v_n: Array) -> tuple[Array, Array]:
+    """What errors of velocity and attitude do to the velocity in body axes (N, 3, 6), and this velocity (N, 3)."""
+    J, v_b = np.empty((len(q_nb), 3, 6)), np.empty((len(q_nb), 3))
+    for k in range(len(q_nb)):
+        C_nb, v_cross = dcm_from_quat(q_nb[k]), skew(v_n[k])
+        for i in range(3):
+            J[k, i, :3] = C_nb[:, i]
+            v_b[k, i] = dot(C_nb[:, i], v_n[k])
+            for j in range(3):
+                J[k, i, 3 + j] = -dot(C_nb[:, i], v_cross[:, j])
+    return J, v_b
+
+
 @cache
-def _solution(status: Status, fixed: bool) -> int:
+def _solution(number: int, fixed: bool) -> int:
     """What an aligned estimator knows, in the bits that ESTIMATOR_STATUS and EKF_STATUS_REPORT have in common.
 
     MAVSDK has its health from the latter, so position is no longer absolute as soon as nothing fixes it.
     """
+    status = Status(number)
     if Status.ATTITUDE_ONLY in status:
         return int(mav.EKF_ATTITUDE)
     known: int = (
@@ -185,8 +197,7 @@ def estimator_status(s: Snapshot) -> Fields:
     """What the estimator holds for known, innovations over their gates, its own sigma."""
     return {
         "time_usec": s.usec,
-        "flags": (_solution(s.estimate.status, s.heard.fixed) if s.aligned else 0)
-        | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
+        "flags": (_solution(s.status, s.fixed) if s.aligned else 0) | (mav.ESTIMATOR_GPS_GLITCH if s.doubted else 0),
         "vel_ratio": s.ratio("gnss_velocity"),
         "pos_horiz_ratio": s.ratio("gnss_position"),
         "pos_vert_ratio": s.ratio("barometer"),
@@ -194,13 +205,13 @@ def estimator_status(s: Snapshot) -> Fields:
         "hagl_ratio": math.nan,
         "tas_ratio": s.ratio("airspeed"),
         "pos_horiz_accuracy": s.sigma(POSITION, 2),
-        "pos_vert_accuracy": root(np.diagonal(s.estimate.covariance)[POSITION][2:]),
+        "pos_vert_accuracy": s.sigma(DOWN),
     }
 
 
 def ekf_flags(s: Snapshot) -> int:
     """What the estimator holds for known, in the bits of EKF_STATUS_REPORT."""
-    known: int = _solution(s.estimate.status, s.heard.fixed) if s.aligned else mav.EKF_UNINITIALIZED
+    known: int = _solution(s.status, s.fixed) if s.aligned else mav.EKF_UNINITIALIZED
     return known | (mav.EKF_GPS_GLITCHING if s.doubted else 0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -13,75 +12,74 @@ from numpy.typing import NDArray
 
 from nav._jit import njit
 from testbed.mavlink.encode import Fields, layout
-from testbed.mavlink.snapshot import Rows, Snapshot
-from testbed.mavlink.stream import Stream
+from testbed.mavlink.snapshot import Moments, Rows
+from testbed.mavlink.stream import Group
 
 Places: TypeAlias = NDArray[np.intp]
+Said: TypeAlias = Sequence[tuple[int, str, Fields]]  # rows, in their order, and messages
 
-KEPT = 1000  # moments, forty seconds at the usual rate
+KEPT = 1000  # rows, forty seconds at the usual rate
 FRESH_S = 1.0  # of wall time: what is kept is no older, so that a log can be followed
-_SLOTS = 256  # frames of one moment at most
+_SLOTS = 1024  # frames of one vehicle in one row at most
+_STREAMS = 512  # the first of those for streams
 _STAMP, _HEAD, _TAIL = 8, 10, 2  # bytes before and after a payload
 
 
-@dataclass(slots=True)  # frozen ones take three times as long to make
-class _Moment:
-    """What one vehicle says at one time."""
+@dataclass(slots=True)
+class Speech:
+    """What one vehicle says in N rows: in each what is ``said`` first, then the streams that are ``due``."""
 
-    stamp_us: int
     system: int
-    said: Sequence[tuple[str, Fields]]
-    snapshot: Snapshot | None
-    streams: Sequence[Stream]
+    said: Said
+    moments: Moments | None = None
+    due: Sequence[tuple[Places, Group]] = ()
 
 
 class History:
-    """Moments of a run, in their order, with the numbers of the frames by vehicle."""
+    """Rows of a run, in their order, with the numbers of the frames by vehicle."""
 
     def __init__(self) -> None:
-        self._moments: list[_Moment] = []
+        self._kept: list[tuple[int, Sequence[Speech]]] = []  # after the numbers of their first places
+        self._stamps: list[int] = []
+        self._systems: list[int] = []
         self._numbers = np.zeros(256, np.uint8)
+        self._rows = 0
         self._taken = time.monotonic()
 
-    def add(
-        self,
-        stamp_us: int,
-        system: int,
-        said: Sequence[tuple[str, Fields]],
-        snapshot: Snapshot | None = None,
-        streams: Sequence[Stream] = (),
-    ) -> bool:
-        """Keep what is ``said`` first and the ``streams`` due of a ``snapshot``; whether it is time to take them."""
-        self._moments.append(_Moment(stamp_us, system, said, snapshot, streams))
-        return len(self._moments) >= KEPT or time.monotonic() - self._taken > FRESH_S
+    def add(self, stamps_us: Sequence[int], speeches: Sequence[Speech]) -> bool:
+        """Keep what vehicles say in rows at ``stamps_us`` (N,); whether it is time to take what was kept."""
+        self._kept.append((len(self._stamps), speeches))
+        for stamp in stamps_us:
+            self._stamps += [max(0, min(2**64 - 1, stamp))] * len(speeches)
+        self._systems += [one.system for one in speeches] * len(stamps_us)
+        self._rows += len(stamps_us)
+        return self._rows >= KEPT or time.monotonic() - self._taken > FRESH_S
 
     def take(self) -> bytes:
         """All that was kept as bytes of a log: big-endian microseconds before each frame."""
-        moments, self._moments, self._taken = self._moments, [], time.monotonic()
         parts = _Parts()
-        wanted: dict[Stream, list[int]] = defaultdict(list)
-        for at, moment in enumerate(moments):
-            place = at * _SLOTS
-            for message, fields in moment.said:
-                payload = np.frombuffer(layout(message).payload(fields), np.uint8)
-                parts.add(message, np.array([place]), np.array([len(payload)]), payload)
-                place += 1
-            for stream in moment.streams:
-                wanted[stream].append(place)
-                place += 1
-        together: dict[bytes, Rows] = {}  # streams of one rate share what is worked out
-        for stream, found in wanted.items():
-            places = np.array(found)
-            where = places // _SLOTS
-            rows = together.get(where.tobytes())
-            if rows is None:
-                snapshots = [one for at in where.tolist() if (one := moments[at].snapshot) is not None]
-                rows = together[where.tobytes()] = Rows(snapshots)
-            own = stream.payloads(rows)
-            parts.add(stream.message, places[own.rows], own.sizes, own.data)
-        stamps = np.array([max(0, min(2**64 - 1, moment.stamp_us)) for moment in moments], np.uint64)
-        systems = np.array([moment.system for moment in moments], np.uint8)
-        return parts.frames(stamps, systems, self._numbers)
+        wanted: dict[Group, list[tuple[Moments, Places, Places]]] = {}  # rows, and their places
+        for first, speeches in self._kept:
+            for vehicle, speech in enumerate(speeches):
+                slots: dict[int, int] = {}
+                for row, message, fields in speech.said:
+                    place = first + row * len(speeches) + vehicle
+                    slots[row] = slots.get(row, -1) + 1
+                    payload = np.frombuffer(layout(message).payload(fields), np.uint8)
+                    parts.add(message, np.array([place * _SLOTS + slots[row]]), np.array([len(payload)]), payload)
+                for rows, group in speech.due:
+                    if len(rows) and speech.moments is not None:
+                        places = first + rows * len(speeches) + vehicle
+                        wanted.setdefault(group, []).append((speech.moments, rows, places))
+        for group, found in wanted.items():  # streams of one rate share what is worked out
+            together = Rows([(moments, rows) for moments, rows, _ in found])
+            places = np.concatenate([places for _, _, places in found]) * _SLOTS + _STREAMS
+            for slot, stream in group.streams:
+                own = stream.payloads(together)
+                parts.add(stream.message, places[own.rows] + slot, own.sizes, own.data)
+        data = parts.frames(np.array(self._stamps, np.uint64), np.array(self._systems, np.uint8), self._numbers)
+        self._kept, self._stamps, self._systems, self._rows, self._taken = [], [], [], 0, time.monotonic()
+        return data
 
 
 class _Parts:
@@ -89,17 +87,16 @@ class _Parts:
 
     def __init__(self) -> None:
         self._payloads: list[NDArray[np.uint8]] = []
-        self._facts: list[NDArray[np.int64]] = []  # rows of place, moment, size, message, seed of the checksum
+        self._facts: list[NDArray[np.int64]] = []  # rows of place, size, message, seed of the checksum
 
     def add(self, message: str, places: Places, sizes: Places, data: NDArray[np.uint8]) -> None:
-        """Payloads of one message (N,), each at its place: the slot of a moment."""
+        """Payloads of one message (N,), each at its place: a slot of a vehicle in a row."""
         own = layout(message)
-        facts = np.empty((len(places), 5), np.int64)
+        facts = np.empty((len(places), 4), np.int64)
         facts[:, 0] = places
-        facts[:, 1] = places // _SLOTS
-        facts[:, 2] = sizes
-        facts[:, 3] = int.from_bytes(own.id, "little")
-        facts[:, 4] = own.crc_extra[0]
+        facts[:, 1] = sizes
+        facts[:, 2] = int.from_bytes(own.id, "little")
+        facts[:, 3] = own.crc_extra[0]
         self._payloads.append(data)
         self._facts.append(facts)
 
@@ -108,11 +105,22 @@ class _Parts:
         if not self._facts:
             return b""
         facts, payload = np.concatenate(self._facts), np.concatenate(self._payloads)
-        begins = np.cumsum(facts[:, 2]) - facts[:, 2]
+        begins = np.cumsum(facts[:, 1]) - facts[:, 1]
         order = np.argsort(facts[:, 0])
         out = np.empty(len(payload) + len(facts) * (_STAMP + _HEAD + _TAIL), np.uint8)
         length = _write(out, payload, begins[order], facts[order], stamps, systems, numbers)
         return out[:length].tobytes()
+
+
+def _remainders() -> NDArray[np.uint16]:
+    """CRC-16/MCRF4XX of each byte (256,): polynomial 1 + x^5 + x^12 + x^16, the lowest bit first."""
+    found = np.arange(256, dtype=np.uint16)
+    for _ in range(8):
+        found = np.where(found & 1, found >> 1 ^ 0x8408, found >> 1)
+    return found.astype(np.uint16)
+
+
+_REMAINDERS = _remainders()
 
 
 @njit
@@ -128,14 +136,14 @@ def _write(
     """Stamps and MAVLink 2 frames of payloads, without their trailing zeros; how many bytes that is."""
     end = 0
     for k in range(len(facts)):
-        moment, size, message, seed = facts[k, 1], facts[k, 2], facts[k, 3], facts[k, 4]
+        place, size, message, seed = facts[k, 0] // _SLOTS, facts[k, 1], facts[k, 2], facts[k, 3]
         first = begins[k]
         while size > 1 and payload[first + size - 1] == 0:
             size -= 1
         for i in range(_STAMP):
-            out[end + i] = (stamps[moment] >> np.uint64(8 * (_STAMP - 1 - i))) & np.uint64(255)
+            out[end + i] = (stamps[place] >> np.uint64(8 * (_STAMP - 1 - i))) & np.uint64(255)
         head = end + _STAMP
-        system = systems[moment]
+        system = systems[place]
         out[head] = 0xFD
         out[head + 1] = size
         out[head + 2] = 0
@@ -150,9 +158,8 @@ def _write(
         out[head + _HEAD : end] = payload[first : first + size]
         crc = 0xFFFF
         for i in range(head + 1, end + 1):
-            byte = int(seed if i == end else out[i]) ^ (crc & 255)
-            byte = (byte ^ (byte << 4)) & 255
-            crc = (crc >> 8) ^ (byte << 8) ^ (byte << 3) ^ (byte >> 4)
+            byte = int(seed if i == end else out[i])
+            crc = (crc >> 8) ^ int(_REMAINDERS[(crc ^ byte) & 255])
         out[end] = crc & 255
         out[end + 1] = crc >> 8
         end += _TAIL

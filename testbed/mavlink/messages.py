@@ -15,7 +15,7 @@ from collections.abc import Mapping
 import numpy as np
 from pymavlink.dialects.v20 import all as mav  # type: ignore[import-untyped]
 
-from nav.earth import SEA_LEVEL_DENSITY, pressure_altitude
+from nav.earth import SEA_LEVEL_DENSITY
 from nav.samples import (
     AirspeedSample,
     BarometerSample,
@@ -70,18 +70,13 @@ _AIDS: Mapping[type[Sample], int] = {
 }
 
 
-def inertial(s: Snapshot) -> bool:
-    """Whether the inertial reading is one."""
-    return all(map(math.isfinite, s.gyro.tolist() + s.accel.tolist()))
-
-
 def health(s: Snapshot) -> int:
     """Which sensors work, in the bits of SYS_STATUS.
 
     Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
     """
     bits = _ALWAYS
-    if inertial(s):
+    if s.inertial:
         bits |= _INERTIAL
     if s.aligned:
         bits |= _ALIGNED
@@ -99,8 +94,8 @@ def health(s: Snapshot) -> int:
 def sys_status(s: Snapshot) -> Fields:
     """Which sensors there are and which of them work."""
     present = _ALWAYS | _INERTIAL | _ALIGNED
-    for kind in s.heard.first:
-        present |= _AIDS.get(kind, 0)
+    for kind, bit in _AIDS.items():
+        present |= bit if s.knows(kind) else 0
     return {
         "onboard_control_sensors_present": present,
         "onboard_control_sensors_enabled": present,
@@ -133,21 +128,20 @@ def extended_sys_state(s: Snapshot) -> Fields:
 
 def current_item(s: Snapshot) -> int:
     """The mission item being flown: that of the leg; the first before it, the last one when the plan is flown."""
-    leg = float(s.truth.leg[0])
     first = int(s.identity.home_first)
-    if leg <= CLIMBING_OUT:
+    if s.leg <= CLIMBING_OUT:
         return first
-    return first + (int(leg) if 0 <= leg < s.legs else max(0, s.legs - 1))
+    return first + (int(s.leg) if 0 <= s.leg < s.legs else max(0, s.legs - 1))
 
 
 def mission_current(s: Snapshot) -> Fields:
     """The leg being flown, as an item of the mission."""
     if not s.legs:
         state = mav.MISSION_STATE_NO_MISSION
-    elif s.truth.leg[0] <= CLIMBING_OUT:
+    elif s.leg <= CLIMBING_OUT:
         state = mav.MISSION_STATE_NOT_STARTED
     else:
-        state = mav.MISSION_STATE_ACTIVE if s.truth.leg[0] >= 0 else mav.MISSION_STATE_COMPLETE
+        state = mav.MISSION_STATE_ACTIVE if s.leg >= 0 else mav.MISSION_STATE_COMPLETE
     return {
         "seq": current_item(s) if s.legs else 0,
         "total": s.legs,
@@ -184,7 +178,7 @@ def home_position(s: Snapshot) -> Fields | None:
 
 def gps_raw_int(s: Snapshot) -> Fields | None:
     """What the receiver says: no fix and nothing known when it is denied."""
-    if GnssSample not in s.heard.first:
+    if not s.knows(GnssSample):
         return None
     fix = s.gnss_fix
     if fix is None:
@@ -225,7 +219,7 @@ def gnss_integrity(s: Snapshot) -> Fields | None:
 
     Spoofing is reported while the estimator isolates, or long refuses, a receiver that has one.
     """
-    if GnssSample not in s.heard.first:
+    if not s.knows(GnssSample):
         return None
     spoofing = mav.GPS_SPOOFING_STATE_UNKNOWN
     if s.gnss_fix:
@@ -260,7 +254,7 @@ def highres_imu(r: Rows) -> Fields:
         *(r.field_b * 1e4).T,
         r.pressure / 100,
         0.5 * SEA_LEVEL_DENSITY * r.eas * r.eas / 100,
-        np.array([pressure_altitude(p) if p > 0 else math.nan for p in r.pressure.tolist()]),
+        r.pressure_altitude,
         np.full(len(r), math.nan),
     )
     updated = sum((column == column).astype(float) * 2**bit for bit, column in enumerate(columns))

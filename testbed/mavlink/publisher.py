@@ -6,26 +6,30 @@ import contextlib
 import datetime
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import numpy.typing as npt
 
-from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, Status, UpdateReport
+from nav.columns import Estimates
+from nav.samples import Array, Sample, Status
+from testbed.loop.links import Stretch
 from testbed.loop.requests import Request
 from testbed.loop.settings import settings
 from testbed.mavlink import estimates, messages, mission
 from testbed.mavlink.answers import Answers, Talk, Vehicle
 from testbed.mavlink.encode import Fields, microseconds
-from testbed.mavlink.history import History
+from testbed.mavlink.hearing import Hearing, Inertial
+from testbed.mavlink.history import History, Said, Speech
 from testbed.mavlink.identity import identity_of
 from testbed.mavlink.link import Link, Station, TelemetryLog, connect_all
 from testbed.mavlink.parameters import Parameters
 from testbed.mavlink.signing import Signing
-from testbed.mavlink.snapshot import Heard, Point, Snapshot, known_point
+from testbed.mavlink.snapshot import Moments, known_points
 from testbed.mavlink.stream import BESIDE_VEHICLES, OTHERS_HZ, PUBLISH_HZ, STREAMS, VEHICLE_STREAMS, Schedule, Stream
-from testbed.motion.table import TruthBlock
+from testbed.mavlink.verdicts import NOBODY, ShutOut, Verdicts
 from testbed.scenario import Scenario
 from testbed.sensors.imu import ImuConfig
 from testbed.sensors.timing import patience
@@ -33,14 +37,23 @@ from testbed.sensors.timing import patience
 HEARD_A_TURN = 4096  # bytes that are taken from each link at a time; the rest waits, or is lost
 HEARTBEAT_S = 0.95  # of wall time: stations hold the link for lost after 3.5 s
 _TOO_SOON_S = 0.1  # after a heartbeat by the wall clock, for one by the run's
-REFUSED = 10  # samples of a receiver in a row, before it is held for spoofed
 MOST_VEHICLES = 254
+
+
+@dataclass(frozen=True, slots=True)
+class _Spoken:
+    """What a vehicle says in a stretch, and how it is put."""
+
+    answers: Answers
+    schedule: Schedule
+    moments: Moments
+    said: Said
 
 
 class MavlinkPublisher:
     """The vehicle that ground stations see: fixed wing, system 1 component 1, on a mode of its own.
 
-    It is handed a row of a run every `period_s` of simulated time and sends what is due to every station and log. A
+    It is handed rows of a run that are `period_s` apart and sends what is due to every station and log. A
     telemetry log holds what goes out by itself, at the usual rates: with the same run it has the same bytes, whatever
     stations ask. Answers, and heartbeats by the wall clock, go to stations only.
     """
@@ -107,78 +120,63 @@ class MavlinkPublisher:
         self._t = -math.inf
         self._calls = 0
         self._leg = -1.0
-        self._home: Point | None = None
+        self._homes: dict[int, Array] = {}  # by system
         self._health: tuple[int, int] | None = None
-        self._health_of: tuple[object, ...] = ()  # what it was worked out from
-        self._heard: Heard | None = None
-        self._imu: ImuSamples | None = None
-        self._readings: list[_Readings] = []  # of the newest increments, and of those before
-        self._gyro: Array = np.full(3, math.nan)
-        self._accel: Array = np.full(3, math.nan)
-        self._ratios: dict[str, float] = {}
-        self._refused: dict[tuple[str, str], int] = {}  # samples in a row, by sensor and aid
-        self._isolated: set[tuple[str, str]] = set()
-        self._shut_out: tuple[frozenset[str], frozenset[str]] = (frozenset(), frozenset())  # sensors, of both
-        self._told: frozenset[str] = frozenset()  # isolations
+        self._health_of: dict[str, int] = {}  # what it was worked out from
+        self._heard: Mapping[str, Sample] = {}
+        self._inertial = Inertial()
+        self._verdicts = Verdicts()
+        self._shut_out: ShutOut = NOBODY
         vehicle = Vehicle(self._identity, self._parameters, self._items, self._streams)
         self._main = Answers(vehicle, self._scenario, self._readonly)
         for talk in self._talks.values():
             talk.lists.clear()
 
-    def publish(
-        self,
-        truth: TruthBlock,
-        estimate: Estimate,
-        samples: Mapping[str, Sample],
-        imu: ImuSamples | None,
-        others: Sequence[tuple[str, Estimate]],
-        reports: Sequence[UpdateReport] = (),
-    ) -> None:
-        """Send what is due at the time of ``truth`` (one row).
-
-        ``samples`` is the newest of each sensor, ``imu`` increments around now (those up to now are used), ``others``
-        the estimates shown beside this one, needed every `others_every` calls, ``reports`` this estimator's updates
-        since the last call.
-        """
-        t = float(truth.t[0])
-        if t < self._t:
+    def publish(self, rows: Stretch) -> None:
+        """Send what is due in these rows. Estimates beside the shown ones are needed every `others_every` rows."""
+        if rows.truth["t"][0] < self._t:
             self._begin()
-        self._t = t
-        self._beats()
+        self._t = float(rows.truth["t"][-1])
         with np.errstate(all="ignore"):  # an estimate may be anything; the encoder copes
-            self._read_imu(imu, t)
-            for report in reports:
-                self._read_report(report)
-            if reports:
-                self._shut_out = (
-                    frozenset(sensor for sensor, _ in self._isolated),
-                    frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
-                )
-            if self._heard is None or not self._heard.holds(samples, t):
-                self._heard = Heard(samples, t, self._silent_s)
-            if self._home is None:
-                self._home = known_point(estimate)
-            snapshot = Snapshot(
-                truth,
-                estimate,
-                self._heard,
-                self._gyro,
-                self._accel,
-                others,
-                self._home,
-                self._start_us,
-                dict(self._ratios),
-                self._identity,
-                self._legs,
-                *self._shut_out,
-            )
-            self._tell_isolations(t, snapshot.isolated)
-            self._main.snapshot = snapshot
-            said = [*self._reached(snapshot), *self._health_changed(snapshot)]
-            self._send(t, said, self._main, self._schedule)
+            moments = self._moments(rows)
+            told = [*self._isolations(moments), *self._reached(moments), *self._health_changed(moments)]
+            said = sorted(told, key=lambda one: one[0])
+            self._shut_out = moments.shut_out[-1]
+            vehicles = [_Spoken(self._main, self._schedule, moments, said)]
             if self._vehicles:
-                self._send_beside(snapshot)
-        self._calls += 1
+                vehicles += self._beside_of(moments, rows)
+            self._send(vehicles)
+        self._calls += len(rows)
+
+    def _moments(self, rows: Stretch) -> Moments:
+        """The rows as the shown vehicle has them."""
+        t = rows.truth["t"]
+        hearing = Hearing(self._heard, rows.samples, t, self._silent_s)
+        self._heard = hearing.last()
+        ratios, shut_out = self._verdicts.read(rows.reports, len(rows))
+        return Moments(
+            rows.ticks,
+            rows.truth,
+            rows.estimates,
+            rows.others,
+            *self._inertial.read(rows.imu, t),
+            hearing,
+            self._home(1, rows.estimates),
+            ratios,
+            shut_out,
+            self._legs,
+            self._identity,
+            self._start_us,
+        )
+
+    def _home(self, system: int, estimates: Estimates) -> Array:
+        """Where a vehicle first knew its position (N, 3), NaN before."""
+        homes = np.full((len(estimates), 3), math.nan)
+        points = known_points(estimates)
+        first = 0 if system in self._homes else next(iter(np.flatnonzero(np.isfinite(points[:, 0])).tolist()), None)
+        if first is not None:
+            homes[first:] = self._homes.setdefault(system, points[first])
+        return homes
 
     def requests(self) -> Sequence[Request]:
         """Answer what stations have asked since the last call, and give what concerns the run; never waits."""
@@ -213,9 +211,18 @@ class MavlinkPublisher:
 
     def event(self, t: float, severity: str, text: str) -> None:
         """Say ``text`` as STATUSTEXT; severity is info, warning or error."""
+        said = [(0, "STATUSTEXT", fields) for fields in self._text(severity, text)]
+        if self._logs and self._history.add(self._stamps([t]), [Speech(self._main.encoder.system, said)]):
+            self._write()
+        frames = [self._main.encoder.frame(message, fields) for _, message, fields in said if self._links]
+        for link in self._links:
+            for station in link.stations:
+                self._talk(station).flush(station, frames)
+
+    def _text(self, severity: str, text: str) -> list[Fields]:
         chunks = messages.statustext(severity, text, self._long_texts)
         self._long_texts += len(chunks) > 1
-        self._send(t, [("STATUSTEXT", chunk) for chunk in chunks], self._main)
+        return chunks
 
     def close(self) -> None:
         """Write the rest of the logs and close every link; harmless when done twice."""
@@ -230,29 +237,50 @@ class MavlinkPublisher:
             talk = self._talks[station] = Talk(self._signing)
         return talk
 
-    def _send(
-        self, t: float, said: Sequence[tuple[str, Fields]], vehicle: Answers, schedule: Schedule | None = None
-    ) -> None:
-        """Send what a vehicle has ``said``, and with a ``schedule`` what is due of its snapshot.
+    def _send(self, vehicles: Sequence[_Spoken]) -> None:
+        """Send what vehicles have said in a stretch, and what is due.
 
         Logs have the usual rates and numbers that are the run's alone, stations what they have asked for.
         """
-        self._sent_us = max(self._sent_us, self._start_us + microseconds(t))  # events tell of times before the last row
+        count = len(vehicles[0].moments)
+        stamps = self._stamps(vehicles[0].moments.truth["t"].tolist())
         if self._logs:
-            due = schedule.due(self._calls, {}) if schedule else ()
-            if self._history.add(self._sent_us, vehicle.encoder.system, said, vehicle.snapshot, due):
+            calls = self._calls + np.arange(count)
+            speeches = [
+                Speech(one.answers.encoder.system, one.said, one.moments, one.schedule.usual(calls)) for one in vehicles
+            ]
+            if self._history.add(stamps, speeches):
                 self._write()
+        for row in range(count if self._links else 0):
+            self._beats(self._calls + row)
+            for one in vehicles:
+                self._send_row(row, one)
+        for one in vehicles:
+            one.answers.snapshot = one.moments.snapshot(count - 1)
+
+    def _send_row(self, row: int, one: _Spoken) -> None:
+        """Send stations what a vehicle says in one row."""
+        answers = one.answers
+        answers.snapshot = one.moments.snapshot(row)
         made: dict[Stream, bytes | None] = {}
-        first = [vehicle.encoder.frame(message, fields) for message, fields in said if self._links]
+        first = [answers.encoder.frame(message, fields) for at, message, fields in one.said if at == row]
         for link in self._links:
             for station in link.stations:
                 talk = self._talk(station)
-                rates = {**talk.rates[vehicle.encoder.system], **self._quiet}
-                streams = schedule.due(self._calls, rates) if schedule else ()
+                rates = {**talk.rates[answers.encoder.system], **self._quiet}
+                streams = one.schedule.due(self._calls + row, rates)
                 for stream in streams:
                     if stream not in made:
-                        made[stream] = vehicle.frame(stream)
-                talk.flush(station, [*first, *(one for stream in streams if (one := made[stream]) is not None)])
+                        made[stream] = answers.frame(stream)
+                talk.flush(station, [*first, *(found for stream in streams if (found := made[stream]) is not None)])
+
+    def _stamps(self, times: Sequence[float]) -> list[int]:
+        """Microseconds since 1970 for a log, that never go back: events tell of times before the last row."""
+        stamps = []
+        for t in times:
+            self._sent_us = max(self._sent_us, self._start_us + microseconds(t))
+            stamps.append(self._sent_us)
+        return stamps
 
     def _write(self) -> None:
         """Hand the logs what was kept for them."""
@@ -261,119 +289,96 @@ class MavlinkPublisher:
         for log in self._logs if data else ():
             log.write(data)
 
-    def _beats(self) -> None:
+    def _beats(self, call: int) -> None:
         """See to it that no heartbeat follows one by the wall clock at once."""
         self._quiet = {}
-        if self._calls % PUBLISH_HZ == 0:
+        if call % PUBLISH_HZ == 0:
             now = time.monotonic()
             if now - self._heartbeat_at < _TOO_SOON_S:
                 self._quiet = {"HEARTBEAT": 0.0}
             else:
                 self._heartbeat_at = now
 
-    def _send_beside(self, shown: Snapshot) -> None:
+    def _beside_of(self, moments: Moments, rows: Stretch) -> list[_Spoken]:
         """Truth and the other estimators as vehicles of their own, each with its home and without the plan."""
-        estimates = [("truth", _as_estimate(shown.truth)), *shown.others][: MOST_VEHICLES - 1]
+        own = [("truth", _as_estimates(rows.truth))]
+        own += [(one.name, one.estimates[one.at.tolist()]) for one in rows.others]
+        own = own[: MOST_VEHICLES - 1]
         if not self._beside:
-            for system, (name, _) in enumerate(estimates, 2):
+            for system, (name, _) in enumerate(own, 2):
                 facts = {name: (system, text) for name, (_, text) in list(self._identity.facts.items())[:1]}
                 parameters = Parameters(facts, {}, self._identity.byte_wise)
                 vehicle = Vehicle(self._identity, parameters, streams=VEHICLE_STREAMS, system=system)
                 self._beside.append(Answers(vehicle, readonly=True))
-                self.event(shown.t, "info", f"system {system} is {name}")
-        for beside, (_, estimate) in zip(self._beside, estimates, strict=True):
-            before = beside.snapshot
-            home = before.home if before is not None and before.t <= shown.t else None
-            beside.snapshot = replace(
-                shown,
-                estimate=estimate,
-                gyro=shown.truth.omega_b[0] + estimate.gyro_bias,
-                others=(),
-                home=home or known_point(estimate),
-                legs=0,
-            )
-            self._send(shown.t, [], beside, self._beside_schedule)
+                self.event(float(rows.truth["t"][0]), "info", f"system {system} is {name}")
+        spoken = []
+        for answers, (_, estimates_) in zip(self._beside, own, strict=True):
+            gyro = rows.truth["omega_b"] + estimates_.gyro_bias
+            home = self._home(answers.encoder.system, estimates_)
+            there = replace(moments, estimates=estimates_, others=(), gyro=gyro, home=home, legs=0)
+            spoken.append(_Spoken(answers, self._beside_schedule, there, ()))
+        return spoken
 
-    def _tell_isolations(self, t: float, isolated: frozenset[str]) -> None:
-        """Say which sensors the shown estimator has shut out since the last call, and which it has let in again."""
-        before, self._told = self._told, isolated
-        for sensor in sorted(isolated - before):
-            self.event(t, "warning", f"{sensor} isolated")
-        for sensor in sorted(before - isolated):
-            self.event(t, "info", f"{sensor} no longer isolated")
+    def _isolations(self, moments: Moments) -> Iterator[tuple[int, str, Fields]]:
+        """STATUSTEXT of which sensors the shown estimator has shut out, and which it has let in again."""
+        before = self._shut_out
+        for row, now in enumerate(moments.shut_out):
+            if now is not before:
+                for sensor in sorted(now.isolated - before.isolated):
+                    yield from ((row, "STATUSTEXT", one) for one in self._text("warning", f"{sensor} isolated"))
+                for sensor in sorted(before.isolated - now.isolated):
+                    yield from ((row, "STATUSTEXT", one) for one in self._text("info", f"{sensor} no longer isolated"))
+            before = now
 
-    def _reached(self, snapshot: Snapshot) -> list[tuple[str, Fields]]:
-        """MISSION_ITEM_REACHED when a leg has ended."""
-        before, self._leg = self._leg, float(snapshot.truth.leg[0])
-        if before == self._leg or not 0 <= before < self._legs:
-            return []
-        number = int(before) + self._identity.home_first
-        return [("MISSION_ITEM_REACHED", {"seq": number})]
+    def _reached(self, moments: Moments) -> Iterator[tuple[int, str, Fields]]:
+        """MISSION_ITEM_REACHED where a leg has ended."""
+        legs = moments.truth["leg"]
+        before = np.concatenate(([self._leg], legs[:-1]))
+        self._leg = float(legs[-1])
+        for row in np.flatnonzero((before != legs) & (before >= 0) & (before < self._legs)).tolist():
+            yield row, "MISSION_ITEM_REACHED", {"seq": int(before[row]) + self._identity.home_first}
 
-    def _health_changed(self, snapshot: Snapshot) -> list[tuple[str, Fields]]:
+    def _health_changed(self, moments: Moments) -> Iterator[tuple[int, str, Fields]]:
         """What tells health, at once when it changes; a heartbeat after it, which is when MAVSDK passes it on."""
-        status, inertial = snapshot.estimate.status, messages.inertial(snapshot)
-        depends = snapshot.heard, status, inertial, snapshot.isolated, snapshot.refused
-        if depends == self._health_of:
-            return []
-        self._health_of = depends
-        before, self._health = self._health, (messages.health(snapshot), estimates.ekf_flags(snapshot))
-        if before in (None, self._health):
-            return []
-        self._heartbeat_at = -math.inf
-        return [
-            ("SYS_STATUS", messages.sys_status(snapshot)),
-            ("EKF_STATUS_REPORT", estimates.ekf_status_report(snapshot)),
-        ]
+        for row in self._health_rows(moments):
+            snapshot = moments.snapshot(row)
+            before, self._health = self._health, (messages.health(snapshot), estimates.ekf_flags(snapshot))
+            if before not in (None, self._health):
+                self._heartbeat_at = -math.inf
+                yield row, "SYS_STATUS", messages.sys_status(snapshot)
+                yield row, "EKF_STATUS_REPORT", estimates.ekf_status_report(snapshot)
 
-    def _read_report(self, report: UpdateReport) -> None:
-        ratio = float(np.float64(report.nis) / report.threshold)
-        self._ratios[report.aid] = math.sqrt(ratio) if ratio >= 0 else math.nan
-        part = report.sensor, report.aid
-        if report.outcome is Outcome.ISOLATED:
-            self._isolated.add(part)
-        else:
-            self._isolated.discard(part)
-        if report.outcome is Outcome.OUTSIDE_GATE:
-            self._refused[part] = self._refused.get(part, 0) + 1
-        elif report.weight > 0:
-            self._refused.pop(part, None)
-
-    def _read_imu(self, imu: ImuSamples | None, t: float) -> None:
-        """Take the newest increment up to ``t``: with an IMU slower than the calls it may be in the block before."""
-        if imu is not self._imu:
-            self._readings = [_Readings(imu), *self._readings[:1]] if imu is not None else []
-            self._imu = imu
-        for block in self._readings:
-            newest = int(block.t.searchsorted(t + 1e-6)) - 1
-            if newest >= 0:
-                self._gyro, self._accel = block.gyro[newest], block.accel[newest]
-                break
+    def _health_rows(self, moments: Moments) -> list[int]:
+        """The rows at which something has changed that health is worked out from."""
+        columns: dict[str, npt.NDArray[np.int64]] = {
+            **{f"sensor {name}": codes for name, codes in moments.hearing.codes().items()},
+            "status": moments.estimates.status,
+            "inertial": np.asarray(np.isfinite(np.hstack([moments.gyro, moments.accel])).all(axis=1), np.int64),
+        }
+        before = [self._shut_out, *moments.shut_out]
+        changed = np.array([now is not last for now, last in zip(moments.shut_out, before, strict=False)])
+        changed[0] |= self._health is None
+        for name, column in columns.items():
+            changed |= column != [self._health_of.get(name, 0), *column[:-1]]
+            self._health_of[name] = int(column[-1])
+        return [int(row) for row in np.flatnonzero(changed)]
 
 
-class _Readings:
-    """Angular rates [rad/s] and specific forces [m/s^2] (N, 3) of increments."""
-
-    def __init__(self, imu: ImuSamples) -> None:
-        self.t = imu.t
-        self.gyro = imu.dtheta / imu.dt[:, None]
-        self.accel = imu.dv / imu.dt[:, None]
-
-
-def _as_estimate(truth: TruthBlock) -> Estimate:
-    """Truth as an estimate without error."""
-    none = np.zeros(3)
-    return Estimate(
-        t=float(truth.t[0]),
-        lat=float(truth.lat[0]),
-        lon=float(truth.lon[0]),
-        h=float(truth.h[0]),
-        v_n=truth.v_n[0],
-        q_nb=truth.q_nb[0],
+def _as_estimates(truth: Mapping[str, Array]) -> Estimates:
+    """Truth as estimates without error."""
+    count = len(truth["t"])
+    none = np.zeros((count, 3))
+    return Estimates(
+        t=truth["t"],
+        lat=truth["lat"],
+        lon=truth["lon"],
+        h=truth["h"],
+        v_n=truth["v_n"],
+        q_nb=truth["q_nb"],
         gyro_bias=none,
         accel_bias=none,
-        covariance=np.zeros((9, 9)),
+        covariance=np.zeros((count, 9, 9)),
         sigma_gyro_bias=none,
         sigma_accel_bias=none,
-        status=Status.ALIGNED | Status.GNSS_FUSED,
+        status=np.full(count, int(Status.ALIGNED | Status.GNSS_FUSED)),
     )

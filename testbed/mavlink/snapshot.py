@@ -1,111 +1,128 @@
-"""The run at one row, as messages see it: truth, estimates, samples, and what follows from them."""
+"""Instants of a run as stations are told of them: truth, estimates, samples, and what follows from them.
+
+`Moments` are columns of many; a `Snapshot` is one of them, `Rows` are some.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias, TypeVar, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
-from nav.earth import displacement_n, position_difference_n
+from nav.columns import Estimates
+from nav.earth import position_difference_n, pressure_altitude
 from nav.rotation import euler_from_quat, quat_conjugate, quat_multiply, rotvec_from_quat
-from nav.samples import (
-    AirspeedSample,
-    Array,
-    BarometerSample,
-    Estimate,
-    GnssSample,
-    MagnetometerSample,
-    PositionSample,
-    Sample,
-    Status,
-)
+from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, Sample, Status
+from testbed.loop.links import Beside
 from testbed.mavlink.encode import boot_ms, microseconds
+from testbed.mavlink.hearing import Hearing, Places, S
 from testbed.mavlink.identity import Identity
-from testbed.motion.table import FLYING_MPS, TruthBlock
+from testbed.mavlink.verdicts import ShutOut
+from testbed.motion.table import FLYING_MPS
 
-_MARGIN_S = 1e-6  # before a sensor falls silent, where rounding might decide
-S = TypeVar("S", GnssSample, BarometerSample, MagnetometerSample, AirspeedSample)
-_KINDS = (GnssSample, BarometerSample, MagnetometerSample, AirspeedSample, PositionSample)
 Point: TypeAlias = tuple[float, float, float]
-
 # Blocks of an estimate's covariance.
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 DOWN, HEADING = slice(2, 3), slice(8, 9)
 
 
-class Heard:
-    """The newest sample of each sensor at a time, and what follows from who has fallen silent."""
-
-    def __init__(self, samples: Mapping[str, Sample], t: float, silent_s: Mapping[str, float]) -> None:
-        """``silent_s`` says after how long a sensor that says nothing counts as failed."""
-        self._samples = [*samples.values()]
-        self._ids = [*map(id, self._samples)]
-        self._t, self._until = t, math.inf
-        # The newest sample of the first sensor of each kind, and those of them that have not fallen silent.
-        self.first: dict[type[Sample], Sample] = {}
-        self.newest: dict[type[Sample], Sample] = {}
-        # Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer.
-        self.fixed = False
-        for sample in self._samples:
-            kind = _kind(sample)
-            speaks = t - sample.t_arrival < silent_s[sample.sensor]
-            if kind not in self.first:
-                self.first[kind] = sample
-                if speaks:
-                    self.newest[kind] = sample
-            if speaks:
-                self._until = min(self._until, sample.t_arrival + silent_s[sample.sensor])
-                self.fixed |= kind is PositionSample or (isinstance(sample, GnssSample) and sample.has_fix)
-
-    def holds(self, samples: Mapping[str, Sample], t: float) -> bool:
-        """Whether nothing of it has changed at a later time, with samples that may be others."""
-        return self._t <= t < self._until - _MARGIN_S and [*map(id, samples.values())] == self._ids
-
-
 @dataclass
-class Snapshot:
-    """One instant of a run, in the numbers that several messages share; worked out when first asked for.
+class Moments:
+    """N instants of a run as one vehicle has them.
 
-    ``gyro`` [rad/s] and ``accel`` [m/s^2] are the newest inertial reading; ``home`` (lat, lon, h) the origin of local
-    coordinates, None until the estimator is aligned; ``start_us`` the run's start in microseconds since 1970;
-    ``ratios`` the newest innovation over its gate, by aid; ``legs`` how many the plan has; ``isolated`` and ``refused``
-    are sensors that the estimator has shut out, or whose samples it has long refused.
+    ``truth`` are columns of `testbed.motion.table.COLUMNS`, ``ticks`` their numbers. ``gyro`` [rad/s] and ``accel``
+    [m/s^2] (N, 3) are the newest inertial readings; ``home`` (N, 3) (lat, lon, h) the origin of local coordinates, NaN
+    until the estimator is aligned; ``ratios`` the newest innovation over its gate, by aid: from which instants on, and
+    which; ``shut_out`` whom the estimator has shut out; ``legs`` how
+    many the plan has; ``start_us`` the run's start in microseconds since 1970.
     """
 
-    truth: TruthBlock
-    estimate: Estimate
-    heard: Heard
+    ticks: npt.NDArray[np.int64]
+    truth: Mapping[str, Array]
+    estimates: Estimates
+    others: Sequence[Beside]
     gyro: Array
     accel: Array
-    others: Sequence[tuple[str, Estimate]]
-    home: Point | None
-    start_us: int
-    ratios: Mapping[str, float]
-    identity: Identity
+    hearing: Hearing
+    home: Array
+    ratios: Mapping[str, tuple[Sequence[int], Sequence[float]]]
+    shut_out: Sequence[ShutOut]
     legs: int
-    isolated: frozenset[str]
-    refused: frozenset[str]
+    identity: Identity
+    start_us: int
 
-    def __post_init__(self) -> None:
-        """What every call needs."""
-        self.t = float(self.truth.t[0])
-        self.aligned = Status.ALIGNED in self.estimate.status
+    def __len__(self) -> int:
+        return len(self.ticks)
+
+    @cached_property
+    def aligned(self) -> list[bool]:
+        """Whether the estimator is."""
+        found: list[bool] = _aligned(self.estimates).tolist()
+        return found
+
+    @cached_property
+    def points(self) -> Array:
+        """Estimated lat, lon [rad], h [m] (N, 3), NaN where they are not known."""
+        return known_points(self.estimates)
+
+    def snapshot(self, row: int) -> Snapshot:
+        """One of them."""
+        return Snapshot(self, row)
+
+
+class Snapshot:
+    """One instant of a run, in the numbers that several messages share; worked out when first asked for."""
+
+    def __init__(self, moments: Moments, row: int) -> None:
+        self._moments, self._row = moments, row
+        self.t = float(moments.truth["t"][row])
+        self.identity, self.legs, self.start_us = moments.identity, moments.legs, moments.start_us
+        self.isolated, self.refused = moments.shut_out[row]
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the estimator is."""
+        return self._moments.aligned[self._row]
+
+    @property
+    def status(self) -> int:
+        """The estimator's, as a number of `Status`."""
+        return int(self._moments.estimates.status[self._row])
+
+    @property
+    def leg(self) -> float:
+        """The leg of the plan that is flown."""
+        return float(self._moments.truth["leg"][self._row])
+
+    @property
+    def inertial(self) -> bool:
+        """Whether the inertial reading is one."""
+        row = self._row
+        return all(map(math.isfinite, self._moments.gyro[row].tolist() + self._moments.accel[row].tolist()))
+
+    @cached_property
+    def home(self) -> Point | None:
+        """The origin of local coordinates."""
+        lat, lon, h = self._moments.home[self._row].tolist()
+        return None if lat != lat else (lat, lon, h)
+
+    @cached_property
+    def alone(self) -> Rows:
+        """The same as one row."""
+        return Rows([(self._moments, np.array([self._row]))])
 
     @property
     def gnss_fix(self) -> GnssSample | None:
         """The receiver's newest epoch if it has a fix."""
         receiver = self.newest(GnssSample)
         return receiver if receiver and receiver.has_fix else None
-
-    @cached_property
-    def alone(self) -> Rows:
-        """The same as one row."""
-        return Rows((self,))
 
     @cached_property
     def boot_ms(self) -> int:
@@ -132,19 +149,13 @@ class Snapshot:
     @cached_property
     def point(self) -> Point | None:
         """Estimated (lat, lon, h)."""
-        return known_point(self.estimate)
-
-    @cached_property
-    def local_n(self) -> list[float] | None:
-        """Estimated position from home [m], NED."""
-        if self.point is None or self.home is None:
-            return None
-        return floats(displacement_n(*self.point, *self.home))
+        lat, lon, h = self._moments.points[self._row].tolist()
+        return None if lat != lat else (lat, lon, h)
 
     @cached_property
     def v_n(self) -> list[float]:
         """Estimated velocity [m/s], NED."""
-        return floats(self.estimate.v_n)
+        return floats(self._moments.estimates.v_n[self._row])
 
     @cached_property
     def groundspeed(self) -> float:
@@ -170,29 +181,46 @@ class Snapshot:
 
     def newest(self, kind: type[S]) -> S | None:
         """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
-        return cast("S | None", self.heard.newest.get(kind))
+        return cast("S | None", self._moments.hearing.newest(kind, self._row))
+
+    def knows(self, kind: type[Sample]) -> bool:
+        """Whether any sensor of this kind has ever said something."""
+        return self._moments.hearing.knows(kind, self._row)
+
+    @property
+    def fixed(self) -> bool:
+        """Whether any sensor tells where the vehicle is."""
+        return self._moments.hearing.fixed(self._row)
+
+    @property
+    def wind(self) -> tuple[Array, Array] | None:
+        """Estimated wind (north, east) [m/s] and its 1-sigma, of an estimator that has wind states."""
+        if "wind" not in self._moments.estimates.extra:
+            return None
+        wind, sigma = (column[self._row] for column in self._moments.estimates.extra["wind"])
+        return None if np.isnan((wind, sigma)).all() else (wind, sigma)
 
     def sigma(self, block: slice, dimensions: int = 3) -> float:
         """Root of the summed variances of the first ``dimensions`` components of a block of the covariance."""
-        return root(np.diagonal(self.estimate.covariance)[block][:dimensions])
+        return root(self._moments.estimates.covariance[self._row].diagonal()[block][:dimensions])
 
     def ratio(self, aid: str) -> float:
         """Newest innovation of an aid over its gate, NaN when it is not known."""
-        return self.ratios.get(aid, math.nan)
+        rows, ratios = self._moments.ratios.get(aid, ((), ()))
+        at = bisect_right(rows, self._row) - 1
+        return float(ratios[at]) if at >= 0 else math.nan
 
 
-def _kind(sample: Sample) -> type[Sample]:
-    """The one of `_KINDS` that a sample is of, of what is none its class."""
-    own = type(sample)
-    return own if own in _KINDS else next((kind for kind in _KINDS if isinstance(sample, kind)), own)
+def known_points(estimates: Estimates) -> Array:
+    """Lat, lon [rad], h [m] (N, 3) of estimates, NaN where one has no position."""
+    points = np.column_stack([estimates.lat, estimates.lon, estimates.h])
+    known = _aligned(estimates) & np.isfinite(points.sum(axis=1))
+    points[~known] = math.nan
+    return points
 
 
-def known_point(estimate: Estimate) -> Point | None:
-    """(lat, lon, h) of an estimate, None while it has no position."""
-    if Status.ALIGNED not in estimate.status:
-        return None
-    point = float(estimate.lat), float(estimate.lon), float(estimate.h)
-    return point if math.isfinite(point[0] + point[1] + point[2]) else None
+def _aligned(estimates: Estimates) -> npt.NDArray[np.bool_]:
+    return np.asarray((estimates.status & Status.ALIGNED) != 0)
 
 
 def floats(x: Array) -> list[float]:
@@ -213,14 +241,21 @@ class Rows:
     What is not known is NaN; a vector is known or not as a whole.
     """
 
-    def __init__(self, snapshots: Sequence[Snapshot]) -> None:
-        self.snapshots = snapshots
-        self._estimates = [one.estimate for one in snapshots]
-        self._truths = [one.truth for one in snapshots]
-        self._t = np.array([one.t for one in snapshots])
+    def __init__(self, parts: Sequence[tuple[Moments, Places]]) -> None:
+        """Of each of several `Moments` some."""
+        self._parts = parts
+        self._t = self.truth("t")
 
     def __len__(self) -> int:
-        return len(self.snapshots)
+        return len(self._t)
+
+    @cached_property
+    def snapshots(self) -> list[Snapshot]:
+        """The same one by one."""
+        return [moments.snapshot(row) for moments, rows in self._parts for row in rows.tolist()]
+
+    def _of(self, column: Callable[[Moments], npt.NDArray[Any]]) -> npt.NDArray[Any]:
+        return np.concatenate([column(moments)[rows] for moments, rows in self._parts])
 
     @cached_property
     def boot_ms(self) -> Array:
@@ -238,93 +273,91 @@ class Rows:
     @cached_property
     def q_nb(self) -> Array:
         """Estimated attitude (N, 4)."""
-        return _together([one.q_nb for one in self._estimates])
+        return self._of(lambda one: one.estimates.q_nb)
 
     @cached_property
     def euler(self) -> Array:
         """Estimated roll, pitch, heading (N, 3) [rad]."""
-        return _eulers(self._estimates)
+        return _eulers(self.q_nb, self._of(lambda one: _aligned(one.estimates)))
 
     @cached_property
     def rates(self) -> Array:
         """Angular rate (N, 3) [rad/s], body: the gyro less its estimated bias; Earth and transport rate are left in."""
-        bias: Array = _together([one.gyro_bias for one in self._estimates])
+        bias: Array = self._of(lambda one: one.estimates.gyro_bias)
         return self.gyro - bias
 
     @cached_property
     def point(self) -> Array:
         """Estimated lat, lon [rad], h [m] (N, 3)."""
-        return np.array([one.point or _NOWHERE for one in self.snapshots])
+        return self._of(lambda one: one.points)
 
     @cached_property
     def local_n(self) -> Array:
         """Estimated position from home (N, 3) [m], NED."""
-        home = np.array([one.home or _NOWHERE for one in self.snapshots])
-        return position_difference_n(*self.point.T, *home.T)
+        return position_difference_n(*self.point.T, *self._of(lambda one: one.home).T)
 
     @cached_property
     def v_n(self) -> Array:
         """Estimated velocity (N, 3) [m/s], NED."""
-        return _together([one.v_n for one in self._estimates])
+        return self._of(lambda one: one.estimates.v_n)
 
     @cached_property
     def covariance(self) -> Array:
         """Of position, velocity and attitude (N, 9, 9)."""
-        return np.array([one.covariance for one in self._estimates])
+        return self._of(lambda one: one.estimates.covariance)
 
     @cached_property
     def gyro_bias_variance(self) -> Array:
         """Of the gyro's bias (N, 3) [rad^2/s^2]."""
-        return _together([one.sigma_gyro_bias for one in self._estimates]) ** 2
+        return self._of(lambda one: one.estimates.sigma_gyro_bias) ** 2
 
     @cached_property
     def second(self) -> Array:
         """Roll, pitch, heading, lat, lon [rad], h [m] (N, 6) of the second estimator."""
-        return self._other(0)
+        return self._of(lambda one: _pose(one, 0))
 
     @cached_property
     def third(self) -> Array:
         """The same of the third."""
-        return self._other(1)
-
-    def _other(self, index: int) -> Array:
-        others = [one.others[index][1] if index < len(one.others) else None for one in self.snapshots]
-        points = np.array([known_point(one) or _NOWHERE if one else _NOWHERE for one in others])
-        return np.hstack([_eulers(others), points])
+        return self._of(lambda one: _pose(one, 1))
 
     # Samples
 
     @cached_property
     def gyro(self) -> Array:
         """Newest angular rate measured (N, 3) [rad/s]."""
-        return _together([one.gyro for one in self.snapshots])
+        return self._of(lambda one: one.gyro)
 
     @cached_property
     def accel(self) -> Array:
         """Newest specific force measured (N, 3) [m/s^2]."""
-        return _together([one.accel for one in self.snapshots])
+        return self._of(lambda one: one.accel)
 
     @cached_property
     def field_b(self) -> Array:
         """Newest magnetic field measured (N, 3) [T]."""
-        found = [one.newest(MagnetometerSample) for one in self.snapshots]
-        return np.array([_NOWHERE if one is None else one.field_b for one in found])
+        return self._of(lambda one: one.hearing.field_b)
 
     @cached_property
     def pressure(self) -> Array:
         """Static pressure measured [Pa]."""
-        return np.array([one.pressure for one in self.snapshots])
+        return self._of(lambda one: one.hearing.pressure)
+
+    @cached_property
+    def pressure_altitude(self) -> Array:
+        """Height in the standard atmosphere [m] that belongs to the pressure, NaN where that is not above zero."""
+        return np.array([pressure_altitude(p) if p > 0 else math.nan for p in self.pressure.tolist()])
 
     @cached_property
     def eas(self) -> Array:
         """Equivalent airspeed measured [m/s]."""
-        return np.array([one.eas for one in self.snapshots])
+        return self._of(lambda one: one.hearing.eas)
 
     # The truth
 
     def truth(self, name: str) -> Array:
         """A column of truth, (N,) or (N, width)."""
-        return np.concatenate([getattr(one, name) for one in self._truths])
+        return self._of(lambda one: one.truth[name])
 
     @cached_property
     def true_euler(self) -> Array:
@@ -334,8 +367,8 @@ class Rows:
     @cached_property
     def specific_force(self) -> Array:
         """True specific force over the last tick (N, 3) [m/s^2], body."""
-        ticks = np.array([one.tick for one in self._truths], float)
-        dt = np.where(ticks == 0, math.inf, self.truth("t") / ticks)
+        ticks = self._of(lambda one: one.ticks).astype(float)
+        dt = np.where(ticks == 0, math.inf, self._t / ticks)
         return self.truth("dv") / dt[:, None]
 
     @cached_property
@@ -344,9 +377,7 @@ class Rows:
         true = np.column_stack([self.truth(name) for name in ("lat", "lon", "h")])
         position = position_difference_n(*self.point.T, *true.T)
         velocity = self.v_n - self.truth("v_n")
-        pairs = zip(self._estimates, self._truths, strict=True)
-        turns = [rotvec_from_quat(quat_multiply(one.q_nb, quat_conjugate(true.q_nb[0]))) for one, true in pairs]
-        turn = np.array(turns)
+        turn = _turns(self.q_nb, self.truth("q_nb"))
         return {
             "err_tilt": np.degrees(np.hypot(turn[:, 0], turn[:, 1])),
             "err_head": np.degrees(turn[:, 2]),
@@ -362,23 +393,27 @@ class Rows:
 
     def _sigma(self, block: slice, dimensions: int = 3) -> Array:
         """As `Snapshot.sigma`."""
-        return np.array([one.sigma(block, dimensions) for one in self.snapshots])
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)[:, block][:, :dimensions]
+        total: Array = variances.sum(axis=1)
+        return np.sqrt(total)
 
 
-_NOWHERE = (math.nan, math.nan, math.nan)
-_NOTHING = np.full(4, math.nan)
+def _pose(moments: Moments, index: int) -> Array:
+    """Roll, pitch, heading, lat, lon [rad], h [m] (N, 6) of an estimator beside the shown one."""
+    pose = np.full((len(moments), 6), math.nan)
+    if index < len(moments.others):
+        other = moments.others[index]
+        known = np.flatnonzero(other.at >= 0)
+        own = other.estimates[other.at[known].tolist()]
+        pose[known, :3] = _eulers(own.q_nb, _aligned(own))
+        pose[known, 3:] = known_points(own)
+    return pose
 
 
-def _together(vectors: Sequence[Array]) -> Array:
-    """Vectors (n,) as rows (N, n); several times faster than `numpy.array`."""
-    return np.concatenate(vectors).reshape(len(vectors), -1)
-
-
-def _eulers(estimates: Sequence[Estimate | None]) -> Array:
-    """Roll, pitch, heading (N, 3) [rad] of estimates that have an attitude."""
-    q_nb = [one.q_nb if one is not None and Status.ALIGNED in one.status else _NOTHING for one in estimates]
-    found = _euler_rows(_together(q_nb))
-    found[~np.isfinite(found).all(axis=1)] = math.nan
+def _eulers(q_nb: Array, aligned: npt.NDArray[np.bool_]) -> Array:
+    """Roll, pitch, heading (N, 3) [rad], NaN of what is not aligned and has no attitude."""
+    found = _euler_rows(q_nb)
+    found[~(aligned & np.isfinite(found).all(axis=1))] = math.nan
     return found
 
 
@@ -388,4 +423,13 @@ def _euler_rows(q_nb: Array) -> Array:
     found = np.empty((len(q_nb), 3))
     for k in range(len(q_nb)):
         found[k] = euler_from_quat(q_nb[k])
+    return found
+
+
+@njit
+def _turns(estimated: Array, true: Array) -> Array:
+    """Rotation vectors (N, 3) from one attitude (N, 4) to the other."""
+    found = np.empty((len(estimated), 3))
+    for k in range(len(estimated)):
+        found[k] = rotvec_from_quat(quat_multiply(estimated[k], quat_conjugate(true[k])))
     return found

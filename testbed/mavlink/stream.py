@@ -91,7 +91,7 @@ STREAMS = (
     Stream("LOCAL_POSITION_NED", 10, estimates.local_position_ned, _POSITION, needs=("local_n",)),
     Stream("VFR_HUD", 5, estimates.vfr_hud, _HUD, needs=("point", "euler")),
     Stream("ODOMETRY", 5, estimates.odometry, _POSITION, needs=("local_n", "euler")),
-    Stream("ALTITUDE", 2, estimates.altitude, _POSITION),
+    Stream("ALTITUDE", 2, estimates.altitude, _POSITION, needs=("local_n",)),
     Stream("WIND_COV", 1, estimates.wind_cov, _REST),
     Stream("ESTIMATOR_STATUS", 2, estimates.estimator_status, _REST),
     Stream("EKF_STATUS_REPORT", 1, estimates.ekf_status_report, _REST),
@@ -128,13 +128,28 @@ VEHICLE_STREAMS = tuple(replace(one, rate_hz=min(one.rate_hz, 10)) for one in ST
 BESIDE_VEHICLES = tuple(one for one in STREAMS if not one.message.startswith("AHRS"))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Streams of one rate, each after its place among all."""
+
+    streams: Sequence[tuple[int, Stream]]
+
+
 class Schedule:
     """Which of some streams are due at each call."""
 
     def __init__(self, streams: Sequence[Stream]) -> None:
         self._streams = streams
+        by_rate: dict[float, list[tuple[int, Stream]]] = {}
+        for place, one in enumerate(streams):
+            by_rate.setdefault(one.rate_hz, []).append((place, one))
+        self._groups = {rate: Group(group) for rate, group in by_rate.items()}
         # The usual rates repeat after two seconds: the slowest message is sent every two seconds.
         self._pattern = [self._due(call, {}) for call in range(2 * PUBLISH_HZ)]
+
+    def usual(self, calls: NDArray[np.int64]) -> list[tuple[NDArray[np.intp], Group]]:
+        """Of calls (N,) those at which streams are due at their usual rates, for each rate."""
+        return [(np.flatnonzero(calls * rate % PUBLISH_HZ < rate), group) for rate, group in self._groups.items()]
 
     def due(self, call: int, rates: Mapping[str, float]) -> Sequence[Stream]:
         """The streams due at a call, where ``rates`` [Hz] replace the usual ones by message."""

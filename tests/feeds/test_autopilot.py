@@ -98,7 +98,7 @@ def test_the_result_does_not_depend_on_the_chunk(
     in_one_chunk: RunResult, monkeypatch: pytest.MonkeyPatch, batch_s: float
 ) -> None:
     assert any("ground velocity less wind" in text for _, text in events(in_one_chunk))
-    monkeypatch.setattr(loop, "BATCH_S", batch_s)
+    monkeypatch.setattr(loop, "HEARD_S", batch_s)
     assert same(in_one_chunk.dataset, with_requests().dataset)
 
 

@@ -12,11 +12,13 @@ import pytest
 from worlds.loop import Watcher, same
 from worlds.recordings import log_of
 
+from nav.columns import FusedReports
 from nav.samples import FixType, GnssSample, Sample
 from testbed import RunResult, Scenario, results, run, sensors
 from testbed.errors import UserError
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
+from testbed.loop.links import Stretch
 from testbed.motion import flight
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.record import reader as record
@@ -146,9 +148,11 @@ def test_a_plan_that_ends_before_the_run_is_an_event(denied: list[list[float]], 
 @pytest.mark.ci
 def test_links_show_the_estimator_that_was_asked_for() -> None:
     class Naming(Watcher):
-        def publish(self, truth, estimate, samples, imu, others, reports):  # type: ignore[no-untyped-def]
-            super().publish(truth, estimate, samples, imu, others, reports)
-            self.shown = "wind" in estimate.extra, [name for name, _ in others], [r.aid for r in reports]
+        def publish(self, rows: Stretch) -> None:
+            super().publish(rows)
+            pieces = [piece[:] if isinstance(piece, FusedReports) else [piece] for _, piece in rows.reports]
+            aids = {report.aid for piece in pieces for report in piece}
+            self.shown = "wind" in rows.estimates.extra, [one.name for one in rows.others], aids
 
     estimators = ", ".join(
         f"{{name='{n}', aids={a}}}" for n, a in (("a", ["gnss"]), ("b", ["gnss", "airspeed"]), ("c", []))
@@ -227,10 +231,13 @@ def test_estimators_beside_the_shown_one_are_handed_over_as_often_as_they_are_lo
     class Sparse(Watcher):
         others_every = every
 
-        def publish(self, truth, estimate, samples, imu, others, reports):  # type: ignore[no-untyped-def]
+        def row(self, rows: Stretch, row: int) -> None:
             if len(self.rows) % every == 0:
-                assert [(name, one.t) for name, one in others] == [("b", estimate.t)]
-            super().publish(truth, estimate, samples, imu, others, reports)
+                others = [(one.name, one.estimates.t[one.at[row]]) for one in rows.others]
+                assert others == [("b", rows.estimates.t[row])]
+            else:
+                assert [one.at[row] for one in rows.others] == [-1]
+            super().row(rows, row)
 
     estimators = "estimator=[{name='a', aids=['gnss']}, {name='b', aids=[]}]"
     watcher = Sparse()
@@ -240,16 +247,14 @@ def test_estimators_beside_the_shown_one_are_handed_over_as_often_as_they_are_lo
 
 
 def test_gnss_denied_sample_says_so() -> None:
-    watcher = Watcher()
     seen: list[GnssSample] = []
-    original = watcher.publish
 
-    def publish(truth, estimate, samples, *rest):  # type: ignore[no-untyped-def]
-        if "gnss" in samples:
-            seen.append(samples["gnss"])
-        original(truth, estimate, samples, *rest)
+    class Keeping(Watcher):
+        def publish(self, rows: Stretch) -> None:
+            super().publish(rows)
+            seen.extend(sample for _, sample in rows.samples if isinstance(sample, GnssSample))
 
-    watcher.publish = publish  # type: ignore[method-assign]
+    watcher = Keeping()
     run(Scenario.load("u_turn", SHORT), links=[watcher])
     inside = [s for s in seen if 20.5 < s.t < 25.5]
     assert inside

@@ -20,6 +20,7 @@ from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.loop.director import Director, Restarted, recorded
 from testbed.loop.injection import KINDS, UNITS, injection
+from testbed.loop.links import Stretch
 from testbed.loop.requests import (
     Change,
     Clear,
@@ -70,9 +71,9 @@ class Station:
         self.told_settings: list[dict[str, float]] = []
         self.calls = 0
 
-    def publish(self, truth: Any, *rest: Any) -> None:
-        self.t = float(truth.t[0])
-        self.rows.append(self.t)
+    def publish(self, rows: Stretch) -> None:
+        self.rows += rows.truth["t"].tolist()
+        self.t = self.rows[-1]
 
     def requests(self) -> Sequence[Request]:
         self.calls += 1

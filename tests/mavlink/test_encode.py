@@ -8,6 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from pymavlink.dialects.v20 import all as mav
+from worlds.loop import one_row
 
 from nav.samples import (
     AirspeedSample,
@@ -23,7 +24,7 @@ from nav.samples import (
 )
 from testbed import Scenario
 from testbed.mavlink import MavlinkPublisher, encode, messages
-from testbed.mavlink.history import History
+from testbed.mavlink.history import History, Speech
 from testbed.mavlink.stream import STREAMS
 from testbed.motion.table import COLUMNS, TruthBlock
 
@@ -121,7 +122,7 @@ def recorded(said, system=3):
     """Frames of messages with their fields as a log has them."""
     history = History()
     for k, one in enumerate(said):
-        history.add(k, system, [one])
+        history.add([k], [Speech(system, [(0, *one)])])
     frames = list(logged(history.take()))
     assert [stamp for stamp, _ in frames] == list(range(len(said)))
     return [frame for _, frame in frames]
@@ -257,7 +258,7 @@ def estimate(deal, status):
 
 
 def broken_run(deal, status, fix):
-    """Arguments of `MavlinkPublisher.publish` from a run gone completely wrong."""
+    """A row of a run gone completely wrong."""
     truth = TruthBlock.empty(8, 1)
     for name, column in COLUMNS.items():
         getattr(truth, name)[0] = deal() if column.width == 1 else deal.vector(column.width)
@@ -286,7 +287,7 @@ def broken_run(deal, status, fix):
     reports = [
         UpdateReport(now, "gnss", "gnss_position", deal.vector(3), np.eye(3), deal(), deal(), 1.0, Outcome.FUSED)
     ]
-    return truth, estimate(deal, status), {s.sensor: s for s in samples}, imu, others, reports
+    return one_row(truth, estimate(deal, status), {s.sensor: s for s in samples}, imu, others, reports)
 
 
 @pytest.mark.ci
@@ -303,11 +304,11 @@ def test_no_state_can_stop_the_stream(vehicles, state, before, status, fix):
     link = Collector()
     publisher = MavlinkPublisher([], SCENARIO, vehicles=vehicles)
     publisher._logs.append(link)
-    publisher.publish(*broken_run(Deal(before), status, fix))  # whatever came first, home and IMU included
+    publisher.publish(broken_run(Deal(before), status, fix))  # whatever came first, home and IMU included
     publisher._write()
     publisher._calls = 0  # every stream is due
     link.frames.clear()
-    publisher.publish(*broken_run(Deal(state), status, fix))
+    publisher.publish(broken_run(Deal(state), status, fix))
     publisher._write()
     names = [decode(frame).get_type() for frame in link.frames]
     assert {"HEARTBEAT", "SYS_STATUS", "GPS_RAW_INT", "HIGHRES_IMU", "HIL_STATE_QUATERNION"} <= set(names)

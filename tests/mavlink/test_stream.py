@@ -15,6 +15,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mav
 from scipy.spatial.transform import Rotation
+from worlds.loop import joined
 from worlds.mavlink import (
     MIDNIGHT_US,
     SCENARIO,
@@ -25,7 +26,9 @@ from worlds.mavlink import (
     publish,
     quaternion,
     read_log,
+    row_at,
     samples_at,
+    truth_row,
     velocity,
 )
 
@@ -528,6 +531,59 @@ def test_time_never_runs_backwards_in_the_log(tmp_path):
     stamps = [time_us for time_us, _ in read_log(path)]
     assert stamps == sorted(stamps)
     assert stamps[-1] == MIDNIGHT_US + 59 * 40_000
+
+
+@pytest.mark.parametrize("vehicles", [False, True])
+def test_a_log_is_the_same_however_many_rows_come_at_once(tmp_path, vehicles):
+    """The estimator aligns, a receiver loses its fix, a barometer falls silent, legs end, a sensor is shut out."""
+
+    def estimates(t):
+        return estimate(t, Status.ALIGNING if t < 1 else Status.ALIGNED, offset_h=t)
+
+    def truth(t):
+        row = truth_row(t)
+        row.leg[0] = t // 3
+        return row
+
+    def samples(t):
+        found = samples_at(t, fix=not 4 < t < 5)
+        if t > 2:
+            found["barometer"] = samples_at(2.0)["barometer"]
+        return {name: one for name, one in found.items() if round(t / 0.04) % 3 == 0}
+
+    def reports(t):
+        outcome = Outcome.ISOLATED if 6 < t < 7 else Outcome.OUTSIDE_GATE if 7.5 < t < 8.5 else Outcome.FUSED
+        weight = float(outcome is Outcome.FUSED)
+        return [UpdateReport(t, "gnss", "gnss_position", np.zeros(3), np.eye(3), t, 9.0, weight, outcome)]
+
+    turns = np.random.default_rng(1).normal(size=(2, 2000, 3)) / 200
+    imu = ImuSamples(np.arange(1, 2001) / 200, np.full(2000, 1 / 200), *turns)
+    rows = [
+        row_at(
+            k,
+            truth=truth,
+            estimate=estimates,
+            samples=samples,
+            reports=reports,
+            imu=lambda t: imu,
+            others=lambda t: [("b", estimate(t, offset_h=5.0)), ("c", estimate(t, Status.ALIGNING))],
+        )
+        for k in range(250)
+    ]
+    logs = []
+    for chunk in (1, 7, 250):
+        path = tmp_path / f"{chunk}.tlog"
+        publisher = MavlinkPublisher([str(path)], SCENARIO, vehicles=vehicles)
+        for first in range(0, 250, chunk):
+            publisher.publish(joined(rows[first : first + chunk]))
+        publisher.close()
+        logs.append(path.read_bytes())
+    assert logs[0] == logs[1] == logs[2]
+    told = collections.Counter(message.get_type() for _, message in read_log(tmp_path / "250.tlog"))
+    assert told["MISSION_ITEM_REACHED"] == 3
+    texts = [m.text for _, m in read_log(tmp_path / "250.tlog") if m.get_type() == "STATUSTEXT"]
+    assert texts[-2:] == ["gnss isolated", "gnss no longer isolated"]
+    assert told["SYS_STATUS"] > 20 * (1 + 3 * vehicles)
 
 
 def test_several_links_say_the_same(tmp_path):

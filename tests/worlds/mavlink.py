@@ -20,6 +20,7 @@ from nav.samples import (
 )
 from testbed import Scenario
 from testbed.motion.table import TruthBlock
+from worlds.loop import one_row
 
 SCENARIO = Scenario.load("u_turn", ["date=2026-06-01"])
 MIDNIGHT_US = 1_780_272_000_000_000  # 2026-06-01T00:00Z
@@ -118,16 +119,15 @@ def increments(t):
 
 def publish(publisher, calls, **changes):
     for k in calls:
-        t = k * 0.04
         publisher.requests()
-        arguments = {
-            "truth": truth_row(t),
-            "estimate": estimate(t),
-            "samples": samples_at(t),
-            "imu": increments(t),
-            "others": [],
-        }
-        publisher.publish(**arguments | {name: change(t) for name, change in changes.items()})
+        publisher.publish(row_at(k, **changes))
+
+
+def row_at(k, **changes):
+    """A row of the flight at 25 Hz; ``changes`` replace what it holds by functions of time."""
+    t = k * 0.04
+    arguments = {"truth": truth_row, "estimate": estimate, "samples": samples_at, "imu": increments} | changes
+    return one_row(**{name: made(t) for name, made in arguments.items()})
 
 
 def read_log(path):
