@@ -39,12 +39,12 @@ def combine(
     ``weigh``.
     """
     if combination == "information":
-        return Master(*_information(x, P, common, members), members)
+        return Master(*information(x, P, common, members), members)
     weights = (weigh or weights_by_covariance)(P, common, members)
     if combination == "scalar":
         x_g, P_g = weights @ x[:, :common], np.tensordot(weights, P[:, :common, :common], 1)
     else:
-        x_g, P_g = _information(x, P, common, weights)
+        x_g, P_g = information(x, P, common, weights)
     return Master(x_g, P_g, weights)
 
 
@@ -63,7 +63,7 @@ def weights_by_covariance(P: Array, common: int, members: Array, shares: Array |
 
 
 @njit
-def _information(x: Array, P: Array, common: int, weights: Array) -> tuple[Array, Array]:
+def information(x: Array, P: Array, common: int, weights: Array) -> tuple[Array, Array]:
     """(x_g, P_g) with ``P_g^-1 = sum w_i P_i^-1`` over the filters whose covariance is definite and w_i positive."""
     total, y = np.zeros((common, common)), np.zeros(common)
     for f in range(len(x)):
@@ -86,7 +86,7 @@ def blend(x: Array, P: Array, x_g: Array, P_g: Array, retention: float) -> tuple
     """(x, P) of the common states between a filter's own (0) and the shared ones (1), by weighted information."""
     common = len(x_g)
     both = np.stack([x[:common], x_g]), np.stack([P[:common, :common], P_g])
-    return _information(*both, common, np.array([1.0 - retention, retention]))
+    return information(*both, common, np.array([1.0 - retention, retention]))
 
 
 @njit

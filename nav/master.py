@@ -9,7 +9,7 @@ import numpy as np
 from nav._jit import njit
 from nav.columns import Estimates
 from nav.federation import Config
-from nav.fusion import Master, blend, combine, reset, weights_by_covariance
+from nav.fusion import Master, blend, combine, information, reset, weights_by_covariance
 from nav.local_filter import LocalFilter
 from nav.reference import REPORTED, Reference, described, spread, turned
 from nav.samples import Array, Status
@@ -97,19 +97,37 @@ class MasterFilter:
         self, wholes: Array, shape: tuple[int, int, int], t: Array, status: Sequence[Status], off: Array
     ) -> Estimates:
         """The estimates of settled states (N, numbers), which are changed, with a doubt ``off`` (9,) of the motion."""
-        common = shape[0]
-        model, masters = self._filters[0].model, np.empty((len(wholes), common, common))
-        for k, whole in enumerate(wholes):
-            state = State(*shape, whole)
-            master = self.combine(state, self._everyone)
-            inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
-            masters[k] = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
+        common, model = shape[0], self._filters[0].model
+        if self._config.combination == "information" and not self._reference.scalings:
+            masters = _combined(wholes, *shape, self._everyone)
+        else:
+            masters = np.empty((len(wholes), common, common))
+            for k, whole in enumerate(wholes):
+                state = State(*shape, whole)
+                master = self.combine(state, self._everyone)
+                inject(state.q_nb, state.v_n, state.lla, state.imu, master.x)
+                masters[k] = turned(master.x, master.P, own=True) if self._reference.scalings else master.P
         q_nb, v_n, lla, imu, x, _ = known(wholes, *shape)
         rows, deviation = masters.reshape(len(t), -1), deviations(wholes, *shape)
         covariance, sigma = spread(rows, 0, common, self._config.mounting_sigma**2, off)
         extra = {name: (imu[:, at], sigma[:, at]) for name, at in self._common}
         extra |= {name: (x[:, row, where], deviation[:, row, where]) for name, row, where in self._extra}
         return described(t, status, (q_nb, v_n, lla), imu, (rows, 0), model, covariance, sigma, extra)
+
+
+@njit
+def _combined(wholes: Array, common: int, filters: int, n: int, members: Array) -> Array:
+    """The fused covariances (N, common, common) of settled states, whose nominal states get what was fused.
+
+    By information, of the first filters, as many as there are ``members``: in one go, since to hand the parts of one
+    state over from a kernel takes longer than to fuse them.
+    """
+    masters, m = np.empty((len(wholes), common, common)), len(members)
+    for k in range(len(wholes)):
+        q_nb, v_n, lla, imu, x, P, _, _, _, _, _ = parts(wholes[k], common, filters, n)
+        x_g, masters[k] = information(x[:m], P[:m], common, members)
+        inject(q_nb, v_n, lla, imu, x_g)
+    return masters
 
 
 @njit
