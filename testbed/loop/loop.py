@@ -166,7 +166,7 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
             pass
         remarks = passage.conclude()
         passage.look_back()
-    dataset = passage.recorder.dataset()
+        dataset = passage.recorder.finish()
     return _Flown(dataset, passage.feed.failure, remarks, passage.seconds())
 
 

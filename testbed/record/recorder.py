@@ -199,8 +199,21 @@ class Recorder:
         self.flush()
         if self.path is not None and self.path.exists():
             return load(self.path)
+        return self._tree(lambda path, name: self._tables[path].rows(name))
+
+    def finish(self) -> xarray.DataTree:
+        """`close`, and give everything recorded: to read the compressed file again would take several times as long."""
+        self.flush()
+        if self._file is None:
+            return self.dataset()
+        rows = {(path, name): self._written(path, name) for path, t in self._tables.items() for name in t.columns}
+        self.close()
+        return self._tree(lambda path, name: rows[path, name])
+
+    def _tree(self, rows: Callable[[str, str], Data]) -> xarray.DataTree:
+        """The columns with their ``rows``."""
         columns = {
-            path: {name: (c.variable, table.rows(name)) for name, c in table.columns.items()}
+            path: {name: (c.variable, rows(path, name)) for name, c in table.columns.items()}
             for path, table in self._tables.items()
         }
         return tree(columns, self.attributes)
