@@ -88,7 +88,7 @@ class MagnetometerAid:
 
 def problem(sample: MagnetometerSample) -> str:
     """See `nav.aids.problem`."""
-    return range_problem("field", math.hypot(*sample.field_b), FIELD_LIMITS)
+    return range_problem("field", math.hypot(*sample.field_b.tolist()), FIELD_LIMITS)
 
 
 @njit
