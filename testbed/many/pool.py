@@ -218,8 +218,10 @@ def _do(do: Work[A, R], task: A, number: int, topic: str) -> R:
 def _client(of: str | LocalCluster) -> Iterator[Client]:
     from distributed import Client
 
-    # A scheduler that goes away is told of in a line; the client would add its traceback.
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    # A scheduler that goes away is told of in a line; the client would add its traceback, and whoever still had
+    # something to say to a connection that is closed in the end.
+    for name in ("distributed.client", "distributed.batched"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with Client(of, set_as_default=False) as client, client.as_current():
         yield client
 
