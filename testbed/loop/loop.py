@@ -43,7 +43,8 @@ if TYPE_CHECKING:
     import xarray
 
 BATCH_S = 20.0  # simulated time per turn of the loop when nobody can interfere
-HEARD_S = 5.0  # and when somebody can, or with another's motion: as much is lost when that breaks
+HEARD_S = 5.0  # and when somebody can, with another's motion, or slowly: as much is lost when that breaks
+QUICK = 40.0  # times real time, from which on a turn may be long
 PACED_S = 0.1  # and when it keeps to the clock, or a far end follows
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REHEARSAL_S = 5.0  # that an estimator aligns in
@@ -200,6 +201,7 @@ class _Passage:
         self.cadence = _Cadence(round(rate_hz / scenario.record.rate_hz), events, publish, others)
         alone = BATCH_S if setup.source is None and not director.listens else HEARD_S
         self.batch = round((alone if setup.far_end is None else PACED_S) * rate_hz)
+        self.slow, self.quick = min(self.batch, round(HEARD_S * rate_hz)), False
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
         self.lanes = setup.build(_own(scenario, setup.far_end), scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
@@ -229,7 +231,8 @@ class _Passage:
 
     def advance(self) -> bool:
         """One turn: what the feed gives, estimated, recorded and handed out. False when the motion has ended."""
-        size = self.paced if self.director.pacer is not None else self.batch
+        began = time.monotonic()
+        size = self.paced if self.director.pacer is not None else self.batch if self.quick else self.slow
         ticks = min(size, self.ticks - self.tick, self.director.room(self.tick))
         turn = self.feed.advance(ticks, self.cadence.rows(self.tick, ticks))
         block = turn.reference
@@ -252,6 +255,7 @@ class _Passage:
         if self.director.pacer is not None:
             self.director.pacer.wait(t, self.recorder.tend)
         self.told.advance(t, "GNSS denied" if self.watch.denied else self.feed.activity())
+        self.quick = QUICK * (time.monotonic() - began) < len(block) / self.rate_hz
         return True
 
     def _track(self, name: str, turn: Turn, times: Sequence[float]) -> Tracked:

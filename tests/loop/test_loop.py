@@ -66,6 +66,17 @@ def test_result_does_not_depend_on_the_chunk(
     assert same(in_one_chunk.dataset, run(LATE).dataset)
 
 
+@pytest.mark.parametrize(("quick", "turns"), [(0.0, [5.0, 20.0, 40.0]), (math.inf, [5.0, 10.0, 15.0, 20.0])])
+def test_turns_are_long_only_when_they_pass_quickly(
+    monkeypatch: pytest.MonkeyPatch, quick: float, turns: list[float]
+) -> None:
+    """What is not quick loses little of its record when it is ended."""
+    monkeypatch.setattr(loop, "QUICK", quick)
+    told: list[float] = []
+    run(Scenario.load("u_turn", ["duration_s=45"]), progress=lambda now: told.append(now.t))
+    assert told[: len(turns)] == pytest.approx(turns, abs=0.01)
+
+
 def test_events_tell_of_denial_reacquisition_and_legs() -> None:
     watcher = Watcher()
     run(Scenario.load("u_turn", SHORT), links=[watcher])
