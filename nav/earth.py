@@ -46,6 +46,8 @@ GEOPOTENTIAL_RADIUS = 6356766.0  # [m]
 PRESSURE_EXPONENT = STANDARD_GRAVITY / (GAS_CONSTANT * LAPSE_RATE)
 TROPOPAUSE_PRESSURE = SEA_LEVEL_PRESSURE * (TROPOPAUSE_TEMPERATURE / SEA_LEVEL_TEMPERATURE) ** PRESSURE_EXPONENT
 STRATOSPHERE_SCALE = GAS_CONSTANT * TROPOPAUSE_TEMPERATURE / STANDARD_GRAVITY  # [m]
+# What the functions of air take a height for that is beyond: below and above the standard atmosphere (ISO 2533).
+ATMOSPHERE = (-5e3, 80e3)  # [m]
 
 
 @njit
@@ -188,17 +190,24 @@ def position_difference_n(lat: Scalar, lon: Scalar, h: Scalar, lat0: Scalar, lon
 
 
 @njit
+def _geopotential(h: Scalar) -> Scalar:
+    """Geopotential height [m] of a height above sea level [m], held where air is: a filter astray believes any height."""
+    held = np.minimum(np.maximum(h, ATMOSPHERE[0]), ATMOSPHERE[1])
+    geopotential: Scalar = GEOPOTENTIAL_RADIUS * held / (GEOPOTENTIAL_RADIUS + held)
+    return geopotential
+
+
+@njit
 def isa_temperature(h: Scalar) -> Scalar:
     """Standard air temperature [K] at a height above sea level [m], up to 20 km."""
-    geopotential = GEOPOTENTIAL_RADIUS * h / (GEOPOTENTIAL_RADIUS + h)
-    temperature: Scalar = SEA_LEVEL_TEMPERATURE - LAPSE_RATE * np.minimum(geopotential, TROPOPAUSE)
+    temperature: Scalar = SEA_LEVEL_TEMPERATURE - LAPSE_RATE * np.minimum(_geopotential(h), TROPOPAUSE)
     return temperature
 
 
 @njit
 def isa_pressure(h: Scalar) -> Scalar:
     """Standard static pressure [Pa] at a height above sea level [m], up to 20 km."""
-    geopotential = GEOPOTENTIAL_RADIUS * h / (GEOPOTENTIAL_RADIUS + h)
+    geopotential = _geopotential(h)
     below = (isa_temperature(h) / SEA_LEVEL_TEMPERATURE) ** PRESSURE_EXPONENT
     above = np.exp(-np.maximum(geopotential - TROPOPAUSE, 0.0) / STRATOSPHERE_SCALE)
     pressure: Scalar = SEA_LEVEL_PRESSURE * below * above

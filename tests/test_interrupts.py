@@ -11,13 +11,14 @@ import time
 from pathlib import Path
 
 import pytest
+from worlds.programs import free_port
 
 COMMANDS = {
     "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
     "campaign": (["campaign", "static_bench", "--runs", "1000000"], r"what is finished is in .*; the same .*"),
     "check": (["check", "one.toml", "two.toml"], "nothing was concluded"),
     "papers": (["papers"], "nothing was written"),
-    "watch": (["watch", "udpin:127.0.0.1:0"], ""),
+    "watch": (["watch", f"udpin:127.0.0.1:{free_port()}"], ""),
 }
 
 

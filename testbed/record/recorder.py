@@ -29,6 +29,7 @@ import numpy as np
 
 from nav.columns import Estimates, FusedReports
 from nav.samples import ImuSamples, Sample, UpdateReport
+from testbed import interrupts
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.record import tables
@@ -328,15 +329,17 @@ class Recorder:
                         yield from _copy(self._file, column.offset, new, plan.offsets[name], written * column.row_bytes)
                     else:
                         _put(new, plan.offsets[name], blank((written, *column.shape), column.dtype).data.cast("B"))
-            self._file.close()
-        self._file = new
-        for path, plan in plans.items():
-            table = self._tables[path]
-            table.capacity, table.grown = plan.capacity, len(table.columns) > len(plan.columns)
-            for name, column in plan.columns.items():
-                column.offset = plan.offsets[name]
-        self._write_rows()
-        os.replace(_part(self.path), self.path)
+        with interrupts.held():  # between the old file and the new one, what is in which would not be known
+            if self._file is not None:
+                self._file.close()
+            self._file = new
+            for path, plan in plans.items():
+                table = self._tables[path]
+                table.capacity, table.grown = plan.capacity, len(table.columns) > len(plan.columns)
+                for name, column in plan.columns.items():
+                    column.offset = plan.offsets[name]
+            self._write_rows()
+            os.replace(_part(self.path), self.path)
 
     def _guard(self, write: Callable[[], None]) -> None:
         """Turn a full disk and the like into a message; what the file held before stays."""

@@ -52,7 +52,7 @@ def correlation_time(runs, tau):
 @pytest.mark.slow
 @pytest.mark.parametrize("grade", REAL)
 def test_white_and_correlated_errors_are_recovered(grade):
-    config = GnssConfig(grade=grade, rate_hz=RATE_HZ)
+    config = GnssConfig(grade=grade, rate_hz=RATE_HZ, jumps_per_h=0.0)  # jumps have tests of their own
     e = config.errors()
     found = [errors(config, seed) for seed in range(SEEDS)]
     for what, first, white, correlated, tau in [

@@ -134,14 +134,15 @@ MORE = [
     pytest.param(sign("gnss_position", PHI), "federated.outage_position_horizontal_rms_m", id="sign-lever-arm"),
     pytest.param(sign("gnss_position", POS), "ins.position_horizontal_rms_m", id="sign-gnss-position"),
     pytest.param(sign("barometer", POS), "ins.position_vertical_rms_m", id="sign-barometer"),
-    pytest.param(sign("sideslip", PHI), "federated.heading_rms_deg", id="sign-sideslip"),
+    pytest.param(sign("sideslip", PHI), "ins.outage_heading_std_deg", id="sign-sideslip-attitude"),
+    pytest.param(sign("sideslip", VEL), "federated.outage_position_north_rms_m", id="sign-sideslip-velocity"),
     pytest.param(noise("barometer"), "ins.outage_position_vertical_rms_m", id="R-x-100-barometer"),
-    pytest.param(noise("magnetometer"), "federated.nis_mean.magnetometer", id="R-x-100-magnetometer"),
+    pytest.param(noise("magnetometer"), "federated.heading_rms_deg", id="R-x-100-magnetometer"),
     *(
         pytest.param(noise(part), f"ins.nis_mean.{part}", id=f"R-x-100-{part}")
         for part in ("gnss_velocity", "airspeed", "sideslip")
     ),
-    pytest.param(noise("", 0.01), "ins.position_nees_mean", id="R-over-100"),
+    pytest.param(noise("", 0.01), "federated.velocity_nees_mean", id="R-over-100"),
 ]
 
 

@@ -185,3 +185,10 @@ def test_standard_atmosphere(h, pressure, temperature, density):
     assert earth.isa_temperature(h) == pytest.approx(temperature, abs=2e-3)
     assert earth.isa_density(h) == pytest.approx(density, rel=5e-5)
     assert earth.pressure_altitude(earth.isa_pressure(h)) == pytest.approx(h, abs=1e-6)
+
+
+@pytest.mark.parametrize("h", [-2e7, -7e6, -1e4, 1e5, 2e7])
+def test_a_height_that_no_air_is_at_is_taken_for_the_nearest_that_has_some(h):
+    edge = max(min(h, 80e3), -5e3)
+    for air in (earth.isa_pressure, earth.isa_temperature, earth.isa_density):
+        assert air(h) == air(edge) > 0.0

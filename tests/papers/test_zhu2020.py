@@ -219,7 +219,7 @@ def test_the_printed_solver_fails_where_the_right_ones_do_not(monkeypatch: pytes
 
 @pytest.mark.slow
 def test_one_draw_is_flown(tmp_path: Path) -> None:
-    draw = flight.fly(1, rarely=True)
+    draw = flight.fly(1)
     assert set(draw.river) >= {FRKF, TFKF, FRKF_ALONE, TFKF_ALONE}
     assert set(draw.outage) >= {FRKF_ALONE, DVL, AST, EQ13, EQ13_DEGREES, SHARED, SHARED_ALONE}
     assert draw.outage[AST].t[-1] == 2500.0

@@ -12,6 +12,7 @@ import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import h5py
@@ -24,6 +25,7 @@ from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.columns import Estimates
 from nav.samples import ImuSamples, Outcome, UpdateReport
+from testbed import interrupts
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.record import recorder as record
@@ -415,6 +417,48 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
             np.testing.assert_array_equal(after[group][name].values[:rows], before[group][name].values)
     rows = len(after["truth"]["time"])
     np.testing.assert_array_equal(after["truth"]["wind_n"], truth.wind_n[: 20 * rows : 20])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file that its owner did not close
+def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path) -> None:
+    """Raised at the n-th line of a flush that lays out a new file, wherever interrupts are not held."""
+    truth = circle(2.0)
+
+    def interrupted(path: Path, line: int) -> bool:
+        recorder = Recorder(path, scenario(), 3)
+        recorder.truth(truth.rows(0, 201))
+        recorder.flush()
+        recorder.truth(truth.rows(201, 401))
+        recorder.event(1.2, "info", "a table that the file lacks")
+        passed = 0
+
+        def trace(frame: FrameType, event: str, _: Any) -> Any:
+            nonlocal passed
+            if frame.f_code.co_filename != record.__file__:
+                return None
+            passed += event == "line"
+            if passed > line and not interrupts._held:
+                sys.settrace(None)
+                raise interrupts.Interrupted
+            return trace
+
+        sys.settrace(trace)
+        try:
+            recorder.flush()
+        except interrupts.Interrupted:
+            return True
+        finally:
+            sys.settrace(None)
+            recorder.close()
+        return False
+
+    interrupted(tmp_path / "whole.nc", 1_000_000)
+    whole, line = load(tmp_path / "whole.nc"), 0
+    while interrupted(tmp_path / "run.nc", line):
+        assert_same(whole, load(tmp_path / "run.nc"))
+        line += 1
+    assert line > 200
 
 
 def test_missing_damaged_and_foreign_files_are_told(tmp_path: Path, run_file: Path) -> None:
