@@ -191,7 +191,7 @@ def position_difference_n(lat: Scalar, lon: Scalar, h: Scalar, lat0: Scalar, lon
 
 @njit
 def _geopotential(h: Scalar) -> Scalar:
-    """Geopotential height [m] of a height above sea level [m], held where air is: a filter astray believes any height."""
+    """Geopotential height [m] of a height above sea level [m], held where air is: a filter may believe any."""
     held = np.minimum(np.maximum(h, ATMOSPHERE[0]), ATMOSPHERE[1])
     geopotential: Scalar = GEOPOTENTIAL_RADIUS * held / (GEOPOTENTIAL_RADIUS + held)
     return geopotential
