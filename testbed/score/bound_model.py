@@ -49,6 +49,7 @@ MOTION = 9
 PHI, VEL, POS = slice(0, 3), slice(3, 6), slice(6, 9)
 UNKNOWN_WIND = 20.0  # mean wind per axis, before anything is known of it [m/s]
 SLOWEST = 5.0  # along the tube, below which a pitot tube tells nothing [m/s]
+FIELD_EVERY = 50  # steps between which the Earth's magnetic field is taken as changing evenly
 EXACT_SLIP = 0.1  # of its own sigma: how exactly the slip is known to be what it is
 Measured: TypeAlias = Callable[[slice, int], tuple[Array, Array]]  # H (K, m, n) and 1-sigma (K, m) of one sample each
 Gusts: TypeAlias = tuple[slice, Array]  # their states, and their axes (K, 3, 3)
@@ -79,7 +80,7 @@ class Block:
         tau = self.correlation_s[part] if isinstance(self.correlation_s, np.ndarray) else self.correlation_s
         sigma = self.sigma if self.sigma.ndim == 1 else self.sigma[part]
         decay = np.exp(-T[:, None] / tau)
-        return decay, sigma**2 * (1 - decay**2)
+        return decay, 2 * sigma**2 * np.tanh(T[:, None] / tau)  # half before, half after: sigma^2 stays
 
 
 def constant(sigma: Array | Sequence[float]) -> Block:
@@ -131,13 +132,14 @@ class Model:
         return P
 
     def transition(self, part: slice) -> tuple[Array, Array, Array]:
-        """(Phi (K, 9, n), decay (K, n), variance (K, n)) of the steps in ``part``.
+        """(Phi (K, 9, c), decay (K, n), variance (K, n)) of the steps in ``part``.
 
-        The motion at the end of a step is Phi times all states at its beginning, any other state its own times its
-        decay; each gains its variance, white noise of the step. Phi = I + F T + (F T)^2 / 2, with F of the whole step.
+        The motion at the end of a step is Phi times the first c states at its beginning (no other drives it), any other
+        state its own times its decay; each gains its variance, white noise of the step. Phi = I + F T + (F T)^2 / 2,
+        with F of the whole step.
         """
         T = self.way.T[part]
-        FT = np.zeros((len(T), MOTION, self.size))
+        FT = np.zeros((len(T), MOTION, max((where.stop for _, where, _ in self.drives), default=MOTION)))
         _motion(FT, self.way, part)
         for onto, where, turned in self.drives:
             FT[:, onto, where] += turned[part]
@@ -325,7 +327,9 @@ def _add_magnetometer(model: Model, times: Array, config: MagnetometerConfig, da
     hard, soft = model.add(constant([e.hard_iron] * 3)), model.add(constant([e.soft_iron] * 9))
     wiring = model.add(constant([e.current] * 3))
     world = FieldMap(date)
-    field_n = np.array([world.field_n(*place) for place in way.lla.tolist()])
+    looked_up = np.unique(np.append(np.arange(0, len(way), FIELD_EVERY), len(way) - 1))
+    known = np.array([world.field_n(*place) for place in way.lla[looked_up].tolist()])
+    field_n = np.column_stack([np.interp(np.arange(len(way)), looked_up, axis) for axis in known.T])
     C_bn = way.C_nb.transpose(0, 2, 1)
     field_b = np.einsum("kij,kj->ki", C_bn, field_n)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import itertools
 from collections.abc import Callable
 from types import SimpleNamespace
 
@@ -37,7 +36,7 @@ EARTH = 7.292115e-5
 # --- the recursion
 
 
-def random_steps(rng: np.random.Generator, count: int) -> list[bound.Step]:
+def random_steps(rng: np.random.Generator, count: int) -> list[tuple[Array, Array, Array, Array]]:
     """Nine states that mix, three that decay, and five measurements, two of which are missing now and then."""
     found = []
     for _ in range(count):
@@ -51,8 +50,9 @@ def random_steps(rng: np.random.Generator, count: int) -> list[bound.Step]:
 
 def test_it_is_the_covariance_of_a_kalman_filter_and_the_inverse_of_tichavskys_information() -> None:
     steps, P = random_steps(np.random.default_rng(4), 30), np.diag(np.linspace(1.0, 4.0, 12))
-    J = np.linalg.inv(P)
-    for got, (Phi, decay, variance, H) in zip(bound.covariances(P, steps), steps, strict=True):
+    got, J = P.copy(), np.linalg.inv(P)
+    for Phi, decay, variance, H in steps:
+        told = bound.variances(got, *(one[None] for one in (Phi, decay, variance, H)))
         F = np.diag(decay)
         F[:9] = Phi
         Q = 0.5 * (F @ np.diag(variance) @ F.T + np.diag(variance))  # half of the noise before, half after
@@ -63,6 +63,7 @@ def test_it_is_the_covariance_of_a_kalman_filter_and_the_inverse_of_tichavskys_i
         J = D22 - D12.T @ np.linalg.inv(J + D11) @ D12
         np.testing.assert_allclose(got, P, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(got, np.linalg.inv(J), rtol=1e-6, atol=1e-8)
+        np.testing.assert_array_equal(told[0], np.diagonal(got)[:9])
 
 
 def test_it_stays_a_covariance_for_hours_with_a_mode_that_grows() -> None:
@@ -70,9 +71,21 @@ def test_it_stays_a_covariance_for_hours_with_a_mode_that_grows() -> None:
     axes = np.linalg.qr(rng.normal(size=(9, 9)))[0]
     Phi = np.hstack([axes @ np.diag(np.linspace(1.0, 1.01, 9)) @ axes.T, np.zeros((9, 3))])
     step = Phi, np.ones(12), np.full(12, 1e-6), rng.normal(size=(5, 12))
-    *_, P = (P.copy() for P in bound.covariances(np.eye(12), itertools.repeat(step, 10_000)))
+    P = np.eye(12)
+    bound.variances(P, *(np.repeat(one[None], 10_000, 0) for one in step))
     np.testing.assert_array_equal(P, P.T)
     assert np.linalg.eigvalsh(P)[0] > 0
+
+
+@pytest.mark.parametrize("step_s", [0.1, 0.5, 5.0])
+def test_an_error_of_first_order_keeps_its_spread_and_its_correlation(step_s: float) -> None:
+    """Measured once, exactly, it is back at sigma^2 (1 - exp(-2 t / tau)) after t, whatever the steps are."""
+    T, sigma, tau = np.full(round(50 / step_s), step_s), np.linspace(0.5, 4.0, 8), 10.0
+    decay, variance = model.gauss_markov(sigma, tau).step(T, slice(0, len(T)))
+    for start, end in ((1.0, 1.0), (0.0, 1 - np.exp(-2 * 50 / tau))):
+        P = start * np.diag(sigma**2)
+        bound.variances(P, np.zeros((len(T), 0, 8)), decay.repeat(8, 1), variance, np.zeros((len(T), 1, 8)))
+        np.testing.assert_allclose(np.diagonal(P), end * sigma**2, rtol=1e-9)
 
 
 # --- the model, by finite differences of motion and measurements
@@ -276,7 +289,7 @@ def test_a_simulated_outage_has_a_bound_for_each_estimator_of_position(short: Ru
 @pytest.mark.ci
 def test_finer_steps_and_fewer_sensors(short: RunResult) -> None:
     usual = bound.of_run(short.dataset)["ins"].horizontal_at(100.0)
-    assert bound.of_run(short.dataset, 0.2)["ins"].horizontal_at(100.0) == pytest.approx(usual, rel=0.015)
+    assert bound.of_run(short.dataset, 0.1)["ins"].horizontal_at(100.0) == pytest.approx(usual, rel=1e-3)
     blind = short.dataset.copy()
     text = str(blind.attrs["scenario"])
     blind.attrs["scenario"] = text.replace('["gnss", "barometer", "magnetometer", "airspeed"]', '["gnss", "barometer"]')
