@@ -125,3 +125,12 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
     Compiled by itself first, it would be compiled twice.
     """
     return _compiled(function, inline="always")
+
+
+def lean(function: Callable[P, R]) -> Callable[P, R]:
+    """As `njit`, without counting the references to arrays, which takes a fifth of the time where these are small.
+
+    For a kernel that makes no array, and neither hands one back nor calls what does; views are no arrays made. Numba
+    refuses to compile one that makes an array, or calls what does and is not compiled yet.
+    """
+    return _compiled(function, no_cfunc_wrapper=True, _nrt=False)

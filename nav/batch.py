@@ -9,6 +9,7 @@ is not what it seemed to be; that is left to the filter.
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Mapping, Sequence
 from copy import copy
 from typing import NamedTuple, Protocol
@@ -17,7 +18,7 @@ import numpy as np
 
 from nav._jit import inlined, njit
 from nav.aids import MagnetometerAid, problem
-from nav.aids.airspeed import airspeed, is_slow, sideslip
+from nav.aids.airspeed import Silence, airspeed, is_slow, sideslip
 from nav.aids.barometer import barometer
 from nav.aids.base import Kind, PlainAid
 from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
@@ -134,7 +135,7 @@ class Batch:
         The last fix that was used was of the time ``last_fix``.
         """
         known = self._known()
-        plan = self._plan(taker, known, steps, last_fix)
+        plan, silences = self._plan(taker, known, steps, last_fix)
         if not len(plan):
             return 0, last_bad
         imu, (common, filters, n) = ahead.imu, state.shape
@@ -153,13 +154,18 @@ class Batch:
         ahead.next, ahead.t = done.row, done.t
         if done.reports:
             reports.append(self._reports(plan, told[: done.reports]))
+        listening = self._listening
+        if silences and done.steps == len(plan):  # they have heard just these
+            for filter_, silence in zip(listening, silences, strict=True):
+                filter_.silence = silence
+            listening = []
         whats, then = plan[:, WHAT].tolist(), iter(when.tolist())
         status: list[Status] = []
         for (t, _, sample), what in zip(steps[: done.steps], whats, strict=False):
             if sample is not None:
                 taker.took(sample)
                 if what >= 0:
-                    for filter_ in self._listening:
+                    for filter_ in listening:
                         filter_.stand_in(sample)
             elif t == t:
                 status.append(taker.status(*next(then)))
@@ -204,10 +210,11 @@ class Batch:
 
     def _plan(
         self, taker: Taker, known: Mapping[str, tuple[int, PlainAid]], steps: Sequence[Step], last_fix: float
-    ) -> Array:
-        """The first of the ``steps`` that look plain, as rows for `follow`."""
+    ) -> tuple[Array, list[Silence]]:
+        """The first of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard."""
         flat: list[float] = []
-        silences = [copy(filter_.silence) for filter_ in self._listening]
+        silences = [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
+        heard = silences
         for t, horizon, sample in steps:
             if sample is None:
                 flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
@@ -224,12 +231,13 @@ class Batch:
                 last_fix = t
             elif problem(sample):
                 break
-            if silences and any([silence.stand_in(sample) for silence in silences if silence is not None]):
+            if silences and any([silence.stand_in(sample) for silence in silences]):
+                heard = []  # one sample too many
                 break
             flat += (t, t, row, *aid.numbers(sample))
             if taker.pauses(t):
                 break
-        return np.array(flat).reshape(-1, WIDTH)
+        return np.frombuffer(array("d", flat)).reshape(-1, WIDTH), heard
 
 
 @njit

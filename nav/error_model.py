@@ -41,7 +41,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from nav._jit import inlined, njit
+from nav._jit import inlined, lean
 from nav.earth import OMEGA_IE, gravity_of, radii_of
 from nav.samples import Array
 
@@ -253,7 +253,7 @@ class ErrorModel:
         return np.array([self.slices[name].start + axis for name, axes in states.items() for axis in axes])
 
 
-@njit
+@lean
 def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
     """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values.
 

@@ -10,8 +10,8 @@ import math
 
 import numpy as np
 
-from nav._jit import inlined, njit
-from nav.matrix import multiply
+from nav._jit import inlined, lean, njit
+from nav.matrix import add_symmetric, multiply
 from nav.samples import Array
 
 CRITICAL = 1e9  # of the variance that a measurement is predicted with over its own: rounding may take all that is left
@@ -64,8 +64,18 @@ def innovate(P: Array, H: Array, R: Array, nu: Array) -> tuple[Array, Array, Arr
     ``H`` (m, n), variances ``R`` (m,). When rounding has left S not positive definite, nis is NaN.
     """
     m, n = H.shape
-    S, HP = np.zeros((m, m)), np.zeros((m, n))
+    S, HP, inverses = np.empty((m, m)), np.empty((m, n)), np.empty((2 * m, m))
+    nis = _innovate(P, H, R, nu, S, HP, inverses)
+    return S, inverses[:m], HP, nis
+
+
+@lean
+def _innovate(P: Array, H: Array, R: Array, nu: Array, S: Array, HP: Array, inverses: Array) -> float:
+    """`innovate` into ``S`` (m, m), ``HP`` (m, n) and the first half of ``inverses`` (2 m, m); nis."""
+    m, n = H.shape
     for i in range(m):
+        for j in range(n):
+            HP[i, j] = 0.0
         for k in range(n):
             a = H[i, k]
             if a != 0.0:
@@ -78,29 +88,46 @@ def innovate(P: Array, H: Array, R: Array, nu: Array) -> tuple[Array, Array, Arr
                 if H[i, k] != 0.0:
                     total += H[i, k] * HP[j, k]
             S[i, j] = S[j, i] = total
-    S_inverse, definite = invert(S)
-    nis = 0.0 if definite else math.nan
+    nis = 0.0 if _invert(S, inverses[:m], inverses[m:]) else math.nan
     for i in range(m):
         for j in range(m):
-            nis += nu[i] * S_inverse[i, j] * nu[j]
-    return S, S_inverse, HP, nis
+            nis += nu[i] * inverses[i, j] * nu[j]
+    return nis
 
 
 @njit
 def update(x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float) -> tuple[Array, float]:
     """`innovate` and, if nis is at most ``threshold``, `correct` ``x`` (n,) and ``P`` (n, n) in place; (S, nis)."""
-    S, S_inverse, HP, nis = innovate(P, H, R, nu)
-    if nis <= threshold:
-        critical = is_critical(P, H, R)
-        correction = correct(P, H, R, HP, S_inverse, nu)
-        if critical:
-            keep_positive(P)
-        for i in range(len(x)):
-            x[i] += correction[i]
+    S, inverses, work = room(len(nu), len(x))
+    nis, critical = update_in(x, P, H, R, nu, threshold, S, inverses, work)
+    if critical:
+        keep_positive(P)
     return S, nis
 
 
-@njit
+@inlined
+def room(m: int, n: int) -> tuple[Array, Array, Array]:
+    """S (m, m), and what `update_in` works in, of ``m`` measurements and ``n`` states."""
+    return np.empty((m, m)), np.empty((2 * m, m)), np.empty((4 * m + 2, n))
+
+
+@lean
+def update_in(
+    x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float, S: Array, inverses: Array, work: Array
+) -> tuple[float, bool]:
+    """`update` in the arrays of `room`; nis, and whether P is still to be kept positive (`is_critical`)."""
+    m = len(nu)
+    HP, correction, critical = work[:m], work[4 * m + 1], False
+    nis = _innovate(P, H, R, nu, S, HP, inverses)
+    if nis <= threshold:
+        critical = is_critical(P, H, R)
+        _correct(P, H, R, inverses, nu, work)
+        for i in range(len(x)):
+            x[i] += correction[i]
+    return nis, critical
+
+
+@lean
 def is_critical(P: Array, H: Array, R: Array) -> bool:
     """Whether rounding may leave ``P`` indefinite after an update by ``H`` (m, n) and variances ``R`` (m,).
 
@@ -174,8 +201,17 @@ def keep_positive(P: Array) -> None:
 @njit
 def invert(S: Array) -> tuple[Array, bool]:
     """Inverse of a symmetric positive definite ``S`` (m, m) by Cholesky, and whether it was positive definite."""
+    inverse = np.empty_like(S)
+    return inverse, _invert(S, inverse, np.empty_like(S))
+
+
+@lean
+def _invert(S: Array, inverse: Array, L: Array) -> bool:
+    """`invert` into ``inverse``, zeros where it fails; ``L`` (m, m) is scratch."""
     m = len(S)
-    L, inverse = np.zeros((m, m)), np.zeros((m, m))
+    for i in range(m):
+        for j in range(m):
+            inverse[i, j] = 0.0
     for i in range(m):
         for j in range(i + 1):
             total = S[i, j]
@@ -186,7 +222,7 @@ def invert(S: Array) -> tuple[Array, bool]:
             elif total > 0.0:
                 L[i, i] = math.sqrt(total)
             else:
-                return inverse, False
+                return False
     for column in range(m):
         # L y = e_column, then L' (column of the inverse) = y, in place
         for i in range(column, m):
@@ -199,10 +235,10 @@ def invert(S: Array) -> tuple[Array, bool]:
             for k in range(i + 1, m):
                 total -= L[k, i] * inverse[k, column]
             inverse[i, column] = total / L[i, i]
-    return inverse, True
+    return True
 
 
-@inlined
+@njit
 def correct(P: Array, H: Array, R: Array, HP: Array, S_inverse: Array, nu: Array) -> Array:
     """Update ``P`` in place and return K nu (n,), what to add to the estimate; K = P H' S^-1, in Joseph's form:
 
@@ -211,33 +247,47 @@ def correct(P: Array, H: Array, R: Array, HP: Array, S_inverse: Array, nu: Array
     It stays symmetric and positive for any gain, whatever rounding did to K. The other arguments as in `innovate`.
     """
     m, n = H.shape
-    KT, correction = np.zeros((m, n)), np.zeros(n)  # K', so that every inner loop runs along a row
+    work = np.empty((4 * m + 2, n))
+    work[:m] = HP
+    _correct(P, H, R, S_inverse, nu, work)
+    correction: Array = work[4 * m + 1]
+    return correction
+
+
+@lean
+def _correct(P: Array, H: Array, R: Array, S_inverse: Array, nu: Array, work: Array) -> None:
+    """`correct` with H P in the first rows of ``work`` (4 m + 2, n), and K nu in its last."""
+    m, n = H.shape
+    right, left, column, correction = work[: 2 * m], work[2 * m : 4 * m], work[4 * m], work[4 * m + 1]
+    HP, KT, factor = right[:m], right[m:], left[m:]  # K', so that every inner loop runs along a row
+    for i in range(n):
+        correction[i] = 0.0
     for j in range(m):
+        for i in range(n):
+            KT[j, i] = 0.0
         for k in range(m):
             for i in range(n):
                 KT[j, i] += S_inverse[k, j] * HP[k, i]
         for i in range(n):
             correction[i] += KT[j, i] * nu[j]
-    # left = (I - K H) P in place, then P = left (I - K H)' + K R K' = left + (K R - left H') K'
-    for i in range(n):
+            left[j, i] = -KT[j, i]
+            factor[j, i] = KT[j, i] * R[j]
+    # (I - K H) P (I - K H)' + K R K' = P - K H P + (K R - (P - K H P) H') K', by what H sees of P - K H P
+    for j in range(n):
+        seen = False
         for k in range(m):
-            a = KT[k, i]
-            for j in range(n):
-                P[i, j] -= a * HP[k, j]
-    factor = np.zeros((m, n))
-    for k in range(m):
+            seen = seen or H[k, j] != 0.0
+        if not seen:
+            continue
         for i in range(n):
-            factor[k, i] = KT[k, i] * R[k]
-        for j in range(n):
+            column[i] = P[i, j]
+        for k in range(m):
+            a = HP[k, j]
+            for i in range(n):
+                column[i] += left[k, i] * a
+        for k in range(m):
             h = H[k, j]
             if h != 0.0:
                 for i in range(n):
-                    factor[k, i] -= P[i, j] * h
-    for i in range(n):
-        for k in range(m):
-            a = factor[k, i]
-            for j in range(i, n):
-                P[i, j] += a * KT[k, j]
-        for j in range(i + 1, n):
-            P[j, i] = P[i, j]
-    return correction
+                    factor[k, i] -= column[i] * h
+    add_symmetric(P, left, right)

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.samples import Array
 
 # Below this squared angle the power series replace sin and cos: exact to rounding there, and faster.
@@ -87,6 +87,22 @@ def quat_from_rotvec(phi: Array) -> Array:
     quarter = 0.25 * (phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
     sinc, versine, _ = rotation_coefficients(quarter)
     return np.array([1 - quarter * versine, 0.5 * sinc * phi[0], 0.5 * sinc * phi[1], 0.5 * sinc * phi[2]])
+
+
+@lean
+def turn(q: Array, x: float, y: float, z: float) -> None:
+    """Turn ``q`` (4,) in place by the rotation vector (x, y, z) [rad]: exp(phi / 2) q, scaled to unit norm."""
+    quarter = 0.25 * (x * x + y * y + z * z)
+    sinc, versine, _ = rotation_coefficients(quarter)
+    p, px, py, pz = 1 - quarter * versine, 0.5 * sinc * x, 0.5 * sinc * y, 0.5 * sinc * z
+    w, qx, qy, qz = (
+        p * q[0] - px * q[1] - py * q[2] - pz * q[3],
+        p * q[1] + px * q[0] + py * q[3] - pz * q[2],
+        p * q[2] - px * q[3] + py * q[0] + pz * q[1],
+        p * q[3] + px * q[2] - py * q[1] + pz * q[0],
+    )
+    norm = math.sqrt(w * w + qx * qx + qy * qy + qz * qz)
+    q[0], q[1], q[2], q[3] = w / norm, qx / norm, qy / norm, qz / norm
 
 
 @njit

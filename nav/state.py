@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nav._jit import inlined, njit
+from nav._jit import inlined, lean, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition, uncross
-from nav.kalman import predict, update
-from nav.rotation import quat_conjugate, quat_from_rotvec, quat_multiply, quat_normalise
+from nav.kalman import keep_positive, predict, room, update_in
+from nav.rotation import turn
 from nav.samples import Array
 from nav.strapdown import step
 from nav.unscented import predict as predict_points
@@ -91,7 +91,7 @@ def known(wholes: Array, common: int, filters: int, n: int) -> Known:
     )  # fmt: skip
 
 
-@njit
+@inlined
 def parts(
     whole: Array, common: int, filters: int, n: int
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
@@ -105,7 +105,7 @@ def parts(
     )  # fmt: skip
 
 
-@njit
+@inlined
 def working(room: Array, common: int, n: int) -> tuple[Array, Array, Array, Array]:
     """Where a covariance step works in: two matrices of `transition`, decay and half noise of each state."""
     matrix = MOTION * common
@@ -124,24 +124,34 @@ def absorb(
 
     With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
     """
+    S, inverses, work = room(len(nu), n)
+    nis, critical = _absorb(whole, common, filters, n, row, driven, nu, H, R, threshold, close, S, inverses, work)
+    if critical:
+        keep_positive(parts(whole, common, filters, n)[5][row])
+    return S, nis
+
+
+@lean
+def _absorb(
+    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices,
+    nu: Array, H: Array, R: Array, threshold: float, close: bool, S: Array, inverses: Array, work: Array,
+) -> tuple[float, bool]:  # fmt: skip
+    """`absorb` in the arrays of `kalman.room`; nis, and whether P is still to be kept positive."""
     q_nb, v_n, lla, imu, x, P, errors, _, _, _, _ = parts(whole, common, filters, n)
-    S, nis = update(x[row], P[row], H, R, nu, threshold)
+    nis, critical = update_in(x[row], P[row], H, R, nu, threshold, S, inverses, work)
     if close and nis <= threshold:
         inject(q_nb, v_n, lla, imu, x[row])
         for i in range(common):
             x[row, i] = 0.0
         sensor_errors(errors, imu, driven)
-    return S, nis
+    return nis, critical
 
 
-@njit
+@lean
 def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -> None:
     """Add a correction (of the common states at least) to the nominal state, with the sign of `kalman.correct`."""
     # C_nb_hat = (I - [phi x]) C_nb, and the correction is minus phi's estimate
-    turn = quat_conjugate(quat_from_rotvec(correction[PHI : PHI + 3]))
-    turned = quat_normalise(quat_multiply(turn, q_nb))
-    for i in range(4):
-        q_nb[i] = turned[i]
+    turn(q_nb, -correction[PHI], -correction[PHI + 1], -correction[PHI + 2])
     for i in range(3):
         v_n[i] += correction[VEL + i]
     R_M, R_N = radii(lla[0])
@@ -152,7 +162,7 @@ def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -
         imu[i] += correction[i]
 
 
-@njit
+@inlined
 def _covariance_step(
     v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,
@@ -188,7 +198,7 @@ def _covariance_step(
     _empty(sums, elapsed)
 
 
-@njit
+@lean
 def _add_motion(half_noise: Array, in_motion: Array, sums: Array, shaking: Array, lla: Array, T: float) -> None:
     """Add what motion and vibration over ``T`` seconds do to half of the noise of attitude and velocity.
 
@@ -210,7 +220,7 @@ def _add_motion(half_noise: Array, in_motion: Array, sums: Array, shaking: Array
         half_noise[VEL + i] += 0.5 * dv
 
 
-@njit
+@lean
 def _shake(shaking: Array, rates: Array, dtheta: Array, dv: Array, T: float) -> None:
     """Learn from one sound increment how noisy increments are, ``rates`` being those of the one before.
 
@@ -239,7 +249,7 @@ def _shake(shaking: Array, rates: Array, dtheta: Array, dv: Array, T: float) -> 
     shaking[2, 2] = T
 
 
-@njit
+@lean
 def _empty(sums: Array, elapsed: Array) -> None:
     """Begin the integrals anew."""
     for i in range(3):
@@ -276,7 +286,7 @@ def sigma_step(
     return error
 
 
-@njit
+@lean
 def propagate(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
@@ -290,7 +300,7 @@ def propagate(
     Phi, FT, decay, half_noise = working(room, common, n)
     bad = -1
     shaken = in_motion[0, 2] > 0.0
-    angle, push, before = np.empty(3), np.empty(3), np.empty(4)
+    angle, push, before = FT[0, :3], FT[1, :3], FT[2, :4]  # done with when a covariance step needs the room
     for k in range(len(dt) + 1):
         T = dt[k] if k < len(dt) else 0.0
         if T > 0.0:

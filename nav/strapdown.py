@@ -17,13 +17,13 @@ import math
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.earth import E2, GRAVITY_EQUATOR, OMEGA_IE, SOMIGLIANA_K, A, F, M, wrap_longitude
 from nav.rotation import rotation_coefficients
 from nav.samples import Array, ImuSamples
 
 
-@njit
+@lean
 def step(q_nb: Array, v_n: Array, lla: Array, dtheta: Array, dv: Array, dt: float) -> None:
     """Advance ``q_nb`` (4,), ``v_n`` (3,) [m/s] and ``lla`` [lat, lon, h] in place by one IMU interval.
 

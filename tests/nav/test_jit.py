@@ -6,9 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.errors import LoweringError, TypingError
 
 import nav
+from nav._jit import lean, njit
+from nav.samples import Array
 
 SCRIPT = """
 from nav import earth
@@ -85,3 +89,23 @@ def test_nowhere_to_keep_kernels_is_said_once_and_they_are_compiled_all_the_same
     assert run.stderr.count("\n") == 1
     assert "NUMBA_CACHE_DIR" in run.stderr
     assert not list(temporary.iterdir())
+
+
+def test_a_kernel_that_counts_no_references_may_not_make_an_array_nor_call_what_makes_one():
+    """Nobody would free it."""
+
+    @lean
+    def makes(n: int) -> float:
+        return float(np.zeros(n)[0])
+
+    @njit
+    def twice(v: Array) -> Array:
+        return np.array([2.0 * v[0]])
+
+    @lean
+    def calls(v: Array) -> float:
+        return float(twice(v)[0])
+
+    for kernel, argument in ((makes, 3), (calls, np.ones(1))):
+        with pytest.raises((TypingError, LoweringError)):
+            kernel(argument)

@@ -5,13 +5,18 @@ import pytest
 from numba.core.errors import TypingError
 
 from nav._jit import njit
-from nav.matrix import LANES, multiply
+from nav.matrix import LANES, add_symmetric, multiply
 from nav.samples import Array
 
 
 @njit
 def product(out: Array, A: Array, B: Array, first: int, stop: int, C: Array, D: Array, columns: int) -> None:
     multiply(out, A, B, first, stop, C, D, columns)
+
+
+@njit
+def add(P: Array, C: Array, D: Array) -> None:
+    add_symmetric(P, C, D)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 5, 9])
@@ -44,6 +49,27 @@ def test_sums_one_term_after_the_other():
                 expected[i, j] += C[k, i] * D[k, j]
     product(out, A, B, 2, 15, C, D, 17)
     np.testing.assert_array_equal(out, expected)
+
+
+@pytest.mark.parametrize("n", [1, 6, LANES, 9, 15, 16, 17, 39])
+@pytest.mark.parametrize("terms", [0, 1, 2, 6])
+def test_adds_to_a_symmetric_matrix_one_term_after_the_other(n, terms):
+    rng = np.random.default_rng(n + terms)
+    C, root = 10.0 ** rng.uniform(-4, 4, (terms, n)), rng.normal(size=(n, n))
+    D, P = C * rng.normal(size=(terms, 1)), root @ root.T
+    P = np.tril(P) + np.tril(P, -1).T
+    expected = P.copy()
+    for i in range(n):
+        for j in range(i, n):
+            for k in range(terms):
+                expected[i, j] += C[k, i] * D[k, j]
+            expected[j, i] = expected[i, j]
+    wide = np.full((n, n + 3), 7.0)
+    wide[:, :n] = P
+    add(wide[:, :n], C, D)
+    np.testing.assert_array_equal(wide[:, :n], expected)
+    assert (wide[:, n:] == 7.0).all()
+    np.testing.assert_allclose(expected, P + C.T @ D, rtol=1e-10, atol=1e-9)
 
 
 def test_what_it_cannot_multiply_is_refused():

@@ -53,6 +53,8 @@ def test_product_inverse_and_rotated_vector(phi, psi, v):
     assert np.abs(rotation.quat_rotate(p, v) - scipy_from(p).apply(v)).max() < 2e-15
     assert np.abs(rotation.quat_rotate(rotation.quat_conjugate(p), rotation.quat_rotate(p, v)) - v).max() < 2e-15
     assert np.abs(rotation.quat_normalise(3.0 * q) - q).max() < 1e-15
+    rotation.turn(q, *phi)
+    assert same_rotation(q, product) < 1e-15
 
 
 @settings(deadline=None)
