@@ -41,6 +41,7 @@ from nav.increments import (
     share,
     take_off,
 )
+from nav.kalman import scratch
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
@@ -257,6 +258,7 @@ def follow(
     """
     q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
+    S_one, (S_three, inverses, updating) = np.empty((1, 1)), scratch(3, n)
     written = drafted = 0
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
@@ -325,7 +327,11 @@ def follow(
                 statistic = whiten(nu, S)[1]
                 if not statistic <= limit:
                     return k, part, row, now, last_bad, written, drafted
-            S, nis = absorb(whole, common, filters, n, f, driven, nu, H, R, limit if closed else math.inf, closed)
+            S = S_three if len(nu) == 3 else S_one  # no plain part has two axes
+            threshold = limit if closed else math.inf
+            nis = absorb(
+                whole, common, filters, n, f, driven, nu, H, R, threshold, closed, S, inverses, updating
+            )  # fmt: skip
             if closed:
                 statistic = nis
                 if not nis <= limit:

@@ -98,33 +98,32 @@ def _innovate(P: Array, H: Array, R: Array, nu: Array, S: Array, HP: Array, inve
 @njit
 def update(x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float) -> tuple[Array, float]:
     """`innovate` and, if nis is at most ``threshold``, `correct` ``x`` (n,) and ``P`` (n, n) in place; (S, nis)."""
-    S, inverses, work = room(len(nu), len(x))
-    nis, critical = update_in(x, P, H, R, nu, threshold, S, inverses, work)
-    if critical:
-        keep_positive(P)
-    return S, nis
+    S, inverses, work = scratch(len(nu), len(x))
+    return S, update_in(x, P, H, R, nu, threshold, S, inverses, work)
 
 
 @inlined
-def room(m: int, n: int) -> tuple[Array, Array, Array]:
-    """S (m, m), and what `update_in` works in, of ``m`` measurements and ``n`` states."""
-    return np.empty((m, m)), np.empty((2 * m, m)), np.empty((4 * m + 2, n))
+def scratch(m: int, n: int) -> tuple[Array, Array, Array]:
+    """S (m, m), and what `update_in` works in, of ``m`` measurements and ``n`` states; the latter may be larger."""
+    return np.empty((m, m)), np.empty((2 * m, m)), np.empty((4 * m + 3 + n, n))
 
 
 @lean
 def update_in(
     x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float, S: Array, inverses: Array, work: Array
-) -> tuple[float, bool]:
-    """`update` in the arrays of `room`; nis, and whether P is still to be kept positive (`is_critical`)."""
+) -> float:
+    """`update` in the arrays of `scratch`; nis."""
     m = len(nu)
-    HP, correction, critical = work[:m], work[4 * m + 1], False
+    HP, correction = work[:m], work[4 * m + 1]
     nis = _innovate(P, H, R, nu, S, HP, inverses)
     if nis <= threshold:
         critical = is_critical(P, H, R)
         _correct(P, H, R, inverses, nu, work)
+        if critical:
+            _keep_positive(P, work[4 * m + 2 :])
         for i in range(len(x)):
             x[i] += correction[i]
-    return nis, critical
+    return nis
 
 
 @lean
@@ -152,12 +151,19 @@ def is_positive(P: Array, share: float) -> bool:
     By Cholesky on ``P`` scaled to a unit diagonal: the units of the states differ by 1e12. Rows of zeros, states that
     are not in use, are left out.
     """
+    return _is_positive(P, share, np.empty((len(P) + 1, len(P))))
+
+
+@lean
+def _is_positive(P: Array, share: float, work: Array) -> bool:
+    """`is_positive`; ``work`` (n + 1, n) or larger is scratch."""
     n = len(P)
-    L, scale = np.zeros((n, n)), np.zeros(n)
+    L, scale = work[1:], work[0]
     for i in range(n):
         if P[i, i] > 0.0:
             scale[i] = 1.0 / math.sqrt(P[i, i])
         else:
+            scale[i] = 0.0
             for j in range(n):
                 if P[i, j] != 0.0:
                     return False
@@ -182,7 +188,13 @@ def keep_positive(P: Array) -> None:
     The share is the least power of ten that does it, so that no more is claimed than is known. A variance that has
     become negative itself is given back its size, without correlations.
     """
-    if is_positive(P, 0.0):
+    _keep_positive(P, np.empty((len(P) + 1, len(P))))
+
+
+@lean
+def _keep_positive(P: Array, work: Array) -> None:
+    """`keep_positive`; ``work`` (n + 1, n) is scratch."""
+    if _is_positive(P, 0.0, work):
         return
     n = len(P)
     for i in range(n):
@@ -192,7 +204,7 @@ def keep_positive(P: Array) -> None:
                     P[i, j] = P[j, i] = 0.0
             P[i, i] = -P[i, i]
     share = MARGIN
-    while share < 1.0 and not is_positive(P, share):
+    while share < 1.0 and not _is_positive(P, share, work):
         share *= 10.0
     for i in range(n):
         P[i, i] += share * P[i, i]
@@ -254,7 +266,7 @@ def correct(P: Array, H: Array, R: Array, HP: Array, S_inverse: Array, nu: Array
     return correction
 
 
-@lean
+@inlined
 def _correct(P: Array, H: Array, R: Array, S_inverse: Array, nu: Array, work: Array) -> None:
     """`correct` with H P in the first rows of ``work`` (4 m + 2, n), and K nu in its last."""
     m, n = H.shape

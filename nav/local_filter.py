@@ -30,7 +30,7 @@ from nav.aids.base import (
 from nav.aids.gnss import Contradiction, GnssAid
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
-from nav.kalman import innovate
+from nav.kalman import innovate, scratch
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
 from nav.samples import Array, BarometerSample, GnssSample, Outcome, Sample, UpdateReport
@@ -263,8 +263,9 @@ class LocalFilter:
             assert at_points is not None
             return self._absorb_points(reference, s, at_points, H, R, threshold)
         before = s.P[self.row].copy() if self.smoother is not None else None
-        S, nis = absorb(
-            s.whole, *s.shape, self.row, reference.driven, nu, H, R, threshold, self.closed
+        S, inverses, work = scratch(len(nu), s.shape[2])
+        nis = absorb(
+            s.whole, *s.shape, self.row, reference.driven, nu, H, R, threshold, self.closed, S, inverses, work
         )  # fmt: skip
         if self.smoother is not None and before is not None and nis <= threshold:
             self.smoother.updated(before, H, nu, S)

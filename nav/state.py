@@ -14,7 +14,7 @@ from nav._jit import inlined, lean, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition, uncross
-from nav.kalman import keep_positive, predict, room, update_in
+from nav.kalman import predict, update_in
 from nav.rotation import turn
 from nav.samples import Array
 from nav.strapdown import step
@@ -115,36 +115,24 @@ def working(room: Array, common: int, n: int) -> tuple[Array, Array, Array, Arra
     )  # fmt: skip
 
 
-@njit
-def absorb(
-    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices,
-    nu: Array, H: Array, R: Array, threshold: float, close: bool,
-) -> tuple[Array, float]:  # fmt: skip
-    """One measurement into filter ``row`` of a `State` if its nis is at most ``threshold``; (S, nis).
-
-    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`.
-    """
-    S, inverses, work = room(len(nu), n)
-    nis, critical = _absorb(whole, common, filters, n, row, driven, nu, H, R, threshold, close, S, inverses, work)
-    if critical:
-        keep_positive(parts(whole, common, filters, n)[5][row])
-    return S, nis
-
-
 @lean
-def _absorb(
-    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices,
-    nu: Array, H: Array, R: Array, threshold: float, close: bool, S: Array, inverses: Array, work: Array,
-) -> tuple[float, bool]:  # fmt: skip
-    """`absorb` in the arrays of `kalman.room`; nis, and whether P is still to be kept positive."""
+def absorb(
+    whole: Array, common: int, filters: int, n: int, row: int, driven: Indices, nu: Array, H: Array, R: Array,
+    threshold: float, close: bool, S: Array, inverses: Array, work: Array,
+) -> float:  # fmt: skip
+    """One measurement into filter ``row`` of a `State` if its nis is at most ``threshold``; nis.
+
+    With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`; ``S``
+    (m, m) and what it works in as of `kalman.scratch`.
+    """
     q_nb, v_n, lla, imu, x, P, errors, _, _, _, _ = parts(whole, common, filters, n)
-    nis, critical = update_in(x[row], P[row], H, R, nu, threshold, S, inverses, work)
+    nis = update_in(x[row], P[row], H, R, nu, threshold, S, inverses, work)
     if close and nis <= threshold:
         inject(q_nb, v_n, lla, imu, x[row])
         for i in range(common):
             x[row, i] = 0.0
         sensor_errors(errors, imu, driven)
-    return nis, critical
+    return nis
 
 
 @lean

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from worlds import real_flights
 
+from nav import kalman
 from nav.earth import displacement_n
 from nav.error_model import PHI
 from nav.ins import Ins
@@ -135,7 +136,8 @@ class Smoothed:
                     nu = true.x[0, where] - state.x[0, where]
                 H = np.eye(state.shape[2])[where]
                 R = np.full(len(nu), TOLD[name] ** 2)
-                absorb(state.whole, *state.shape, 0, ins.model.driven, nu, H, R, np.inf, True)
+                room = kalman.scratch(len(nu), state.shape[2])
+                absorb(state.whole, *state.shape, 0, ins.model.driven, nu, H, R, np.inf, True, *room)
 
         return tell
 
