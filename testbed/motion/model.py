@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+import struct
 import subprocess
 import sys
 from array import array
@@ -79,6 +80,7 @@ LINEAR_STATE: Mapping[str, str] = {
     "phi-rad": "velocities/phidot-rad_sec",
     "theta-rad": "velocities/thetadot-rad_sec",
 }
+VALUE = jsbsim.FGPropertyNode.get_double_value
 ENGINE_SETTLING_S = 3.0
 IDLING_S = 5.0  # before a run that starts on the ground
 TRIMMED_THROTTLE = 0.5  # to which the loops add
@@ -120,7 +122,7 @@ class Aircraft:
         self.rate_hz = rate_hz
         if self.fdm.get_property_manager().get_node(MOTOR_CURRENT) is None:
             self.fdm[MOTOR_CURRENT] = 0.0  # an engine that burns fuel has none
-        self._read = [self._node(name).get_double_value for name in STATE]
+        self._nodes = [self._node(name) for name in STATE]
         tanks = (f"propulsion/tank[{number}]/contents-lbs" for number in itertools.count())
         self._tanks = list(itertools.takewhile(self.fdm.get_property_manager().get_node, tanks))
         self._command = [
@@ -151,17 +153,18 @@ class Aircraft:
 
     def read(self) -> list[float]:
         """One row of `STATE`, in JSBSim's units."""
-        return [get() for get in self._read]
+        return list(map(VALUE, self._nodes))
 
     def run(self, steps: int, rows: array[float]) -> list[float]:
         """Fly ``steps`` ticks, appending a row of `STATE` for each; returns the last."""
-        run, read, append = self.fdm.run, self._read, rows.fromlist
-        row: list[float] = []
+        run, nodes = self.fdm.run, self._nodes
+        flown: list[float] = []
+        read = flown.extend  # no list for each row, and packed all at once: every step of Python counts here
         for _ in range(steps):
             run()
-            row = [get() for get in read]
-            append(row)
-        return row
+            read(map(VALUE, nodes))
+        rows.frombytes(struct.pack(f"{len(flown)}d", *flown))
+        return flown[-WIDTH:]
 
     def command(self, bank: float, altitude: float, climb: float, airspeed: float) -> None:
         """Set what the inner loops follow."""

@@ -186,10 +186,14 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
+        self._close(self._written)
+
+    def _close(self, rows: Callable[[str, str], Data]) -> None:
+        """`close`, with all ``rows`` of a group and a column as they are in the file."""
         try:
             self.flush()
             if self._file is not None:
-                self._guard(self._finish)
+                self._guard(lambda: self._finish(rows))
         finally:
             if self._file is not None:
                 self._file.close()
@@ -208,7 +212,7 @@ class Recorder:
         if self._file is None:
             return self.dataset()
         rows = {(path, name): self._written(path, name) for path, t in self._tables.items() for name in t.columns}
-        self.close()
+        self._close(lambda path, name: rows[path, name])
         return self._tree(lambda path, name: rows[path, name])
 
     def _tree(self, rows: Callable[[str, str], Data]) -> xarray.DataTree:
@@ -284,12 +288,12 @@ class Recorder:
         if next(self._laying, self) is self:
             self._laying = None
 
-    def _finish(self) -> None:
+    def _finish(self, rows: Callable[[str, str], Data]) -> None:
         """Put a whole and compressed file in place of the one that grew."""
         assert self.path is not None
         plans = {path: Plan(t.time_name, t.written, dict(t.columns)) for path, t in self._tables.items()}
         _reserve(_part(self.path), plans)
-        for _ in create(_part(self.path), plans, self.attributes | {"complete": 1}, self._written):
+        for _ in create(_part(self.path), plans, self.attributes | {"complete": 1}, rows):
             pass
         os.replace(_part(self.path), self.path)
         self.attributes["complete"] = 1
