@@ -111,18 +111,11 @@ def njit(function: Callable[P, R]) -> Callable[P, R]:
     return _compiled(function, no_cfunc_wrapper=True)
 
 
-def embedded(function: Callable[P, R]) -> Callable[P, R]:
-    """As `njit`, and repeated in the machine code of every kernel that calls it, where handing over arrays takes long.
-
-    For a function that is called from Python as well, or from several kernels.
-    """
-    return _compiled(function, forceinline=True)
-
-
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """As `njit`, but compiled as part of the kernel that calls it: for a long function with one caller.
 
-    Compiled by itself first, it would be compiled twice.
+    Compiled by itself first, it would be compiled twice. Also for what hands back a view, which `lean` kernels can call
+    no other way.
     """
     return _compiled(function, inline="always")
 

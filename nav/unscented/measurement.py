@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nav._jit import embedded, inlined
+from nav._jit import inlined
 from nav.error_model import PHI
 from nav.matrix import LANES, multiply
 from nav.rotation import rotation_coefficients
@@ -30,7 +30,7 @@ from nav.unscented.sigma_points import (
 TAKEN = 1 - GUARD  # of what a measurement takes from the covariance
 
 
-@embedded
+@inlined
 def innovate(
     P: Array, Z: Array, z: Array, R: Array, root: Array, H: Array, work: Array, spread: float, excess: float
 ) -> tuple[Array, Array, Array, float]:
@@ -115,7 +115,7 @@ def _innovate(
     return nu[:m], S[:, :m], W, nis
 
 
-@embedded
+@inlined
 def correct(P: Array, W: Array, work: Array) -> Array:
     """Update ``P`` in place and return the mean error (n,) found, for `remove`; ``W`` = D^-1 (H P, -nu) by `innovate`.
 
@@ -134,7 +134,7 @@ def correct(P: Array, W: Array, work: Array) -> Array:
 @inlined
 def _correct(P: Array, W: Array, work: Array, n: int, m: int) -> Array:
     """`correct`, with sizes that may be known when it is compiled."""
-    taken = work.ravel()[: (n + 1) * n].reshape((n + 1, n))
+    taken = work.reshape(work.size)[: (n + 1) * n].reshape((n + 1, n))
     multiply(taken, W, W, 0, 0, W, W, n)
     left, less = P.reshape(n * n), taken.reshape(n * n + n)
     mean: Array = taken[n]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nav._jit import embedded, inlined, njit
+from nav._jit import inlined, njit
 from nav.earth import radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
 from nav.matrix import LANES
@@ -68,7 +68,7 @@ def factor(P: Array, columns: int) -> Array:
     return root
 
 
-@embedded
+@inlined
 def factor_into(root: Array, P: Array) -> None:
     """`factor` for kernels: into ``root`` (columns, n)."""
     if len(root) == CURVED and len(P) == USUAL:
@@ -135,7 +135,7 @@ def _per_metre(lat: float, h: float) -> tuple[float, float]:
     return 1 / (R_M + h), 1 / ((R_N + h) * math.cos(lat))
 
 
-@embedded
+@inlined
 def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
     """Take an ``error`` (n,), estimate minus truth, out of the estimate in place; the attitude's is of any size.
 
@@ -154,7 +154,7 @@ def remove(q_nb: Array, v_n: Array, lla: Array, x: Array, error: Array) -> None:
         x[i] -= error[i]
 
 
-@embedded
+@inlined
 def points_into(found: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, root: Array, spread: float) -> None:
     """`points` for kernels: rows of q_nb, v_n, lla, x into ``found`` (2 columns + 1, FURTHER + n)."""
     if len(root) == CURVED and len(x) == USUAL:

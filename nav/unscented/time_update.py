@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from nav._jit import embedded, inlined, njit
+from nav._jit import inlined, njit
 from nav.error_model import MOTION, PHI, POS, VEL
 from nav.kalman import take_rest
 from nav.matrix import multiply
@@ -77,7 +77,7 @@ def carry(e: Array, Phi: Array, push_n: Array, T: float) -> Array:
     return carried
 
 
-@embedded
+@inlined
 def predict(
     P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array, push_n: Array, T: float, spread: float,
     excess: float,

@@ -11,7 +11,7 @@ from bench.measure import Effort, Row, compare, cpu_seconds, need, ratios
 from bench.unit import ACCEL_NOISE, DEG, GNSS_SIGMA, GYRO_NOISE, START, site, unit
 
 from nav import strapdown, unscented
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.ahrs import Ahrs, AhrsConfig
 from nav.aids import GnssAid
 from nav.alignment import InitialState
@@ -90,7 +90,8 @@ def unscented_period(effort: Effort) -> Iterator[Row]:
     H = np.zeros((6, len(P)))
     H[:3, POS : POS + 3] = H[3:, VEL : VEL + 3] = np.eye(3)
     force = np.eye(3) * np.array([1.0, 0.1, -9.8])[:, None, None]  # C_nb, and it times rates and specific forces
-    work, R = unscented.scratch(len(P)), np.array([1.0] * 3 + [0.01] * 3)
+    R = np.array([1.0] * 3 + [0.01] * 3)
+    room = _room(len(P), len(R))
 
     def linear() -> None:
         strapdown.propagate(LEVEL.copy(), np.zeros(3), np.array(site()), samples.dtheta, samples.dv, samples.dt)
@@ -100,8 +101,8 @@ def unscented_period(effort: Effort) -> Iterator[Row]:
 
         def ours(count: int = count, T: float = T) -> None:
             _unscented_periods(
-                count, T, P, work, LEVEL.copy(), np.zeros(3), np.array(site()), model.driven, force * T, H, R,
-                scaling.spread, scaling.excess,
+                count, T, P, LEVEL.copy(), np.zeros(3), np.array(site()), model.driven, force * T,
+                force[2].sum(axis=1) * T, H, R, scaling.spread, scaling.excess, *room,
             )  # fmt: skip
 
         us, them = compare(ours, linear, effort)
@@ -121,22 +122,27 @@ def _integrals(sums: Array, q_nb: Array, dtheta: Array, dv: Array, dt: Array) ->
         integrate(sums, q_nb, q_nb, dtheta[k], dv[k], dt[k])
 
 
-@njit
+def _room(n: int, m: int) -> tuple[Array, ...]:
+    """What `_unscented_periods` works in: from P to the points of a measurement of ``m`` rows."""
+    return (
+        np.empty((n, n)), np.zeros((9, n)), np.zeros((9, n)), np.zeros(n), np.ones(n), np.full(n, 1e-12),
+        np.zeros((7, m)), np.zeros(m), np.empty((3, n)), np.empty((7, unscented.FURTHER + n)), unscented.scratch(n),
+    )  # fmt: skip
+
+
+@lean
 def _unscented_periods(
-    count: int, T: float, P0: Array, work: Array, q_nb: Array, v_n: Array, lla: Array, driven: Indices, sums: Array,
+    count: int, T: float, P0: Array, q_nb: Array, v_n: Array, lla: Array, driven: Indices, sums: Array, push: Array,
     H: Array, R: Array, spread: float, excess: float,
+    P: Array, Phi: Array, FT: Array, x: Array, decay: Array, half: Array, Z: Array, z: Array, root: Array,
+    points: Array, work: Array,
 ) -> None:  # fmt: skip
-    """``count`` periods of ``T`` seconds, each from the same covariance."""
+    """``count`` periods of ``T`` seconds, each from the same covariance ``P0``."""
     n = len(P0)
-    P = P0.copy()
-    Phi, FT, x = np.zeros((9, n)), np.zeros((9, n)), np.zeros(n)
-    decay, half, push = np.ones(n), np.full(n, 1e-12), sums[2].sum(axis=1)
-    Z, z = np.zeros((7, len(R))), np.zeros(len(R))
-    root, points = np.empty((3, n)), np.empty((7, unscented.FURTHER + n))
-    covariance, start = P.ravel(), P0.ravel()
     for _ in range(count):
-        for i in range(len(start)):
-            covariance[i] = start[i]
+        for i in range(n):
+            for j in range(n):
+                P[i, j] = P0[i, j]
         transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
         unscented.remove(q_nb, v_n, lla, x, unscented.predict(P, Phi, decay, half, work, push, T, spread, excess))
         unscented.factor_into(root, P)
