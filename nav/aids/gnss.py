@@ -222,7 +222,8 @@ def problem(sample: GnssSample) -> str:
 
 
 def _positive(sigma: Array) -> bool:
-    return all(0.0 < s < math.inf for s in sigma.tolist())
+    x, y, z = sigma.tolist()
+    return 0.0 < x < math.inf and 0.0 < y < math.inf and 0.0 < z < math.inf
 
 
 def has_velocity(sample: GnssSample) -> bool:

@@ -102,14 +102,19 @@ class GnssMonitor:
 
 def jump(before: GnssSample, fix: GnssSample, velocities: Array, sigma_v: Array) -> float:
     """Squared distance, chi-square of three, of a fix from where the one before and both velocities' sum say [m/s]."""
-    off = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
-    return _jump(off, fix.t - before.t, velocities, fix.sigma_position_n, before.sigma_position_n, sigma_v)
+    return _jump(
+        fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h, fix.t - before.t, velocities,
+        fix.sigma_position_n, before.sigma_position_n, sigma_v,
+    )  # fmt: skip
 
 
 @njit
-def _jump(off: Array, dt: float, velocities: Array, sigma: Array, sigma_before: Array, sigma_v: Array) -> float:
-    """`jump`, by how far the fixes are apart (3,) [m]."""
-    squared = 0.0
+def _jump(
+    lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float, dt: float, velocities: Array, sigma: Array,
+    sigma_before: Array, sigma_v: Array,
+) -> float:  # fmt: skip
+    """`jump`, in one kernel."""
+    off, squared = displacement_n(lat, lon, h, lat0, lon0, h0), 0.0
     for k in range(3):
         variance = sigma[k] ** 2 + sigma_before[k] ** 2 + (dt * sigma_v[k]) ** 2
         variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
