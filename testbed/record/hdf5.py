@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +56,7 @@ def create(
             file.attrs[name] = value
         for group_path, plan in plans.items():
             group = _group(file, group_path)
-            scales = Scales()
+            scales: dict[str, Any] = {}  # of this group, by dimension
             for name, column in plan.columns.items():
                 values = None if contents is None else contents(group_path, name)
                 dataset = _dataset(group, plan, name, values)
@@ -64,7 +64,6 @@ def create(
                 if values is None:
                     plan.offsets[name] = dataset.get_offset()
                 yield
-            scales.close()
 
 
 def _see_that_it_fits(
@@ -124,60 +123,25 @@ def _compressible(values: Data) -> bool:
     return sum(len(zlib.compress(trial, GZIP_LEVEL)) for trial in trials) < 0.5 * sum(map(len, trials))
 
 
-class Scales:
-    """The dimension scales of a group, and which dimensions of its columns they are of.
-
-    HDF5's own `attach_scale` writes all the references of a scale again for each one that comes.
-    """
-
-    def __init__(self) -> None:
-        self.known: dict[str, Any] = {}  # by dimension
-        self._columns: dict[str, list[tuple[Any, int]]] = {}
-
-    def attach(self, dataset: Any, dims: Sequence[str]) -> None:
-        """Note the scales of a dataset's dimensions."""
-        import h5py
-        from h5py import h5a, h5r, h5s, h5t
-
-        references = np.empty(len(dims), h5py.vlen_dtype(h5py.ref_dtype))
-        for k, dim in enumerate(dims):
-            references[k] = np.empty(1, h5py.ref_dtype)
-            references[k][0] = h5r.create(self.known[dim], b".", h5r.OBJECT)
-            self._columns.setdefault(dim, []).append((h5r.create(dataset, b".", h5r.OBJECT), k))
-        space = h5s.create_simple((len(dims),))
-        h5a.create(dataset, b"DIMENSION_LIST", h5t.vlen_create(h5t.STD_REF_OBJ), space).write(references)
-
-    def close(self) -> None:
-        """Note at each scale whose it is."""
-        from h5py import h5a, h5s, h5t
-
-        kind = h5t.create(h5t.COMPOUND, 16)
-        kind.insert(b"dataset", 0, h5t.STD_REF_OBJ)
-        kind.insert(b"dimension", 8, h5t.NATIVE_UINT32)
-        for dim, columns in self._columns.items():
-            references = np.empty(len(columns), kind.dtype)
-            references["dataset"], references["dimension"] = zip(*columns, strict=True)
-            space = h5s.create_simple(references.shape)
-            h5a.create(self.known[dim], b"REFERENCE_LIST", kind, space).write(references)
-
-
-def _describe(group: h5py.Group, dataset: Any, time_name: str, name: str, column: Column, scales: Scales) -> None:
+def _describe(
+    group: h5py.Group, dataset: Any, time_name: str, name: str, column: Column, scales: dict[str, Any]
+) -> None:
     """Give a column its dimensions and attributes."""
     from h5py import h5ds
 
     text = column.dtype.kind == "S"
     dims = (*column.variable.dims, *((f"characters_{column.dtype.itemsize}",) if text else ()))
     labels = column.variable.labels
-    for k, dim in enumerate(dims, start=1):
-        if dim not in scales.known:
-            made = _labels(group, dim) if dim in AXES else _bare_dimension(group, dim, dataset.shape[k])
-            scales.known[dim] = made
     if name == time_name:
         h5ds.set_scale(dataset, name.encode())
-        scales.known[name] = dataset
+        scales[name] = dataset
         labels = {"standard_name": "time", "axis": "T"} | labels
     else:
-        scales.attach(dataset, (time_name, *dims))
+        h5ds.attach_scale(dataset, scales[time_name], 0)
+    for k, dim in enumerate(dims, start=1):
+        if dim not in scales:
+            scales[dim] = _labels(group, dim) if dim in AXES else _bare_dimension(group, dim, dataset.shape[k])
+        h5ds.attach_scale(dataset, scales[dim], k)
     if text:
         labels = labels | {"_Encoding": "utf-8"}
     for key, value in labels.items():
