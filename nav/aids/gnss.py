@@ -222,6 +222,7 @@ def problem(sample: GnssSample) -> str:
 
 
 def _positive(sigma: Array) -> bool:
+    x: float
     x, y, z = sigma.tolist()
     return 0.0 < x < math.inf and 0.0 < y < math.inf and 0.0 < z < math.inf
 
