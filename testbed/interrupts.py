@@ -62,11 +62,11 @@ def heeded() -> Iterator[None]:
     def interrupt(number: int, frame: object) -> None:
         nonlocal interrupted
         interrupted = True
+        for one in mine:
+            signal.signal(one, signal.SIG_IGN)
         if _held:
             _waiting.append(number)
             return
-        for one in mine:
-            signal.signal(one, signal.SIG_IGN)
         raise Interrupted(number)
 
     before = {one: signal.getsignal(one) for one in mine}
@@ -95,14 +95,20 @@ def heeded() -> Iterator[None]:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """A signal in this context is raised at its end: to start a process, and to note that it was, is one thing."""
+    """A signal in this context is raised at its end: to start a process, and to note that it was, is one thing.
+
+    At the end of the outermost such context; an error there ends the command by itself.
+    """
     global _held
-    _held = True
+    outer, _held = _held, True
     try:
         yield
+    except BaseException:
+        _waiting.clear()
+        raise
     finally:
-        _held = False
-    if _waiting:
+        _held = outer
+    if _waiting and not outer:
         raise Interrupted(_waiting.pop())
 
 

@@ -75,3 +75,30 @@ def test_an_interrupt_ends_a_command(tmp_path: Path, name: str, number: int, aft
         time.sleep(0.05)
     if name in ("check", "papers"):
         assert sorted(one.name for one in tmp_path.iterdir()) == ["one.toml", "two.toml"]
+
+
+def test_one_interrupt_is_raised_once_at_the_end_of_what_holds_it() -> None:
+    """Whatever comes while it is held, or while files are closed, is the same wish."""
+    script = """
+import os, signal
+from testbed import interrupts
+with interrupts.heeded():
+    try:
+        with interrupts.held():
+            with interrupts.held():
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGTERM)
+            print("held", flush=True)
+        print("not reached")
+    finally:
+        os.kill(os.getpid(), signal.SIGINT)
+        with interrupts.held():
+            pass
+        print("closed", flush=True)
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert ended.stdout.split() == ["held", "closed"]
+    assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")

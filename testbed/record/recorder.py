@@ -279,9 +279,10 @@ class Recorder:
             for name in table.order():
                 column = table.columns[name]
                 _put(self._file, column.offset + table.written * column.row_bytes, table.rows(name).data.cast("B"))
-            table.written += table.pending
-            table.pending = 0
-            table.blocks.clear()
+            with interrupts.held():
+                table.written += table.pending
+                table.pending = 0
+                table.blocks.clear()
 
     def _lay_piece(self) -> None:
         assert self._laying is not None

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from nav.columns import VECTORS, Estimates, FusedReports
 from nav.samples import Outcome, Sample, UpdateReport
+from testbed import interrupts
 from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
 
 if TYPE_CHECKING:
@@ -102,8 +103,9 @@ class Table:
     def pack(self) -> None:
         """Turn the waiting objects into a block."""
         if self.objects and self._pack is not None:
-            self.add(*self._pack(self.objects))
-            self.objects.clear()
+            with interrupts.held():
+                self.add(*self._pack(self.objects))
+                self.objects.clear()
 
     def rows(self, name: str) -> Data:
         """All waiting rows of one column."""
