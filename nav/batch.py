@@ -232,8 +232,10 @@ class Batch:
                 last_fix = t
             elif problem(sample):
                 break
-            if silences and any([silence.stand_in(sample) for silence in silences]):
-                heard = []  # one sample too many
+            for silence in silences:  # each hears it
+                if silence.stand_in(sample) is not None:
+                    heard = []  # one sample too many
+            if silences and not heard:
                 break
             flat += (t, t, row, *aid.numbers(sample))
             if taker.pauses(t):

@@ -101,8 +101,9 @@ class FusionHorizon:
             t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
             known = sample.t_arrival - self.lag_s  # not before, however early it is handed over
             turn = known if known > t + COINCIDENT else t
-            heapq.heappush(self._queue, (turn, sample.sensor, self._count, sample))
+            self._queue.append((turn, sample.sensor, self._count, sample))
             self._count += 1
+        self._queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
         if len(imu):
             ready = compensate(imu, self._raw) if self.coning else imu
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
@@ -148,13 +149,16 @@ class FusionHorizon:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         steps: list[Step] = []
         ends, lag = self._ahead.ends, self.lag_s if self.estimator.listening else 0.0
+        queue, accepts, due = self._queue, self.estimator.accepts, 0
         for t in (*times, ends[-1]):
             horizon = ends[self._ahead.row_after(t) - 1] - lag
-            while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
-                turn, _, _, sample = heapq.heappop(self._queue)
-                if self.estimator.accepts(sample):
+            while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
+                turn, _, _, sample = queue[due]
+                if accepts(sample):
                     steps.append(Step(sample.t, turn, sample))
+                due += 1
             steps.append(Step(t, horizon))
+        del queue[:due]
         steps[-1] = Step(math.nan, steps[-1].horizon)
         while steps:
             taken = estimator.take(steps, self._ahead, reports, estimates)

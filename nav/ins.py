@@ -227,8 +227,8 @@ class Ins:
                 self._monitor.heard(sample.t)
                 return
             self._monitor.judge(sample, sample.v_n, sample.sigma_velocity_n, inside_gate=True)
-        elif sample.sensor in self._refusals:
-            self._refusals[sample.sensor].taken()
+        elif (refusals := self._refusals.get(sample.sensor)) is not None:
+            refusals.taken()
 
     def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
         """See `nav.batch.Taker`."""
