@@ -14,6 +14,7 @@ or group can be added.
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -22,8 +23,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -93,7 +95,8 @@ class Recorder:
         self._heard = 0.0  # up to where all else has been taken, which comes after truth
         self._last_flush = time.monotonic()
         self._tended = False
-        self._file: BinaryIO | None = None
+        self._file: FileIO | None = None
+        self._closed = False
         self._laying: Iterator[None] | None = None  # the next file in the making
         if path is not None:
             _check_writable(path)
@@ -186,32 +189,41 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
-        self._close(self._written)
+        self._pack()
+        self._close(self._rows)
 
     def _close(self, rows: Callable[[str, str], Data]) -> None:
-        """`close`, with all ``rows`` of a group and a column as they are in the file."""
+        """`close`, with all ``rows`` of a group and a column. Interrupted, it can be called again."""
+        if self.path is None or self._closed:
+            return
         try:
-            self.flush()
-            if self._file is not None:
+            if any(table.rows_now for table in self._tables.values()):
                 self._guard(lambda: self._finish(rows))
-        finally:
-            if self._file is not None:
-                self._file.close()
-                self._file = None
+        except UserError:
+            try:
+                self.flush()  # the file that grew may have room where a whole one beside it has none
+            finally:
+                self._let_go()
+            raise
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self._closed = True
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def dataset(self) -> xarray.DataTree:
         """Everything recorded so far, equal to `load` of the file."""
         self.flush()
         if self.path is not None and self.path.exists():
             return load(self.path)
-        return self._tree(lambda path, name: self._tables[path].rows(name))
+        return self._tree(self._rows)
 
     def finish(self) -> xarray.DataTree:
         """`close`, and give everything recorded: to read the compressed file again would take several times as long."""
-        self.flush()
-        if self._file is None:
-            return self.dataset()
-        rows = {(path, name): self._written(path, name) for path, t in self._tables.items() for name in t.columns}
+        self._pack()
+        rows = {(path, name): self._rows(path, name) for path, t in self._tables.items() for name in t.columns}
         self._close(lambda path, name: rows[path, name])
         return self._tree(lambda path, name: rows[path, name])
 
@@ -280,9 +292,7 @@ class Recorder:
                 column = table.columns[name]
                 _put(self._file, column.offset + table.written * column.row_bytes, table.rows(name).data.cast("B"))
             with interrupts.held():
-                table.written += table.pending
-                table.pending = 0
-                table.blocks.clear()
+                table.count_written()
 
     def _lay_piece(self) -> None:
         assert self._laying is not None
@@ -292,21 +302,32 @@ class Recorder:
     def _finish(self, rows: Callable[[str, str], Data]) -> None:
         """Put a whole and compressed file in place of the one that grew."""
         assert self.path is not None
-        plans = {path: Plan(t.time_name, t.written, dict(t.columns)) for path, t in self._tables.items()}
+        self._laying = None
+        plans = {path: Plan(t.time_name, t.rows_now, dict(t.columns)) for path, t in self._tables.items()}
         _reserve(_part(self.path), plans)
         for _ in create(_part(self.path), plans, self.attributes | {"complete": 1}, rows):
             pass
-        os.replace(_part(self.path), self.path)
-        self.attributes["complete"] = 1
+        with interrupts.held():
+            os.replace(_part(self.path), self.path)
+            self.attributes["complete"] = 1
+            for table in self._tables.values():
+                table.count_written()
 
-    def _written(self, path: str, name: str) -> Data:
-        """All rows of a column as they are in the file."""
-        assert self.path is not None
+    def _rows(self, path: str, name: str) -> Data:
+        """All rows of a column: those in the file, and those that wait."""
         table = self._tables[path]
         column = table.columns[name]
+        if not table.written:
+            return table.rows(name)
+        assert self._file is not None
         shape = (table.written, *column.shape)
-        flat = np.fromfile(self.path, column.dtype, math.prod(shape), offset=column.offset)
-        return flat.reshape(shape)
+        if not column.offset:  # newer than the file
+            return np.concatenate([blank(shape, column.dtype), table.rows(name)])
+        whole = np.empty((table.rows_now, *column.shape), column.dtype)
+        _get(self._file, column.offset, whole[: table.written].data.cast("B"))
+        if table.pending:
+            whole[table.written :] = table.rows(name)
+        return whole
 
     def _lay_out(self) -> Iterator[None]:
         """Write a new file with the room that is needed, piece by piece, and put it in place of the old one.
@@ -325,16 +346,13 @@ class Recorder:
         _reserve(_part(self.path), plans)
         yield from create(_part(self.path), plans, dict(self.attributes))
         new = _part(self.path).open("r+b", buffering=0)
-        if self._file is not None:
-            for path, plan in plans.items():
-                written = self._tables[path].written
-                for name in reversed(plan.columns) if written else ():
-                    column = plan.columns[name]
-                    if column.offset:
-                        yield from _copy(self._file, column.offset, new, plan.offsets[name], written * column.row_bytes)
-                    else:
-                        _put(new, plan.offsets[name], blank((written, *column.shape), column.dtype).data.cast("B"))
+        try:
+            yield from self._copied(new, plans)
+        except BaseException:
+            new.close()
+            raise
         with interrupts.held():  # between the old file and the new one, what is in which would not be known
+            os.replace(_part(self.path), self.path)
             if self._file is not None:
                 self._file.close()
             self._file = new
@@ -343,8 +361,20 @@ class Recorder:
                 table.capacity, table.grown = plan.capacity, len(table.columns) > len(plan.columns)
                 for name, column in plan.columns.items():
                     column.offset = plan.offsets[name]
-            self._write_rows()
-            os.replace(_part(self.path), self.path)
+        self._write_rows()
+
+    def _copied(self, new: FileIO, plans: Mapping[str, Plan]) -> Iterator[None]:
+        """Copy what was written to a file of these plans, piece by piece."""
+        if self._file is None:
+            return
+        for path, plan in plans.items():
+            written = self._tables[path].written
+            for name in reversed(plan.columns) if written else ():
+                column = plan.columns[name]
+                if column.offset:
+                    yield from _copy(self._file, column.offset, new, plan.offsets[name], written * column.row_bytes)
+                else:
+                    _put(new, plan.offsets[name], blank((written, *column.shape), column.dtype).data.cast("B"))
 
     def _guard(self, write: Callable[[], None]) -> None:
         """Turn a full disk and the like into a message; what the file held before stays."""
@@ -382,7 +412,7 @@ def _part(path: Path) -> Path:
     return path.with_name(f".{path.name}.part")
 
 
-def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -> Iterator[None]:
+def _copy(source: FileIO, start: int, target: FileIO, at: int, count: int) -> Iterator[None]:
     source.seek(start)
     while count:
         chunk = source.read(min(count, 1 << 20))
@@ -392,7 +422,18 @@ def _copy(source: BinaryIO, start: int, target: BinaryIO, at: int, count: int) -
         yield
 
 
-def _put(file: BinaryIO, at: int, data: bytes | memoryview) -> None:
+def _get(file: FileIO, at: int, room: memoryview) -> None:
+    """Read as many bytes as there is room for."""
+    file.seek(at)
+    done = 0
+    while done < len(room):
+        count = file.readinto(room[done:])
+        if not count:
+            raise OSError(errno.EIO, "the file is shorter than what was written to it")
+        done += count
+
+
+def _put(file: FileIO, at: int, data: bytes | memoryview) -> None:
     """Write all of it: a disk that fills up takes a part without a word, and refuses the next."""
     file.seek(at)
     done = 0

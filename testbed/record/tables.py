@@ -110,6 +110,8 @@ class Table:
     def rows(self, name: str) -> Data:
         """All waiting rows of one column."""
         column = self.columns[name]
+        if not self.blocks:
+            return np.empty((0, *column.shape), column.dtype)
         parts = [
             np.asarray(block[name], column.dtype)
             if name in block
@@ -117,6 +119,12 @@ class Table:
             for block in self.blocks
         ]
         return np.ascontiguousarray(parts[0] if len(parts) == 1 else np.concatenate(parts))
+
+    def count_written(self) -> None:
+        """Take the waiting rows for written."""
+        self.written += self.pending
+        self.pending = 0
+        self.blocks.clear()
 
     def order(self) -> Iterator[str]:
         """Column names, time last: a finite time says that the rest of its row is there."""

@@ -418,6 +418,9 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
             np.testing.assert_array_equal(after[group][name].values[:rows], before[group][name].values)
     rows = len(after["truth"]["time"])
     np.testing.assert_array_equal(after["truth"]["wind_n"], truth.wind_n[: 20 * rows : 20])
+    monkeypatch.setattr(Table, "rows", real)
+    recorder.close()  # what it could not end it ends now
+    np.testing.assert_array_equal(load(path)["truth"]["wind_n"], truth.wind_n[::20])
 
 
 @pytest.mark.slow
@@ -548,6 +551,67 @@ def test_a_full_disk_is_told_and_the_last_flush_stays(tmp_path: Path, monkeypatc
         recorder.close()
     assert len(load(path)["truth"]["time"]) == 21
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize("room", [0, 1, 40, 75])
+def test_a_disk_that_is_full_from_any_write_on_leaves_the_last_flush(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
+) -> None:
+    """The file has just been changed for a larger one, or not yet, when the n-th write after the last flush fails."""
+    path = tmp_path / "run.nc"
+    recorder = Recorder(path, scenario(), 3)
+    truth = circle(4.0)
+    recorder.truth(truth.rows(0, 401))
+    recorder.flush()
+    left, put = room, record._put
+
+    def filling(*arguments: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise OSError(28, "No space left on device")
+        put(*arguments)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    recorder.truth(truth.rows(401, 801))
+    recorder.event(2.0, "info", "needs a new group")
+    monkeypatch.setattr(record, "_put", filling)
+    if room == 75:
+        recorder.flush()  # of some 60 writes
+    else:
+        with pytest.raises(UserError, match=r"run\.nc: can't write the record \(No space left on device\)"):
+            recorder.flush()
+    left = 0
+    monkeypatch.setattr(record, "_reserve", full)
+    with pytest.raises(UserError, match="can't write the record"):
+        recorder.close()
+    recorder.close()
+    left_over = load(path)
+    rows = len(left_over["truth"]["time"])
+    assert rows == 41 if room == 75 else rows >= 21
+    np.testing.assert_array_equal(left_over["truth"]["v_n"], truth.v_n[: 20 * rows : 20])
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_rows_since_the_last_flush_go_where_they_can_when_there_is_no_room_for_a_whole_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.nc"
+    recorder = Recorder(path, scenario(), 3)
+    truth = circle(4.0)
+    recorder.truth(truth.rows(0, 401))
+    recorder.flush()
+    recorder.truth(truth.rows(401, 441))
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(record, "_reserve", full)
+    with pytest.raises(UserError, match="No space left"):
+        recorder.close()
+    assert len(load(path)["truth"]["time"]) == 23
 
 
 def test_a_disk_that_fills_up_is_told_in_one_line(tmp_path: Path) -> None:
