@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from nav._jit import njit
+from nav.rotation import Four, Three
 from nav.samples import Array
 
 # A scalar or an array of scalars: one formula serves both.
@@ -108,9 +109,15 @@ def wrap_longitude(lon: Scalar) -> Scalar:
 @njit
 def ecef_from_geodetic(lat: float, lon: float, h: float) -> Array:
     """Position r_e (3,) [m] (Groves 2.112)."""
+    return np.array(ecef_components(lat, lon, h))
+
+
+@njit
+def ecef_components(lat: float, lon: float, h: float) -> Three:
+    """`ecef_from_geodetic` without an array, for long loops."""
     _, R_N = radii(lat)
     across = (R_N + h) * math.cos(lat)
-    return np.array([across * math.cos(lon), across * math.sin(lon), ((1 - E2) * R_N + h) * math.sin(lat)])
+    return across * math.cos(lon), across * math.sin(lon), ((1 - E2) * R_N + h) * math.sin(lat)
 
 
 @njit
@@ -148,10 +155,16 @@ def dcm_en(lat: float, lon: float) -> Array:
 @njit
 def quat_en(lat: float, lon: float) -> Array:
     """q_en (4,): the same rotation as `dcm_en`, continuous in longitude up to its sign."""
+    return np.array(quat_en_components(lat, lon))
+
+
+@njit
+def quat_en_components(lat: float, lon: float) -> Four:
+    """`quat_en` without an array, for long loops."""
     half_turn = -0.5 * (0.5 * math.pi + lat)
     sin_turn, cos_turn = math.sin(half_turn), math.cos(half_turn)
     sin_lon, cos_lon = math.sin(0.5 * lon), math.cos(0.5 * lon)
-    return np.array([cos_lon * cos_turn, -sin_lon * sin_turn, cos_lon * sin_turn, sin_lon * cos_turn])
+    return cos_lon * cos_turn, -sin_lon * sin_turn, cos_lon * sin_turn, sin_lon * cos_turn
 
 
 @njit

@@ -11,11 +11,15 @@ the Jacobian of the rotation vector: Barfoot, State Estimation for Robotics, sec
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 
 from nav._jit import lean, njit
 from nav.samples import Array
+
+Three: TypeAlias = tuple[float, float, float]
+Four: TypeAlias = tuple[float, float, float, float]
 
 # Below this squared angle the power series replace sin and cos: exact to rounding there, and faster.
 SMALL_ANGLE_SQUARED = 0.04
@@ -58,13 +62,17 @@ def cross(u: Array, v: Array) -> Array:
 @njit
 def quat_multiply(p: Array, q: Array) -> Array:
     """Product (4,) of two quaternions: the rotation q first, then p."""
-    return np.array(
-        [
-            p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-            p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-            p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-            p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-        ]
+    return np.array(quat_multiply_components(p, q))
+
+
+@njit
+def quat_multiply_components(p: Array | Four, q: Array | Four) -> Four:
+    """`quat_multiply` without an array, for long loops."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
     )
 
 
@@ -108,11 +116,17 @@ def turn(q: Array, x: float, y: float, z: float) -> None:
 @njit
 def rotvec_from_quat(q: Array) -> Array:
     """Rotation vector (3,) [rad] of a unit quaternion, the shorter way round: |phi| <= pi."""
+    return np.array(rotvec_components(q))
+
+
+@njit
+def rotvec_components(q: Array | Four) -> Three:
+    """`rotvec_from_quat` without an array, for long loops."""
     sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if sine == 0.0:
-        return np.zeros(3)
+        return 0.0, 0.0, 0.0
     scale = 2 * math.atan2(sine, q[0]) / sine if q[0] >= 0 else -2 * math.atan2(sine, -q[0]) / sine
-    return np.array([scale * q[1], scale * q[2], scale * q[3]])
+    return scale * q[1], scale * q[2], scale * q[3]
 
 
 @njit
@@ -160,16 +174,20 @@ def quat_from_dcm(C: Array) -> Array:
 @njit
 def quat_from_euler(roll: float, pitch: float, heading: float) -> Array:
     """``q_nb`` (4,) from Euler angles [rad], turning by heading about z, then pitch about y, then roll about x."""
+    return np.array(quat_from_euler_components(roll, pitch, heading))
+
+
+@njit
+def quat_from_euler_components(roll: float, pitch: float, heading: float) -> Four:
+    """`quat_from_euler` without an array, for long loops."""
     sr, cr = math.sin(0.5 * roll), math.cos(0.5 * roll)
     sp, cp = math.sin(0.5 * pitch), math.cos(0.5 * pitch)
     sh, ch = math.sin(0.5 * heading), math.cos(0.5 * heading)
-    return np.array(
-        [
-            ch * cp * cr + sh * sp * sr,
-            ch * cp * sr - sh * sp * cr,
-            ch * sp * cr + sh * cp * sr,
-            sh * cp * cr - ch * sp * sr,
-        ]
+    return (
+        ch * cp * cr + sh * sp * sr,
+        ch * cp * sr - sh * sp * cr,
+        ch * sp * cr + sh * cp * sr,
+        sh * cp * cr - ch * sp * sr,
     )
 
 
@@ -193,15 +211,19 @@ def euler_from_quat(q: Array) -> Array:
 @njit
 def quat_rotate(q: Array, v: Array) -> Array:
     """``C(q) @ v`` (3,) for a unit quaternion."""
+    return np.array(quat_rotate_components(q, v))
+
+
+@njit
+def quat_rotate_components(q: Array | Four, v: Array | Three) -> Three:
+    """`quat_rotate` without an array, for long loops."""
     tx = 2 * (q[2] * v[2] - q[3] * v[1])
     ty = 2 * (q[3] * v[0] - q[1] * v[2])
     tz = 2 * (q[1] * v[1] - q[2] * v[0])
-    return np.array(
-        [
-            v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
-            v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
-            v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
-        ]
+    return (
+        v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
+        v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
+        v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
     )
 
 
@@ -212,12 +234,25 @@ def left_jacobian_solve(phi: Array, v: Array) -> Array:
     A vector f that is constant in axes turning by ``phi`` (|phi| < 2 pi) has the mean J @ f in the axes where the turn
     began; this finds f from that mean.
     """
+    return np.array(left_jacobian_components(phi, v))
+
+
+@njit
+def left_jacobian_components(phi: Array | Three, v: Array | Three) -> Three:
+    """`left_jacobian_solve` without an array, for long loops."""
     s = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     a, b, _ = rotation_coefficients(s)
     # The rounding error of k grows as 1/s, but k multiplies terms of order s.
     k = (1 - 0.5 * a / b) / s if s > 1e-8 else 1 / 12
-    first = cross(phi, v)
-    second = cross(phi, first)
-    for axis in range(3):
-        second[axis] = v[axis] - 0.5 * first[axis] + k * second[axis]
-    return second
+    first = _cross(phi, v)
+    second = _cross(phi, first)
+    return (
+        v[0] - 0.5 * first[0] + k * second[0],
+        v[1] - 0.5 * first[1] + k * second[1],
+        v[2] - 0.5 * first[2] + k * second[2],
+    )
+
+
+@njit
+def _cross(u: Array | Three, v: Array | Three) -> Three:
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.earth import GAS_CONSTANT
-from nav.rotation import quat_conjugate, quat_from_euler, quat_rotate
+from nav.rotation import quat_from_euler_components, quat_rotate_components
 from nav.samples import Array
 from testbed.motion.guidance import Guidance, beginning, climb_out
 from testbed.motion.launch import Launcher
@@ -236,14 +236,12 @@ class Flight:
 def _attitude_and_air(euler: Array, v_n: Array, wind_n: Array) -> tuple[Array, Array]:
     """Quaternions (N, 4), and (3, N) true airspeed [m/s], angles of attack and sideslip [rad]."""
     q_nb, air = np.empty((len(euler), 4)), np.empty((3, len(euler)))
-    air_n = np.empty(3)
     for k in range(len(euler)):
-        q = quat_from_euler(euler[k, 0], euler[k, 1], euler[k, 2])
+        q = quat_from_euler_components(euler[k, 0], euler[k, 1], euler[k, 2])
         for i in range(4):
             q_nb[k, i] = q[i]
-        for i in range(3):
-            air_n[i] = v_n[k, i] - wind_n[k, i]
-        air_b = quat_rotate(quat_conjugate(q), air_n)
+        air_n = v_n[k, 0] - wind_n[k, 0], v_n[k, 1] - wind_n[k, 1], v_n[k, 2] - wind_n[k, 2]
+        air_b = quat_rotate_components((q[0], -q[1], -q[2], -q[3]), air_n)
         speed = math.sqrt(air_b[0] * air_b[0] + air_b[1] * air_b[1] + air_b[2] * air_b[2])
         across = min(max(air_b[1] / speed, -1.0), 1.0) if speed > 0.0 else 0.0
         air[0, k], air[1, k], air[2, k] = speed, math.atan2(air_b[2], air_b[0]), math.asin(across)

@@ -13,14 +13,21 @@ import shutil
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 from numpy.lib.format import open_memmap
 
 from nav._jit import njit
-from nav.earth import OMEGA_IE, ecef_from_geodetic, gravity, quat_en
-from nav.rotation import left_jacobian_solve, rotvec_from_quat
+from nav.earth import OMEGA_IE, ecef_components, gravity, quat_en_components
+from nav.rotation import (
+    Four,
+    Three,
+    left_jacobian_components,
+    quat_multiply_components,
+    quat_rotate_components,
+    rotvec_components,
+)
 from nav.samples import Array
 from testbed.errors import UserError
 
@@ -132,34 +139,6 @@ class MotionSource(Protocol):
         ...
 
 
-Three: TypeAlias = tuple[float, float, float]
-Four: TypeAlias = tuple[float, float, float, float]
-
-
-@njit
-def _product(p: Array | Four, q: Array | Four) -> Four:
-    """`quat_multiply`; as `_turned` and `_plus` it makes no array, of which a row would have twenty."""
-    return (
-        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
-        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
-        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
-        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
-    )
-
-
-@njit
-def _turned(q: Array | Four, v: Array | Three) -> Three:
-    """`quat_rotate`."""
-    tx = 2 * (q[2] * v[2] - q[3] * v[1])
-    ty = 2 * (q[3] * v[0] - q[1] * v[2])
-    tz = 2 * (q[1] * v[1] - q[2] * v[0])
-    return (
-        v[0] + q[0] * tx + q[2] * tz - q[3] * ty,
-        v[1] + q[0] * ty + q[3] * tx - q[1] * tz,
-        v[2] + q[0] * tz + q[1] * ty - q[2] * tx,
-    )
-
-
 @njit
 def _plus(u: Three, factor: float, v: Three) -> Three:
     """The sum u + factor v."""
@@ -169,14 +148,14 @@ def _plus(u: Three, factor: float, v: Three) -> Three:
 @njit
 def _inertial(lat: float, lon: float, h: float, v_n: Array, q_nb: Array) -> tuple[Four, Three, Three]:
     """Attitude q_eb, inertial velocity [m/s] and gravitation [m/s^2] of one row, both vectors in e axes."""
-    q_en = quat_en(lat, lon)
-    r_e = ecef_from_geodetic(lat, lon, h)
-    v_e = _turned(q_en, v_n)
+    q_en = quat_en_components(lat, lon)
+    r_e = ecef_components(lat, lon, h)
+    v_e = quat_rotate_components(q_en, v_n)
     # Gravity includes the centrifugal acceleration of the turning Earth, gravitation does not.
-    g_e = _turned(q_en, (0.0, 0.0, gravity(lat, h)))
+    g_e = quat_rotate_components(q_en, (0.0, 0.0, gravity(lat, h)))
     gravitation = g_e[0] - OMEGA_IE**2 * r_e[0], g_e[1] - OMEGA_IE**2 * r_e[1], g_e[2]
     v_i = v_e[0] - OMEGA_IE * r_e[1], v_e[1] + OMEGA_IE * r_e[0], v_e[2]
-    return _product(q_en, q_nb), v_i, gravitation
+    return quat_multiply_components(q_en, q_nb), v_i, gravitation
 
 
 @njit
@@ -203,10 +182,10 @@ def increments(t: Array, lat: Array, lon: Array, h: Array, v_n: Array, q_nb: Arr
         q_next, v_next, gravitation_next = _inertial(lat[k], lon[k], h[k], v_n[k], q_nb[k])
         earth_turn = math.cos(0.5 * OMEGA_IE * dt), 0.0, 0.0, math.sin(0.5 * OMEGA_IE * dt)
         q_bi = q[0], -q[1], -q[2], -q[3]
-        turn = rotvec_from_quat(np.array(_product(q_bi, _product(earth_turn, q_next))))
+        turn = rotvec_components(quat_multiply_components(q_bi, quat_multiply_components(earth_turn, q_next)))
         before = _plus(v, 0.5 * dt, gravitation)
-        after = _turned(earth_turn, _plus(v_next, -0.5 * dt, gravitation_next))
-        gain = left_jacobian_solve(turn, np.array(_turned(q_bi, _plus(after, -1.0, before))))
+        after = quat_rotate_components(earth_turn, _plus(v_next, -0.5 * dt, gravitation_next))
+        gain = left_jacobian_components(turn, quat_rotate_components(q_bi, _plus(after, -1.0, before)))
         for axis in range(3):
             dtheta[k, axis], dv[k, axis] = turn[axis], gain[axis]
         q, v, gravitation = q_next, v_next, gravitation_next

@@ -24,7 +24,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.kalman import predict
-from nav.matrix import multiply
+from nav.matrix import add_symmetric
 from nav.samples import Array
 from testbed.errors import UserError
 from testbed.estimators.outside import ArduPilotSection
@@ -160,8 +160,9 @@ def variances(P: Array, Phi: Array, decay: Array, variance: Array, H: Array) -> 
     of unit noise, one after the other, P - P h h' P / (h' P h + 1), and none where a row is zero.
     """
     (steps, moving, _), (_, measured, n) = Phi.shape, H.shape
-    found, work = np.empty((steps, moving)), np.empty((n, n))
+    found, work = np.empty((steps, moving)), np.empty((moving, n))
     W = np.empty((measured, n))  # P h of each measurement, after those before it, over the root of its variance
+    minus = np.empty((measured, n))
     for k in range(steps):
         predict(P, Phi[k], decay[k], 0.5 * variance[k], work)
         seen = 0
@@ -184,12 +185,10 @@ def variances(P: Array, Phi: Array, decay: Array, variance: Array, H: Array) -> 
             if s > 1.0:
                 for j in range(n):
                     w[j] /= math.sqrt(s)
+                    minus[seen, j] = -w[j]
                 seen += 1
         if seen:
-            multiply(work, work, work, 0, 0, W[:seen], W[:seen], n)
-            for i in range(n):
-                for j in range(n):
-                    P[i, j] -= work[i, j]
+            add_symmetric(P, minus[:seen], W[:seen])
         for i in range(moving):
             found[k, i] = P[i, i]
     return found
