@@ -99,8 +99,10 @@ def _innovate(P: Array, H: Array, R: Array, nu: Array, S: Array, HP: Array, inve
 def update(x: Array, P: Array, H: Array, R: Array, nu: Array, threshold: float) -> tuple[Array, float]:
     """`innovate` and, if nis is at most ``threshold``, `correct` ``x`` (n,) and ``P`` (n, n) in place; (S, nis).
 
-    The rows of ``P`` must be contiguous, here and in all that works on a covariance (`nav.matrix`).
+    The rows of ``P`` must be contiguous, here and in all that works on a covariance (`nav.matrix`): ValueError.
     """
+    if P.strides[1] != P.itemsize:
+        raise ValueError("the rows of P must be contiguous: numpy.ascontiguousarray makes them so")
     S, inverses, work = scratch(len(nu), len(x))
     return S, update_in(x, P, H, R, nu, threshold, S, inverses, work)
 

@@ -49,6 +49,12 @@ def test_update_is_the_dense_equation(m):
     assert (P == P.T).all()
 
 
+def test_a_covariance_in_columns_that_lie_apart_is_refused():
+    P = np.tile(np.eye(10), (1, 2))[:, ::2]
+    with pytest.raises(ValueError, match="rows of P must be contiguous"):
+        update(np.zeros(10), P, np.eye(1, 10), np.ones(1), np.ones(1), np.inf)
+
+
 def test_inverse():
     S = positive(np.random.default_rng(0), 4)
     inverse, definite = invert(S)
