@@ -6,6 +6,7 @@ import mmap
 import multiprocessing
 import os
 import signal
+import threading
 import traceback
 import warnings
 from collections.abc import Callable
@@ -107,12 +108,25 @@ class _Shared:
 def _fly(
     make: Callable[[], MotionSource], shared: _Shared, ticks: int, blocks: Connection, other_end: Connection
 ) -> None:
+    """`_share` in a thread, which has a heap of its own.
+
+    Strewn over what was free in that of the process that forked, JSBSim's model takes a tenth longer for each step.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who asked for the motion decides what an interrupt means
+    other_end.close()
+    try:
+        thread = threading.Thread(target=_share, args=(make, shared, ticks, blocks), daemon=True)
+        thread.start()
+        thread.join()
+    finally:
+        os._exit(0)  # without the parent's exit handlers, or its output buffers
+
+
+def _share(make: Callable[[], MotionSource], shared: _Shared, ticks: int, blocks: Connection) -> None:
     """Share blocks and send (number, tick, rows, activity, failure) of each, until one is empty or nobody listens.
 
     Or an exception in place of that. The last blocks but `SLOTS` have been taken when the next is written.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who asked for the motion decides what an interrupt means
-    other_end.close()
     try:
         source, rows, number = make(), 1, 0
         while rows:
@@ -130,4 +144,4 @@ def _fly(
         error.add_note(traceback.format_exc())
         blocks.send(error)
     finally:
-        os._exit(0)  # without the parent's exit handlers, or its output buffers
+        os._exit(0)  # while the thread is there: what JSBSim does as one ends is no part of the flight
