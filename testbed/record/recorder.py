@@ -196,16 +196,17 @@ class Recorder:
         """`close`, with all ``rows`` of a group and a column. Interrupted, it can be called again."""
         if self.path is None or self._closed:
             return
+        if not any(table.rows_now for table in self._tables.values()):
+            self._closed = True
+            return
         try:
-            if any(table.rows_now for table in self._tables.values()):
-                self._guard(lambda: self._finish(rows))
+            self._guard(lambda: self._finish(rows))
         except UserError:
             try:
                 self.flush()  # the file that grew may have room where a whole one beside it has none
             finally:
                 self._let_go()
             raise
-        self._let_go()
 
     def _let_go(self) -> None:
         self._closed = True
@@ -307,11 +308,12 @@ class Recorder:
         _reserve(_part(self.path), plans)
         for _ in create(_part(self.path), plans, self.attributes | {"complete": 1}, rows):
             pass
-        with interrupts.held():
+        with interrupts.held():  # from here on the rows are there, and the file that grew is not
             os.replace(_part(self.path), self.path)
             self.attributes["complete"] = 1
             for table in self._tables.values():
                 table.count_written()
+            self._let_go()
 
     def _rows(self, path: str, name: str) -> Data:
         """All rows of a column: those in the file, and those that wait."""

@@ -468,6 +468,54 @@ def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, grows: bool) 
     assert line > (200 if grows else 20)
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("flushed", [True, False])
+def test_an_interrupt_at_any_line_of_the_end_leaves_every_row(tmp_path: Path, flushed: bool) -> None:
+    """As it does within a flush; one that is held is raised as soon as it may be. `close` is then called once more."""
+    truth = circle(2.0)
+
+    def interrupted(path: Path, line: int) -> bool:
+        recorder = Recorder(path, scenario(), 3)
+        recorder.truth(truth.rows(0, 201))
+        if flushed:
+            recorder.flush()
+        recorder.truth(truth.rows(201, 401))
+        recorder.event(1.2, "info", "a row that the file lacks")
+        passed = 0
+
+        def trace(frame: FrameType, event: str, _: Any) -> Any:
+            nonlocal passed
+            if frame.f_code.co_filename not in (record.__file__, tables.__file__):
+                return None
+            passed += event == "line"
+            if passed > line:
+                sys.settrace(None)
+                if not interrupts._held:
+                    raise interrupts.Interrupted
+                interrupts._waiting.append(signal.SIGINT)
+            return trace
+
+        sys.settrace(trace)
+        try:
+            recorder.finish()
+        except interrupts.Interrupted:
+            return True
+        finally:
+            sys.settrace(None)
+            recorder.close()
+            recorder.close()
+        return False
+
+    interrupted(tmp_path / "whole.nc", 1_000_000)
+    whole, line = load(tmp_path / "whole.nc"), 0
+    while interrupted(tmp_path / "run.nc", line):
+        assert_same(whole, load(tmp_path / "run.nc"))
+        assert not list(tmp_path.glob(".*"))
+        line += 1
+    assert line > 200
+
+
 def test_missing_damaged_and_foreign_files_are_told(tmp_path: Path, run_file: Path) -> None:
     with pytest.raises(UserError, match=r"absent\.nc: no such file"):
         load(tmp_path / "absent.nc")
