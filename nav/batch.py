@@ -17,12 +17,12 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from nav._jit import inlined, njit
-from nav.aids import MagnetometerAid, problem
-from nav.aids.airspeed import Silence, airspeed, is_slow, sideslip
-from nav.aids.barometer import barometer
-from nav.aids.base import Kind, PlainAid
-from nav.aids.gnss import gnss_position, gnss_velocity, has_velocity, white
-from nav.aids.magnetometer import magnetometer
+from nav.aids import MagnetometerAid
+from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, airspeed, is_slow, sideslip
+from nav.aids.barometer import PRESSURE_LIMITS, barometer
+from nav.aids.base import Kind, PlainAid, well_within
+from nav.aids.gnss import gnss_position, gnss_velocity, is_whole, white
+from nav.aids.magnetometer import FIELD_LIMITS, magnetometer
 from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import whiten
 from nav.earth import pressure_altitude
@@ -212,10 +212,13 @@ class Batch:
     def _plan(
         self, taker: Taker, known: Mapping[str, tuple[int, PlainAid]], steps: Sequence[Step], last_fix: float
     ) -> tuple[Array, list[Silence]]:
-        """The first of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard."""
+        """The first of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard.
+
+        Whether samples are sound, `follow` finds out itself.
+        """
         flat: list[float] = []
         silences = [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
-        heard = silences
+        heard, pauses = silences, taker.pauses
         for t, horizon, sample in steps:
             if sample is None:
                 flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
@@ -227,18 +230,16 @@ class Batch:
                 if not sample.has_fix:
                     flat += (t, t, SPLIT, *NOTHING)
                     continue
-                if problem(sample) or not (has_velocity(sample) and taker.trusted(sample, last_fix)):
+                if not taker.trusted(sample, last_fix):
                     break
                 last_fix = t
-            elif problem(sample):
-                break
             for silence in silences:  # each hears it
                 if silence.stand_in(sample) is not None:
                     heard = []  # one sample too many
             if silences and not heard:
                 break
             flat += (t, t, row, *aid.numbers(sample))
-            if taker.pauses(t):
+            if pauses(t):
                 break
         return np.frombuffer(array("d", flat)).reshape(-1, WIDTH), heard
 
@@ -264,6 +265,8 @@ def follow(
     written = drafted = 0
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
+        if what >= 0 and not _is_sound(kinds[what, 0], steps[k, NUMBERS:]):
+            return k, 0, row, now, last_bad, written, drafted
         stop, settle = row_after(t, steps[k, HORIZON], row), what >= 0
         reached = t[stop - 1] if stop > row else now
         split = (settle or what == SPLIT) and time > reached + COINCIDENT and stop < len(t)
@@ -341,6 +344,19 @@ def follow(
             _report(reports[written], k, part, nu, S, nis, statistic)
             written += 1
     return len(steps), 0, row, now, last_bad, written, drafted
+
+
+@njit
+def _is_sound(kind: int, numbers: Array) -> bool:
+    """Whether a sample of these numbers (12,) surely has no `nav.aids.problem`."""
+    if kind == Kind.BAROMETER:
+        return well_within(numbers[0], PRESSURE_LIMITS)
+    if kind == Kind.MAGNETOMETER:
+        length = math.sqrt(numbers[0] ** 2 + numbers[1] ** 2 + numbers[2] ** 2)
+        return well_within(length, FIELD_LIMITS)
+    if kind == Kind.AIRSPEED:
+        return well_within(numbers[0], AIRSPEED_LIMITS)
+    return is_whole(numbers)
 
 
 @njit

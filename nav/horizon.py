@@ -97,13 +97,13 @@ class FusionHorizon:
         Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``, and none that
         had not arrived.
         """
-        for sample in samples:
+        lag_s, queue = self.lag_s, self._queue
+        for count, sample in enumerate(samples, self._count):
             t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
-            known = sample.t_arrival - self.lag_s  # not before, however early it is handed over
-            turn = known if known > t + COINCIDENT else t
-            self._queue.append((turn, sample.sensor, self._count, sample))
-            self._count += 1
-        self._queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
+            known = sample.t_arrival - lag_s  # not before, however early it is handed over
+            queue.append((known if known > t + COINCIDENT else t, sample.sensor, count, sample))
+        self._count += len(samples)
+        queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
         if len(imu):
             ready = compensate(imu, self._raw) if self.coning else imu
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])

@@ -115,8 +115,10 @@ class Silence:
         if sample.sensor == self.sensor:
             self._interval, self._heard = t - self._heard, t
             return None
-        silent = t - self._heard > max(SILENT_S, SILENT_INTERVALS * self._interval)
-        if not silent or t - self._stood_in < self._interval - TIME_TOLERANCE:
+        since = t - self._heard
+        if not since > SILENT_S or not since > SILENT_INTERVALS * self._interval:
+            return None
+        if t - self._stood_in < self._interval - TIME_TOLERANCE:
             return None
         self._stood_in = t
         return AirspeedSample(t, t, math.nan, self.sensor)

@@ -176,6 +176,13 @@ def range_problem(what: str, value: float, limits: tuple[float, float]) -> str:
     return "" if limits[0] <= value <= limits[1] else f"{what} {value:.6g} is out of range"
 
 
+@njit
+def well_within(value: float, limits: tuple[float, float]) -> bool:
+    """Whether `range_problem` surely has nothing against a value: one at the edge could be rounded over it."""
+    edge = 1e-9 * (limits[1] - limits[0])
+    return limits[0] + edge < value < limits[1] - edge
+
+
 def position_problem(lat: float, lon: float, h: float) -> str:
     """Why a position can't be, empty when it can."""
     if not (math.isfinite(lat) and math.isfinite(lon) and math.isfinite(h)):

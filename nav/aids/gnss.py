@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import NO_RATES, SPEED_LIMIT, Axes, Kind, Measurement, OperatingPoint, position_problem, put_skew
+from nav.aids.base import (
+    HEIGHT_LIMITS,
+    NO_RATES,
+    SPEED_LIMIT,
+    Axes,
+    Kind,
+    Measurement,
+    OperatingPoint,
+    position_problem,
+    put_skew,
+    well_within,
+)
 from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross, dcm_from_quat, quat_rotate
@@ -225,6 +236,17 @@ def _positive(sigma: Array) -> bool:
     x: float
     x, y, z = sigma.tolist()
     return 0.0 < x < math.inf and 0.0 < y < math.inf and 0.0 < z < math.inf
+
+
+@njit
+def is_whole(numbers: Array) -> bool:
+    """Whether a fix of these numbers (12,), those of `GnssAid.numbers`, surely has no `problem`, and has velocity."""
+    for k in range(6, 12):
+        if not 0.0 < numbers[k] < math.inf:
+            return False
+    speed = math.sqrt(numbers[3] ** 2 + numbers[4] ** 2 + numbers[5] ** 2)
+    placed = abs(numbers[0]) < 0.5 * math.pi and abs(numbers[1]) < 2 * math.pi
+    return placed and well_within(numbers[2], HEIGHT_LIMITS) and well_within(speed, (-SPEED_LIMIT, SPEED_LIMIT))
 
 
 def has_velocity(sample: GnssSample) -> bool:

@@ -73,6 +73,22 @@ def rough(increments, samples):
             change = {"t_arrival": sample.t + 1.5}
         elif within(sample, "gnss", 50, 50.5):
             change = {"sigma_position_n": np.zeros(3)}
+        elif within(sample, "gnss", 51, 51.3):
+            change = {"sigma_velocity_n": np.array([0.1, np.inf, 0.1])}
+        elif within(sample, "gnss", 53, 53.3):
+            change = {"h": 6e4}
+        elif within(sample, "gnss", 55, 55.3):
+            change = {"lat": 1.6}
+        elif within(sample, "gnss", 57, 57.3):
+            change = {"v_n": np.array([0.0, 0.0, -601.0])}
+        elif within(sample, "barometer", 59, 59.3):
+            change = {"pressure": -1.0}
+        elif within(sample, "magnetometer", 61, 61.3):
+            change = {"field_b": np.array([np.nan, 0.0, 0.0])}
+        elif within(sample, "magnetometer", 63, 63.3):
+            change = {"field_b": np.zeros(3)}
+        elif within(sample, "airspeed", 60.5, 61):
+            change = {"eas": np.inf}
         elif within(sample, "barometer", 52, 53):
             change = {"pressure": sample.pressure + 500}
         elif within(sample, "barometer", 54, 54.5):
