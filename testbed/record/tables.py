@@ -212,8 +212,9 @@ def fused_columns(reports: FusedReports) -> tuple[Block, dict[str, Variable]]:
     ((sensor, aid, m),) = reports.kinds
     block: Block = {"sample_time": reports.t, "nis": reports.nis, "threshold": reports.threshold}
     block["innovation"], block["S"] = reports.innovation, reports.S.reshape(-1, m, m)
-    for name, value in (("weight", 1.0), ("outcome", Outcome.FUSED), ("sensor", sensor.encode()), ("reason", b"")):
+    for name, value in (("weight", 1.0), ("outcome", Outcome.FUSED), ("sensor", sensor.encode())):
         block[name] = np.full(len(reports), value, REPORT[name].dtype)
+    block["reason"] = np.zeros(len(reports), REPORT["reason"].dtype)
     return block, REPORT | _innovation(aid)
 
 

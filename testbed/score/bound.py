@@ -87,8 +87,11 @@ class Bound:
         return float(np.interp(t, self.t, self.horizontal))
 
 
-def of_run(dataset: xarray.DataTree, step_s: float = STEP_S) -> dict[str, Bound]:
-    """The bound of each estimator that has one, by name, in steps of ``step_s``; see the head of this module."""
+def of_run(dataset: xarray.DataTree, step_s: float = STEP_S, until: float = math.inf) -> dict[str, Bound]:
+    """The bound of each estimator that has one, by name, in steps of ``step_s`` [s]; see the head of this module.
+
+    Nothing is worked out of what comes after ``until`` [s].
+    """
     try:
         scenario = scenario_of(dataset)
     except UserError:  # `metrics.unscored` says so
@@ -102,15 +105,16 @@ def of_run(dataset: xarray.DataTree, step_s: float = STEP_S) -> dict[str, Bound]
             continue
         key = (section.imu, *sorted(section.aiding(scenario.sensors)), str(getattr(section, "handover", None)))
         if key not in same:
-            same[key] = of_estimator(dataset, scenario, section, step_s)
+            same[key] = of_estimator(dataset, scenario, section, step_s, until)
         if (bound := same[key]) is not None:
             found[section.name] = bound
     return found
 
 
 def of_estimator(
-    dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSection, step_s: float = STEP_S
-) -> Bound | None:
+    dataset: xarray.DataTree, scenario: Scenario, section: EstimatorSection, step_s: float = STEP_S,
+    until: float = math.inf,
+) -> Bound | None:  # fmt: skip
     """The bound of one estimator of a simulated ``scenario``, if it has one; of the record, truth and samples count."""
     if _none_for(section, scenario):
         return None
@@ -126,8 +130,9 @@ def of_estimator(
             return None
     start = model.prior
     start[range(MOTION), range(MOTION)] = _start(getattr(section, "handover", None)) ** 2
-    sigma = np.sqrt(np.maximum(along(model, start), 0.0))
-    return Bound(model.way.t, sigma[:, POS], sigma[:, VEL], sigma[:, PHI])
+    steps = int(np.searchsorted(model.way.t, until)) + 1
+    sigma = np.sqrt(np.maximum(along(model, start, steps), 0.0))
+    return Bound(model.way.t[:steps], sigma[:, POS], sigma[:, VEL], sigma[:, PHI])
 
 
 def _none_for(section: EstimatorSection, scenario: Scenario) -> bool:
@@ -145,9 +150,10 @@ def _start(handover: Handover | None) -> Array:
     return np.array([level, level, heading, *[handover.velocity_mps] * 3, *[handover.position_m] * 3])
 
 
-def along(model: Model, P: Array) -> Array:
-    """The bound's variances (K, 9) of the motion after each step of a model, from ``P`` (n, n) before the first."""
-    parts = [slice(first, min(first + PART, len(model.way))) for first in range(0, len(model.way), PART)]
+def along(model: Model, P: Array, steps: int) -> Array:
+    """The bound's variances (K, 9) of the motion after each of the first ``steps``, from ``P`` (n, n) before them."""
+    stop = min(steps, len(model.way))
+    parts = [slice(first, min(first + PART, stop)) for first in range(0, stop, PART)]
     return np.concatenate([variances(P, *model.transition(part), model.measured(part)) for part in parts])
 
 

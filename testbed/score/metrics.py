@@ -139,7 +139,7 @@ def compute(dataset: xarray.DataTree, settling_s: float = SETTLING_S) -> dict[st
         )
     result: dict[str, float] = {}
     windows = outages(dataset)
-    bounds = bound.of_run(dataset) if windows else {}
+    bounds = bound.of_run(dataset, until=max(end for _, end in windows)) if windows else {}
     undenied = _undenied(dataset)
     for name in names(dataset):
         own = _estimator(dataset, name, [] if name in undenied else windows, settling_s)
