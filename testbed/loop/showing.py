@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import heapq
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -24,15 +25,15 @@ class Arrivals:
 
     def add(self, samples: Sequence[Sample]) -> None:
         """Some more of them."""
-        for sample in samples:
-            heapq.heappush(self._pending, (sample.t_arrival, self._count, sample))
-            self._count += 1
+        self._pending += [(one.t_arrival, count, one) for count, one in enumerate(samples, self._count)]
+        self._count += len(samples)
 
     def until(self, t: float) -> list[Sample]:
         """Remove and give those that arrive up to ``t``."""
-        arrived = []
-        while self._pending and self._pending[0][0] <= t:
-            arrived.append(heapq.heappop(self._pending)[2])
+        self._pending.sort()
+        due = bisect_right(self._pending, t, key=itemgetter(0))
+        arrived = [sample for _, _, sample in self._pending[:due]]
+        del self._pending[:due]
         return arrived
 
 
