@@ -131,6 +131,13 @@ def _read_column(dataset: h5py.Dataset, rows: int, places: Mapping[int, str]) ->
     return variable, values
 
 
+def _text(values: Data) -> Data:
+    """Texts of their bytes; most columns say the same in every row."""
+    if len(values) and (values == values[0]).all():
+        return np.full(len(values), values[0].decode())
+    return np.char.decode(values, "utf-8")
+
+
 def tree(
     columns: Mapping[str, Mapping[str, tuple[Variable, Data]]], attributes: Mapping[str, str | int | float]
 ) -> xarray.DataTree:
@@ -147,7 +154,7 @@ def tree(
         variables = {
             name: labelled(
                 (time_name, *variable.dims),
-                np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values,
+                _text(values) if values.dtype.kind == "S" else values,
                 variable.labels,
             )
             for name, (variable, values) in group.items()
