@@ -21,6 +21,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
@@ -51,6 +52,7 @@ COLUMN_OVERHEAD = 4096  # bytes of a file for each column, and for itself, besid
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
 UNTENDED_S = 5.0  # or this much of a live one, which writes when there is time, if there was none
 PIECE_S = 0.004  # what one piece of that work may take, on a busy machine
+COPY_BYTES = 1 << 20  # at a time, from a file to a larger one
 PACK_ROWS = 400  # objects that a table keeps before it makes columns of them: while they are in the cache
 
 
@@ -169,7 +171,9 @@ class Recorder:
     def flush(self) -> None:
         """Make every row taken so far part of the file; in memory, only pack it."""
         self._pack()
-        if self.path is not None and (self._laying or any(table.pending for table in self._tables.values())):
+        if self.path is None or self._closed:
+            return
+        if self._laying or any(table.pending for table in self._tables.values()):
             self._guard(self._write)
 
     def tend(self, seconds: float) -> None:
@@ -189,23 +193,22 @@ class Recorder:
 
     def close(self) -> None:
         """Write what is left and give the file its final size. A run without rows leaves no file."""
-        self._pack()
-        self._close(self._rows)
+        if not self._closed:
+            with suppress(UserError):
+                self.flush()  # first what takes little: whoever closes before the end may be in a hurry
+            self._close(self._rows)
 
     def _close(self, rows: Callable[[str, str], Data]) -> None:
         """`close`, with all ``rows`` of a group and a column. Interrupted, it can be called again."""
-        if self.path is None or self._closed:
-            return
-        if not any(table.rows_now for table in self._tables.values()):
+        if self.path is None or not any(table.rows_now for table in self._tables.values()):
             self._closed = True
             return
         try:
             self._guard(lambda: self._finish(rows))
-        except UserError:
-            try:
+        except Exception:
+            with suppress(UserError):
                 self.flush()  # the file that grew may have room where a whole one beside it has none
-            finally:
-                self._let_go()
+            self._let_go()
             raise
 
     def _let_go(self) -> None:
@@ -223,8 +226,17 @@ class Recorder:
 
     def finish(self) -> xarray.DataTree:
         """`close`, and give everything recorded: to read the compressed file again would take several times as long."""
+        if self.path is None or self._closed:
+            return self.dataset()
         self._pack()
-        rows = {(path, name): self._rows(path, name) for path, t in self._tables.items() for name in t.columns}
+        self._laying = None
+        rows: dict[tuple[str, str], Data] = {}
+
+        def read() -> None:
+            for path, table in self._tables.items():
+                rows.update({(path, name): self._rows(path, name) for name in table.columns})
+
+        self._guard(read)
         self._close(lambda path, name: rows[path, name])
         return self._tree(lambda path, name: rows[path, name])
 
@@ -354,7 +366,11 @@ class Recorder:
             new.close()
             raise
         with interrupts.held():  # between the old file and the new one, what is in which would not be known
-            os.replace(_part(self.path), self.path)
+            try:
+                os.replace(_part(self.path), self.path)
+            except OSError:
+                new.close()
+                raise
             if self._file is not None:
                 self._file.close()
             self._file = new
@@ -383,10 +399,12 @@ class Recorder:
         assert self.path is not None
         try:
             write()
-        except (OSError, RuntimeError) as error:  # HDF5 has both
+        except Exception as error:
             self._laying = None
             _part(self.path).unlink(missing_ok=True)
-            raise UserError(f"{self.path}: can't write the record ({_reason(error)})") from error
+            if isinstance(error, OSError | RuntimeError):  # HDF5 has both
+                raise UserError(f"{self.path}: can't write the record ({_reason(error)})") from error
+            raise
 
 
 def _reason(error: Exception) -> str:
@@ -415,12 +433,10 @@ def _part(path: Path) -> Path:
 
 
 def _copy(source: FileIO, start: int, target: FileIO, at: int, count: int) -> Iterator[None]:
-    source.seek(start)
-    while count:
-        chunk = source.read(min(count, 1 << 20))
-        _put(target, at, chunk)
-        at += len(chunk)
-        count -= len(chunk)
+    for done in range(0, count, COPY_BYTES):
+        chunk = memoryview(bytearray(min(COPY_BYTES, count - done)))
+        _get(source, start + done, chunk)
+        _put(target, at + done, chunk)
         yield
 
 

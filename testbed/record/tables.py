@@ -85,8 +85,9 @@ class Table:
                 self.grown = True
         if math.isnan(self.started):
             self.started = float(block[self.time_name][0])
-        self.blocks.append(block)
-        self.pending += len(block[self.time_name])
+        with interrupts.held():
+            self.blocks.append(block)
+            self.pending += len(block[self.time_name])
 
     @property
     def rows_now(self) -> int:

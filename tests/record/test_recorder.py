@@ -643,6 +643,26 @@ def test_a_disk_that_is_full_from_any_write_on_leaves_the_last_flush(
     assert not list(tmp_path.glob(".*"))
 
 
+def test_an_error_of_another_kind_at_the_end_leaves_every_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.nc"
+    recorder = Recorder(path, scenario(), 3)
+    truth = circle(4.0)
+    recorder.truth(truth.rows(0, 401))
+    recorder.flush()
+    recorder.truth(truth.rows(401, 801))
+
+    def exhausted(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(record, "_reserve", exhausted)
+    with pytest.raises(MemoryError):
+        recorder.finish()
+    recorder.close()
+    assert len(load(path)["truth"]["time"]) == 41
+    assert len(recorder.finish()["truth"]["time"]) == 41
+    assert not list(tmp_path.glob(".*"))
+
+
 def test_rows_since_the_last_flush_go_where_they_can_when_there_is_no_room_for_a_whole_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
