@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -423,11 +424,37 @@ def test_death_at_any_write_leaves_the_last_flush(tmp_path: Path, monkeypatch: p
     np.testing.assert_array_equal(load(path)["truth"]["wind_n"], truth.wind_n[::20])
 
 
+def interrupted_at(line: int, work: Callable[[], object]) -> bool:
+    """Whether ``work`` was interrupted at its n-th line of the recorder; where interrupts are held, at their end."""
+    passed = 0
+
+    def trace(frame: FrameType, event: str, _: Any) -> Any:
+        nonlocal passed
+        if frame.f_code.co_filename not in (record.__file__, tables.__file__):
+            return None
+        passed += event == "line"
+        if passed > line:
+            sys.settrace(None)
+            if not interrupts._held:
+                raise interrupts.Interrupted
+            interrupts._waiting.append(signal.SIGINT)
+        return trace
+
+    sys.settrace(trace)
+    try:
+        work()
+    except interrupts.Interrupted:
+        return True
+    finally:
+        sys.settrace(None)
+    return False
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file that its owner did not close
 @pytest.mark.parametrize("grows", [True, False])
 def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, grows: bool) -> None:
-    """Raised at the n-th line of a flush that lays out a new file, or not, wherever interrupts are not held."""
+    """Of a flush that lays out a new file, or not."""
     truth = circle(2.0)
 
     def interrupted(path: Path, line: int) -> bool:
@@ -438,27 +465,9 @@ def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, grows: bool) 
         recorder.flush()
         recorder.truth(truth.rows(201, 401))
         recorder.event(1.2, "info", "a row that the file lacks")
-        passed = 0
-
-        def trace(frame: FrameType, event: str, _: Any) -> Any:
-            nonlocal passed
-            if frame.f_code.co_filename not in (record.__file__, tables.__file__):
-                return None
-            passed += event == "line"
-            if passed > line and not interrupts._held:
-                sys.settrace(None)
-                raise interrupts.Interrupted
-            return trace
-
-        sys.settrace(trace)
-        try:
-            recorder.flush()
-        except interrupts.Interrupted:
-            return True
-        finally:
-            sys.settrace(None)
-            recorder.close()
-        return False
+        was = interrupted_at(line, recorder.flush)
+        recorder.close()
+        return was
 
     interrupted(tmp_path / "whole.nc", 1_000_000)
     whole, line = load(tmp_path / "whole.nc"), 0
@@ -472,7 +481,7 @@ def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, grows: bool) 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("flushed", [True, False])
 def test_an_interrupt_at_any_line_of_the_end_leaves_every_row(tmp_path: Path, flushed: bool) -> None:
-    """As it does within a flush; one that is held is raised as soon as it may be. `close` is then called once more."""
+    """`close` is then called once more, and again."""
     truth = circle(2.0)
 
     def interrupted(path: Path, line: int) -> bool:
@@ -482,30 +491,10 @@ def test_an_interrupt_at_any_line_of_the_end_leaves_every_row(tmp_path: Path, fl
             recorder.flush()
         recorder.truth(truth.rows(201, 401))
         recorder.event(1.2, "info", "a row that the file lacks")
-        passed = 0
-
-        def trace(frame: FrameType, event: str, _: Any) -> Any:
-            nonlocal passed
-            if frame.f_code.co_filename not in (record.__file__, tables.__file__):
-                return None
-            passed += event == "line"
-            if passed > line:
-                sys.settrace(None)
-                if not interrupts._held:
-                    raise interrupts.Interrupted
-                interrupts._waiting.append(signal.SIGINT)
-            return trace
-
-        sys.settrace(trace)
-        try:
-            recorder.finish()
-        except interrupts.Interrupted:
-            return True
-        finally:
-            sys.settrace(None)
-            recorder.close()
-            recorder.close()
-        return False
+        was = interrupted_at(line, recorder.finish)
+        recorder.close()
+        recorder.close()
+        return was
 
     interrupted(tmp_path / "whole.nc", 1_000_000)
     whole, line = load(tmp_path / "whole.nc"), 0
