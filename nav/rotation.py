@@ -56,7 +56,13 @@ def dot(u: Array, v: Array) -> float:
 @njit
 def cross(u: Array, v: Array) -> Array:
     """U x v (3,): for three elements far cheaper than `numpy.cross`, and quicker to compile."""
-    return np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
+    return np.array(cross_components(u, v))
+
+
+@njit
+def cross_components(u: Array | Three, v: Array | Three) -> Three:
+    """`cross` without an array, for long loops."""
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
 
 
 @njit
@@ -244,15 +250,10 @@ def left_jacobian_components(phi: Array | Three, v: Array | Three) -> Three:
     a, b, _ = rotation_coefficients(s)
     # The rounding error of k grows as 1/s, but k multiplies terms of order s.
     k = (1 - 0.5 * a / b) / s if s > 1e-8 else 1 / 12
-    first = _cross(phi, v)
-    second = _cross(phi, first)
+    first = cross_components(phi, v)
+    second = cross_components(phi, first)
     return (
         v[0] - 0.5 * first[0] + k * second[0],
         v[1] - 0.5 * first[1] + k * second[1],
         v[2] - 0.5 * first[2] + k * second[2],
     )
-
-
-@njit
-def _cross(u: Array | Three, v: Array | Three) -> Three:
-    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]

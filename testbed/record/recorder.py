@@ -26,7 +26,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from io import FileIO
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from testbed.scenario import Scenario
     from testbed.sensors.faults import FaultTruth
     from testbed.sensors.imu import ImuConfig
+
+T = TypeVar("T")
 
 COLUMN_OVERHEAD = 4096  # bytes of a file for each column, and for itself, beside the rows: a generous guess
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
@@ -230,13 +232,8 @@ class Recorder:
             return self.dataset()
         self._pack()
         self._laying = None
-        rows: dict[tuple[str, str], Data] = {}
-
-        def read() -> None:
-            for path, table in self._tables.items():
-                rows.update({(path, name): self._rows(path, name) for name in table.columns})
-
-        self._guard(read)
+        columns = self._tables.items()
+        rows = self._guard(lambda: {(path, name): self._rows(path, name) for path, t in columns for name in t.columns})
         self._close(lambda path, name: rows[path, name])
         return self._tree(lambda path, name: rows[path, name])
 
@@ -394,11 +391,11 @@ class Recorder:
                 else:
                     _put(new, plan.offsets[name], blank((written, *column.shape), column.dtype).data.cast("B"))
 
-    def _guard(self, write: Callable[[], None]) -> None:
+    def _guard(self, work: Callable[[], T]) -> T:
         """Turn a full disk and the like into a message; what the file held before stays."""
         assert self.path is not None
         try:
-            write()
+            return work()
         except Exception as error:
             self._laying = None
             _part(self.path).unlink(missing_ok=True)

@@ -452,46 +452,24 @@ def interrupted_at(line: int, work: Callable[[], object]) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file that its owner did not close
-@pytest.mark.parametrize("grows", [True, False])
-def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, grows: bool) -> None:
-    """Of a flush that lays out a new file, or not."""
+@pytest.mark.parametrize(
+    ("flushed", "work", "least"),
+    [("truth", "flush", 200), ("truth, events", "flush", 20), ("truth", "finish", 200), ("", "finish", 200)],
+)
+def test_an_interrupt_at_any_line_leaves_every_row(tmp_path: Path, flushed: str, work: str, least: int) -> None:
+    """Of a flush that lays out a new file, or not; of the end, with a file or without. `close` may come twice."""
     truth = circle(2.0)
 
     def interrupted(path: Path, line: int) -> bool:
         recorder = Recorder(path, scenario(), 3)
         recorder.truth(truth.rows(0, 201))
-        if not grows:
+        if "events" in flushed:
             recorder.event(0.2, "info", "a table that the file has")
-        recorder.flush()
-        recorder.truth(truth.rows(201, 401))
-        recorder.event(1.2, "info", "a row that the file lacks")
-        was = interrupted_at(line, recorder.flush)
-        recorder.close()
-        return was
-
-    interrupted(tmp_path / "whole.nc", 1_000_000)
-    whole, line = load(tmp_path / "whole.nc"), 0
-    while interrupted(tmp_path / "run.nc", line):
-        assert_same(whole, load(tmp_path / "run.nc"))
-        line += 1
-    assert line > (200 if grows else 20)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("flushed", [True, False])
-def test_an_interrupt_at_any_line_of_the_end_leaves_every_row(tmp_path: Path, flushed: bool) -> None:
-    """`close` is then called once more, and again."""
-    truth = circle(2.0)
-
-    def interrupted(path: Path, line: int) -> bool:
-        recorder = Recorder(path, scenario(), 3)
-        recorder.truth(truth.rows(0, 201))
         if flushed:
             recorder.flush()
         recorder.truth(truth.rows(201, 401))
         recorder.event(1.2, "info", "a row that the file lacks")
-        was = interrupted_at(line, recorder.finish)
+        was = interrupted_at(line, getattr(recorder, work))
         recorder.close()
         recorder.close()
         return was
@@ -502,7 +480,7 @@ def test_an_interrupt_at_any_line_of_the_end_leaves_every_row(tmp_path: Path, fl
         assert_same(whole, load(tmp_path / "run.nc"))
         assert not list(tmp_path.glob(".*"))
         line += 1
-    assert line > 200
+    assert line > least
 
 
 def test_missing_damaged_and_foreign_files_are_told(tmp_path: Path, run_file: Path) -> None:

@@ -297,6 +297,14 @@ def test_finer_steps_and_fewer_sensors(short: RunResult) -> None:
 
 
 @pytest.mark.ci
+def test_what_comes_later_changes_nothing(short: RunResult) -> None:
+    whole, part = bound.of_run(short.dataset)["ins"], bound.of_run(short.dataset, until=100.0)["ins"]
+    assert 100.0 <= part.t[-1] < 100.0 + 2 * bound.STEP_S
+    for name in ("t", "position", "velocity", "attitude"):
+        np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[: len(part.t)])
+
+
+@pytest.mark.ci
 def test_what_was_not_simulated_or_not_denied_has_none(short: RunResult) -> None:
     assert bound.of_run(xarray.DataTree.from_dict({"/": xarray.Dataset()})) == {}
     recorded = short.dataset.copy()
