@@ -76,8 +76,9 @@ class Taker(Protocol):
         """Whether a sound fix, if it is inside its gate, is simply used when the one of the time ``before`` was."""
         ...
 
-    def pauses(self, t: float) -> bool:
-        """Whether there is something to do after a sample of the time ``t`` [s] and before the next step."""
+    @property
+    def pauses_from(self) -> float:
+        """The time [s] of samples from which on there is something to do after one and before the next step."""
         ...
 
     def took(self, sample: Sample) -> None:
@@ -175,7 +176,7 @@ class Batch:
             estimates.append(taker.told(wholes[:drafted], when[:drafted, 0], status))
         if not done.parts:
             return done.steps, done.last_bad
-        sample = steps[done.steps].sample
+        _, _, sample = steps[done.steps]
         assert sample is not None
         taker.took(sample)
         reports += taker.finish(sample, done.parts)
@@ -218,7 +219,7 @@ class Batch:
         """
         flat: list[float] = []
         silences = [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
-        heard, pauses = silences, taker.pauses
+        heard, pauses_from = silences, taker.pauses_from
         for t, horizon, sample in steps:
             if sample is None:
                 flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
@@ -239,7 +240,7 @@ class Batch:
             if silences and not heard:
                 break
             flat += (t, t, row, *aid.numbers(sample))
-            if pauses(t):
+            if t >= pauses_from:
                 break
         return np.frombuffer(array("d", flat)).reshape(-1, WIDTH), heard
 

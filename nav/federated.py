@@ -177,13 +177,14 @@ class Federated:
         for filter_ in self.locals:
             if (silent := filter_.stand_in(sample)) is not None:
                 reports += [replace(report, sensor=NO_SENSOR) for report in self._use(state, filter_, silent)]
-        if self.pauses(sample.t):
+        if sample.t >= self.pauses_from:
             self._pause(state, sample.t)
         return reports
 
-    def pauses(self, t: float) -> bool:
-        """See `nav.batch.Taker`: whether a fusion is due."""
-        return t - self._fused_at >= self.config.fusion_period_s - TIME_TOLERANCE
+    @property
+    def pauses_from(self) -> float:
+        """See `nav.batch.Taker`: when a fusion is due."""
+        return self._fused_at + self.config.fusion_period_s - TIME_TOLERANCE
 
     def _pause(self, state: State, t: float) -> None:
         """Fuse."""
@@ -209,9 +210,9 @@ class Federated:
             self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates
         )
         self.t = ahead.t
-        last = steps[taken - 1].sample if taken else None
+        last = steps[taken - 1][2] if taken else None
         used = last is not None and not (isinstance(last, GnssSample) and not last.has_fix)
-        if last is not None and used and self.pauses(last.t):
+        if last is not None and used and last.t >= self.pauses_from:
             self._pause(self._state, last.t)
         return taken
 

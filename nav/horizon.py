@@ -113,12 +113,12 @@ class FusionHorizon:
         estimator = self.estimator
         if getattr(estimator, "in_steps", False) and self._ahead.next:
             self._take(cast(TakesSteps, estimator), times, reports, estimates)
-            return Reports(reports), Estimates.of(estimates)
+            return Reports.joined([Reports(reports)]), Estimates.of(estimates)
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
-        if self._ahead.ends:
-            self._use(self._ahead.ends[-1], reports)
+        if len(self._ahead.imu):
+            self._use(float(self._ahead.imu.t[-1]), reports)
         return Reports(reports), Estimates.of(estimates)
 
     def estimate_at(self, t: float) -> Estimate:
@@ -137,7 +137,7 @@ class FusionHorizon:
             estimate = self.estimator.estimate()
             return estimate if estimate.t == t else replace(estimate, t=t)
         front = ahead.rows(ahead.next, stop)
-        further = t - max(ahead.ends[stop - 1], ahead.t)
+        further = t - max(float(ahead.imu.t[stop - 1]), ahead.t)
         if further > ahead.longest + COINCIDENT:
             raise ValueError(f"no inertial samples up to {t} s")
         if further > COINCIDENT:  # as the next increment would be if one's rates went on
@@ -148,18 +148,19 @@ class FusionHorizon:
     def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Told) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         steps: list[Step] = []
-        ends, lag = self._ahead.ends, self.lag_s if self.estimator.listening else 0.0
+        lag = self.lag_s if self.estimator.listening else 0.0
         queue, accepts, due = self._queue, self.estimator.accepts, 0
-        for t in (*times, ends[-1]):
-            horizon = ends[self._ahead.row_after(t) - 1] - lag
+        all_times = [*times, float(self._ahead.imu.t[-1])]
+        for t, end in zip(all_times, self._ahead.ends_by(all_times), strict=True):
+            horizon = end - lag
             while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
                 turn, _, _, sample = queue[due]
                 if accepts(sample):
-                    steps.append(Step(sample.t, turn, sample))
+                    steps.append((sample.t, turn, sample))
                 due += 1
-            steps.append(Step(t, horizon))
+            steps.append((t, horizon, None))
         del queue[:due]
-        steps[-1] = Step(math.nan, steps[-1].horizon)
+        steps[-1] = math.nan, steps[-1][1], None
         while steps:
             taken = estimator.take(steps, self._ahead, reports, estimates)
             if not taken:
@@ -168,12 +169,13 @@ class FusionHorizon:
 
     def _go(self, step: Step, reports: Reported, estimates: Told) -> None:
         """Take one step by itself."""
-        if step.sample is not None:
-            self._apply(step.horizon, step.sample, reports)
+        t, horizon, sample = step
+        if sample is not None:
+            self._apply(horizon, sample, reports)
             return
-        self._propagate_to(step.horizon, reports)
-        if not math.isnan(step.t):
-            estimates.append(self.estimate_at(step.t))
+        self._propagate_to(horizon, reports)
+        if not math.isnan(t):
+            estimates.append(self.estimate_at(t))
 
     def _use(self, now: float, reports: Reported) -> None:
         """Bring the estimator to ``lag_s`` before the last increment by ``now``, with every sample up to there.
@@ -183,7 +185,7 @@ class FusionHorizon:
         stop = self._ahead.row_after(now)
         if not stop:
             return
-        horizon = self._ahead.ends[stop - 1] - (self.lag_s if self.estimator.listening else 0.0)
+        horizon = float(self._ahead.imu.t[stop - 1]) - (self.lag_s if self.estimator.listening else 0.0)
         while self._queue and self._queue[0][0] <= horizon + COINCIDENT:
             turn, _, _, sample = heapq.heappop(self._queue)
             if self.estimator.accepts(sample):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,16 +17,9 @@ COINCIDENT = 1e-6  # two times this close are the same [s]
 TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
 ESTIMATE, ADVANCE = -1, -2
 
-
-class Step(NamedTuple):
-    """What an estimator is to do next: go on to ``horizon`` [s] and say what it knows of ``t`` [s], later or the same.
-
-    With a ``sample`` it is to use that, which is valid at ``t``; a ``t`` of NaN asks for nothing.
-    """
-
-    t: float
-    horizon: float
-    sample: Sample | None = None
+# What an estimator is to do next, (t, horizon, sample): go on to the horizon [s] and say what it knows of t [s], later
+# or the same. With a sample it is to use that, which is valid at t; a t of NaN asks for nothing.
+Step: TypeAlias = tuple[float, float, Sample | None]
 
 
 @dataclass
@@ -42,7 +36,6 @@ class Increments:
     next: int = 0
     t: float = -np.inf
     longest: float = 0.0
-    ends: list[float] = field(default_factory=list)  # the times of the increments, for `row_after`
 
     def append(self, imu: ImuSamples) -> None:
         """More increments, which follow on the last; of those used one is kept, whose rates lead on."""
@@ -50,13 +43,18 @@ class Increments:
             self.t = float(imu.t[0] - imu.dt[0])
         kept = max(self.next - 1, 0)
         self.imu = joined(self.rows(kept, len(self.imu)), imu)
-        self.ends = self.imu.t.tolist()
         self.longest = max(self.longest, float(imu.dt.max()))
         self.next -= kept
 
     def row_after(self, t: float) -> int:
         """The first row, of those not used, that ends after ``t`` [s]."""
-        return bisect_right(self.ends, t + COINCIDENT, self.next)
+        return bisect_right(self.imu.t, t + COINCIDENT, self.next)
+
+    def ends_by(self, times: Sequence[float]) -> list[float]:
+        """The end of the last row by each of the ``times`` [s], one at least having been used."""
+        rows = np.searchsorted(self.imu.t[self.next :], np.array(times) + COINCIDENT, side="right")
+        ends: list[float] = self.imu.t[self.next - 1 + rows].tolist()
+        return ends
 
     def rows(self, start: int, stop: int) -> ImuSamples:
         """Some rows, as views."""
@@ -69,12 +67,12 @@ class Increments:
         if stop <= self.next:
             return None
         taken = self.rows(self.next, stop)
-        self.t, self.next = self.ends[stop - 1], stop
+        self.t, self.next = float(taken.t[-1]), stop
         return taken
 
     def part(self, t: float) -> ImuSamples | None:
         """What the next increment has up to ``t`` [s], which is used with that; None where ``t`` is not within it."""
-        if not (t > self.t + COINCIDENT and self.next < len(self.ends)):
+        if not (t > self.t + COINCIDENT and self.next < len(self.imu)):
             return None
         imu, row = self.imu, self.next
         taken = share_of(self.rows(row, row + 1), 1 - (imu.t[row] - t) / imu.dt[row], t)

@@ -216,9 +216,10 @@ class Ins:
         """See `nav.batch.Taker`."""
         return self._monitor.sure(fix.t, before) and not (self._winds is not None and self._winds.due(fix.t))
 
-    def pauses(self, t: float) -> bool:
-        """See `nav.batch.Taker`."""
-        return False
+    @property
+    def pauses_from(self) -> float:
+        """See `nav.batch.Taker`: never."""
+        return math.inf
 
     def took(self, sample: Sample) -> None:
         """See `nav.batch.Taker`."""

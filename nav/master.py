@@ -71,9 +71,12 @@ class MasterFilter:
 
     def reset(self, state: State, row: int, x_g: Array, P_g: Array) -> None:
         """`nav.fusion.reset` one filter."""
+        if row not in self._reference.scalings:
+            reset(state.x[row], state.P[row], x_g, P_g)
+            return
         P = self.charted(state, row)
         reset(state.x[row], P, x_g, P_g)
-        state.P[row] = turned(state.x[row], P, own=True) if row in self._reference.scalings else P
+        state.P[row] = turned(state.x[row], P, own=True)
 
     def fuse(self, state: State) -> None:
         """Fuse, correct the nominal state, reset the filters as the structure says."""

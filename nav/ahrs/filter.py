@@ -143,7 +143,7 @@ class Ahrs:
         s, imu, plan = self._state, ahead.imu, self._plan(steps)
         if s is None or not len(plan):
             return 0
-        periods = self._periods(ahead.ends[-1] + ahead.longest - ahead.t)  # what is predicted counts
+        periods = self._periods(float(imu.t[-1]) + ahead.longest - ahead.t)  # what is predicted counts
         told = np.empty((len(plan) + periods, kernels.REPORT))
         asked = np.count_nonzero(plan[:, WHAT] == ESTIMATE)
         wholes, when = np.empty((asked, len(s.whole))), np.empty((asked, 2))

@@ -91,7 +91,7 @@ class Lane:
         if self.commanded is not None:
             self.commanded(commanded)
         increments, votes = self.increments(imu)
-        handed = [sample for aid in self.sensors for sample in samples[aid] if self._spaced(aid, sample)]
+        handed = [sample for aid in self.sensors for sample in self._thinned(aid, samples[aid])]
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
 
@@ -100,15 +100,17 @@ class Lane:
         estimator = self.horizon.estimator
         return estimator.smoothed(times) if isinstance(estimator, Ins) and estimator.config.smooth else iter(())
 
-    def _spaced(self, sensor: str, sample: Sample) -> bool:
-        """Whether a sample is far enough from the last one that was handed over of its sensor."""
+    def _thinned(self, sensor: str, samples: Sequence[Sample]) -> Sequence[Sample]:
+        """Those of one sensor that are far enough from the last one before them that was handed over."""
         least = self.spacing_s.get(sensor)
         if least is None:
-            return True
-        if sample.t - self._taken.get(sensor, -math.inf) < least * (1 - JITTER):
-            return False
-        self._taken[sensor] = sample.t
-        return True
+            return samples
+        spaced = []
+        for sample in samples:
+            if not sample.t - self._taken.get(sensor, -math.inf) < least * (1 - JITTER):
+                self._taken[sensor] = sample.t
+                spaced.append(sample)
+        return spaced
 
     @property
     def failure(self) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -339,8 +340,20 @@ class Gnss:
         antenna = self._antenna(truth, rows)
         if old_n is not None:
             antenna[:, 3:] = old_n[rows.start :: rows.step]
+        times = truth.t[rows.start :: rows.step].tolist()
+        unsettled = [self._unsettled(*where) for where in zip(times, *antenna[:, :2].T.tolist(), strict=True)]
+        fixed = [i for i, factor in enumerate(unsettled) if factor]
+        stamps = [t + self._off for t in times]
+        fixes = iter(
+            self._fixes(
+                [stamps[i] for i in fixed], antenna[fixed], noise[fixed], jumps_n[fixed], sky[fixed, 0].tolist(),
+                [unsettled[i] for i in fixed],
+            )
+        )  # fmt: skip
+        latency = self._config.latency_s
         return [
-            self._sample(float(truth.t[k]), antenna[i], noise[i], jumps_n[i], sky[i, 0]) for i, k in enumerate(rows)
+            next(fixes) if factor else without_fix(t, t + latency, self.name)
+            for t, factor in zip(stamps, unsettled, strict=True)
         ]
 
     def _antenna(self, truth: TruthBlock, rows: range) -> Array:
@@ -360,34 +373,42 @@ class Gnss:
         )
         return antenna
 
-    def _sample(self, t: float, antenna: Array, noise: Array, jump_n: Array, sky: float) -> GnssSample:
+    def _unsettled(self, t: float, lat: float, lon: float) -> float:
+        """By how much errors at ``t`` [s] and a place are larger than usual; zero without a fix."""
         config = self._config
-        stamp = t + self._off
-        arrival = stamp + config.latency_s
-        if not self.reception.has_fix(t, antenna[0], antenna[1]):
-            return without_fix(stamp, arrival, self.name)
-        unsettled = 1 + (config.settle_factor - 1) * math.exp(
-            -(t - self.reception.denied_until - config.reacquire_s) / config.settle_s
-        )
-        noise = noise * unsettled
-        noise[:3] += jump_n
-        lat, lon, h = displaced(antenna[0], antenna[1], antenna[2], noise)
-        satellites = max(MIN_SATELLITES, round((config.satellites + sky) / unsettled))
-        dilution = math.sqrt(config.satellites / satellites)
-        return GnssSample(
-            stamp,
-            arrival,
-            lat,
-            lon,
-            h,
-            antenna[3:] + noise[3:],
-            *self._stated(unsettled, jump_n),
-            FixType.FIX_3D,
-            satellites,
-            config.hdop * dilution,
-            config.vdop * dilution,
-            self.name,
-        )
+        if not self.reception.has_fix(t, lat, lon):
+            return 0.0
+        since = t - self.reception.denied_until - config.reacquire_s
+        return 1 + (config.settle_factor - 1) * math.exp(-since / config.settle_s)
+
+    def _fixes(
+        self, stamps: Sequence[float], antenna: Array, noise: Array, jumps_n: Array, sky: Sequence[float],
+        unsettled: Sequence[float],
+    ) -> Iterator[GnssSample]:  # fmt: skip
+        """The samples of N epochs with a fix: of the antenna's places and velocities (N, 6), and their errors."""
+        config = self._config
+        noise = noise * np.array(unsettled)[:, None]
+        noise[:, :3] += jumps_n
+        v_n = antenna[:, 3:] + noise[:, 3:]
+        for k, (t, factor, (lat, lon, h)) in enumerate(
+            zip(stamps, unsettled, _displaced(antenna, noise).tolist(), strict=True)
+        ):
+            satellites = max(MIN_SATELLITES, round((config.satellites + sky[k]) / factor))
+            dilution = math.sqrt(config.satellites / satellites)
+            yield GnssSample(
+                t,
+                t + config.latency_s,
+                lat,
+                lon,
+                h,
+                v_n[k],
+                *self._stated(factor, jumps_n[k]),
+                FixType.FIX_3D,
+                satellites,
+                config.hdop * dilution,
+                config.vdop * dilution,
+                self.name,
+            )
 
     def _stated(self, unsettled: float, jump_n: Array) -> tuple[Array, Array]:
         """The accuracies of position and velocity that it reports."""
@@ -403,6 +424,15 @@ def displaced(lat: float, lon: float, h: float, d_n: Array) -> tuple[float, floa
     R_M, R_N = radii(lat)
     east = d_n[1] / ((R_N + h) * math.cos(lat))
     return lat + d_n[0] / (R_M + h), wrap_longitude(lon + east), h - d_n[2]
+
+
+@njit
+def _displaced(antenna: Array, d_n: Array) -> Array:
+    """`displaced`, of each row of both (N, _)."""
+    places = np.empty((len(antenna), 3))
+    for k in range(len(antenna)):
+        places[k] = displaced(antenna[k, 0], antenna[k, 1], antenna[k, 2], d_n[k])
+    return places
 
 
 @njit

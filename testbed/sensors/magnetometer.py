@@ -6,6 +6,7 @@ import datetime
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -105,11 +106,20 @@ class FieldMap:
 
     def field_n(self, lat: float, lon: float, h: float) -> Array:
         """The field (3,) [T], north-east-down."""
-        x, y, z = lat / self.STEP[0], lon / self.STEP[1], h / self.STEP[2]
-        cell = (math.floor(x), math.floor(y), math.floor(z))
-        if cell != self._cell:
-            self._enter(cell)
-        return _interpolate(self._corners, x - cell[0], y - cell[1], z - cell[2])
+        field: Array = self.along(np.array([[lat, lon, h]]))[0]
+        return field
+
+    def along(self, lla: Array) -> Array:
+        """The field (N, 3) [T], north-east-down, at places (N, 3) one after the other."""
+        fields, at = np.empty(lla.shape), lla / self.STEP
+        cells = np.floor(at)
+        edges = 1 + np.flatnonzero((cells[1:] != cells[:-1]).any(axis=1))
+        for first, last in pairwise([0, *edges.tolist(), len(lla)]):
+            i, j, k = cells[first].astype(int).tolist()
+            if (i, j, k) != self._cell:
+                self._enter((i, j, k))
+            _interpolate(self._corners, at[first:last] - cells[first], fields[first:last])
+        return fields
 
     def _enter(self, cell: tuple[int, int, int]) -> None:
         self._cell = cell
@@ -123,16 +133,17 @@ class FieldMap:
 
 
 @njit
-def _interpolate(corners: Array, x: float, y: float, z: float) -> Array:
-    """Trilinear interpolation between ``corners`` (2, 2, 2, 3), x, y, z in [0, 1]."""
-    value = np.zeros(3)
-    for i in range(2):
-        for j in range(2):
-            for k in range(2):
-                weight = (x if i else 1 - x) * (y if j else 1 - y) * (z if k else 1 - z)
-                for c in range(3):
-                    value[c] += weight * corners[i, j, k, c]
-    return value
+def _interpolate(corners: Array, inside: Array, values: Array) -> None:
+    """Trilinear interpolation between ``corners`` (2, 2, 2, 3) at ``inside`` (N, 3), in [0, 1], into ``values``."""
+    values[:] = 0.0
+    for row in range(len(inside)):
+        x, y, z = inside[row]
+        for i in range(2):
+            for j in range(2):
+                for k in range(2):
+                    weight = (x if i else 1 - x) * (y if j else 1 - y) * (z if k else 1 - z)
+                    for c in range(3):
+                        values[row, c] += weight * corners[i, j, k, c]
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,12 +231,11 @@ class Magnetometer:
         n = len(rows)
         if not n:
             return []
-        fields = np.empty((n, 3))
-        for i, k in enumerate(rows):
-            fields[i] = self._map.field_n(truth.lat[k], truth.lon[k], truth.h[k])
+        due = slice(rows.start, None, rows.step)
+        fields = self._map.along(np.column_stack([truth.lat[due], truth.lon[due], truth.h[due]]))
         measured = self._white.take(n)
         if self._motor.any():
-            measured += truth.controls[rows.start :: rows.step, 3, None] * self._motor
+            measured += truth.controls[due, 3, None] * self._motor
         _measure(
             rows.start,
             rows.step,
@@ -240,7 +250,7 @@ class Magnetometer:
         )
         return [
             MagnetometerSample(t, t + self._schedule.latency, measured[i], self.name)
-            for i, t in enumerate(truth.t[rows.start :: rows.step].tolist())
+            for i, t in enumerate(truth.t[due].tolist())
         ]
 
 

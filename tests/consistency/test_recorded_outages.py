@@ -89,7 +89,7 @@ class Flight:
             samples = [
                 one
                 for one in self.samples[arrived]
-                if not (denied and isinstance(one, GnssSample)) and self.lane._spaced(one.sensor, one)
+                if not (denied and isinstance(one, GnssSample)) and self.lane._thinned(one.sensor, [one])
             ]
             known = float(imu.t[stop - 1]) if stop else 0.0
             here = [t for t in times if self.known < t <= known]
