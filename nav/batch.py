@@ -9,12 +9,13 @@ is not what it seemed to be; that is left to the filter.
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from copy import copy
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import inlined, njit
 from nav.aids import MagnetometerAid
@@ -36,7 +37,7 @@ from nav.increments import (
     TIME,
     WHAT,
     Increments,
-    Step,
+    Steps,
     row_after,
     share,
     take_off,
@@ -50,7 +51,7 @@ from nav.state import State, absorb, parts, propagate
 
 SPLIT = -3  # of a step, in place of the number of an aid: it only ends an increment
 WIDTH = NUMBERS + 12
-NOTHING = (0.0,) * 12
+ANY, OTHERWISE = -1, -2  # in place of an aid: no sample, and one that is not plain
 LIMITS = 10  # where the limits of an aid's two parts are among its numbers
 REPORT = 16  # step, part, nis, statistic, innovation (3,), S (9,)
 
@@ -67,6 +68,17 @@ class Done(NamedTuple):
     last_bad: float
     reports: int
     estimates: int
+
+
+class Plan(NamedTuple):
+    """All steps (N, WIDTH) as `follow` takes them; the rows of their aids in the tables (N,), or `ANY`, `OTHERWISE`;
+    which of them are fixes, and which are samples of each sensor.
+    """
+
+    rows: Array
+    aid: npt.NDArray[np.int64]
+    fixes: list[int]
+    of: dict[str, list[int]]
 
 
 class Taker(Protocol):
@@ -129,15 +141,14 @@ class Batch:
         self._wholes = np.empty((0, 0))  # states on the way to estimates, many times as long as these: used again
 
     def take(
-        self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Sequence[Step], ahead: Increments,
+        self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Steps, ahead: Increments,
         reports: Reported, estimates: Told,
     ) -> tuple[int, float]:  # fmt: skip
-        """Take the first of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
+        """Take the next of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
 
         The last fix that was used was of the time ``last_fix``.
         """
-        known = self._known()
-        plan, silences = self._plan(taker, known, steps, last_fix)
+        plan, silences = self._plan(taker, steps, last_fix)
         if not len(plan):
             return 0, last_bad
         imu, (common, filters, n) = ahead.imu, state.shape
@@ -161,22 +172,22 @@ class Batch:
             for filter_, silence in zip(listening, silences, strict=True):
                 filter_.silence = silence
             listening = []
-        whats, then = plan[:, WHAT].tolist(), iter(when.tolist())
+        first, then = steps.next, iter(when.tolist())
         status: list[Status] = []
-        for (t, _, sample), what in zip(steps[: done.steps], whats, strict=False):
+        for sample, what in zip(steps.samples[first : first + done.steps], plan[:, WHAT].tolist(), strict=False):
             if sample is not None:
                 taker.took(sample)
                 if what >= 0:
                     for filter_ in listening:
                         filter_.stand_in(sample)
-            elif t == t:
+            elif what == ESTIMATE:
                 status.append(taker.status(*next(then)))
         if status:
             drafted = len(status)
             estimates.append(taker.told(wholes[:drafted], when[:drafted, 0], status))
         if not done.parts:
             return done.steps, done.last_bad
-        _, _, sample = steps[done.steps]
+        sample = steps.samples[first + done.steps]
         assert sample is not None
         taker.took(sample)
         reports += taker.finish(sample, done.parts)
@@ -200,49 +211,92 @@ class Batch:
             self._parts, kind, t, rows[:, 4:7], rows[:, 7:], nis, shown_limits(limit, statistic, nis)
         )  # fmt: skip
 
-    def _known(self) -> dict[str, tuple[int, PlainAid]]:
-        """The sensors whose samples may be plain now, with their rows in the tables, which have their limits."""
-        known = {}
-        for sensor, (row, aid, filter_) in self._aids.items():
+    def _known(self) -> npt.NDArray[np.bool_]:
+        """Which steps may be plain now, by `Plan.aid`; the tables get the limits of today."""
+        known = np.zeros(len(self._kinds) + 2, bool)
+        known[ANY] = True
+        for sensor, (row, _, filter_) in self._aids.items():
             limits = filter_.limits(sensor)
             if limits is not None:
                 self._told[row, LIMITS : LIMITS + len(limits)] = limits
-                known[sensor] = row, aid
+                known[row] = True
         return known
 
-    def _plan(
-        self, taker: Taker, known: Mapping[str, tuple[int, PlainAid]], steps: Sequence[Step], last_fix: float
-    ) -> tuple[Array, list[Silence]]:
-        """The first of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard.
+    def _planned(self, steps: Steps) -> Plan:
+        """All ``steps`` as rows for `follow`."""
+        t, horizon = np.array(steps.t), np.array(steps.horizon)
+        rows, aid = np.zeros((len(t), WIDTH)), np.full(len(t), ANY)
+        rows[:, TIME], rows[:, HORIZON], rows[:, WHAT] = t, horizon, np.where(np.isnan(t), ADVANCE, ESTIMATE)
+        of: dict[str, list[int]] = {}
+        for k, sample in enumerate(steps.samples):
+            if sample is not None:
+                of.setdefault(sample.sensor, []).append(k)
+        fixes: list[int] = []
+        for sensor, where in of.items():
+            if sensor not in self._aids:
+                aid[where] = OTHERWISE
+                continue
+            row, plain, _ = self._aids[sensor]
+            samples = [cast(Sample, steps.samples[k]) for k in where]
+            numbers = plain.numbers(samples)
+            rows[where, NUMBERS : NUMBERS + numbers.shape[1]] = numbers
+            rows[where, WHAT] = row
+            aid[where] = np.where(t[where] == horizon[where], row, OTHERWISE)  # too late, or not known when
+            if isinstance(samples[0], GnssSample):
+                fixed = [k for k, one in zip(where, samples, strict=True) if cast(GnssSample, one).has_fix]
+                rows[sorted({*where} - {*fixed}), WHAT] = SPLIT
+                fixes += fixed
+        return Plan(rows, aid, sorted(fixes), of)
+
+    def _plan(self, taker: Taker, steps: Steps, last_fix: float) -> tuple[Array, list[Silence]]:
+        """The next of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard.
 
         Whether samples are sound, `follow` finds out itself.
         """
-        flat: list[float] = []
-        silences = [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
-        heard, pauses_from = silences, taker.pauses_from
-        for t, horizon, sample in steps:
-            if sample is None:
-                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *NOTHING)
-                continue
-            if t != horizon or sample.sensor not in known:  # too late, or not known when
+        if steps.plan is None:
+            steps.plan = self._planned(steps)
+        plan: Plan = steps.plan
+        first, known = steps.next, self._known()[plan.aid[steps.next :]]
+        stop = first + (len(known) if known.all() else int(known.argmin()))
+        rows, pauses_from = plan.rows[first:stop], taker.pauses_from
+        if pauses_from < math.inf:
+            due = (rows[:, WHAT] >= 0) & (rows[:, TIME] >= pauses_from)
+            stop = first + int(due.argmax()) + 1 if due.any() else stop
+        for k in plan.fixes[bisect_left(plan.fixes, first) : bisect_left(plan.fixes, stop)]:
+            fix = cast(GnssSample, steps.samples[k])
+            if not taker.trusted(fix, last_fix):
+                stop = k
                 break
-            row, aid = known[sample.sensor]
-            if isinstance(sample, GnssSample):
-                if not sample.has_fix:
-                    flat += (t, t, SPLIT, *NOTHING)
-                    continue
-                if not taker.trusted(sample, last_fix):
-                    break
-                last_fix = t
-            for silence in silences:  # each hears it
-                if silence.stand_in(sample) is not None:
-                    heard = []  # one sample too many
-            if silences and not heard:
+            last_fix = fix.t
+        stop, silences = self._heard(steps, plan, stop)
+        return plan.rows[first:stop], silences
+
+    def _heard(self, steps: Steps, plan: Plan, stop: int) -> tuple[int, list[Silence]]:
+        """Up to which of the next steps before ``stop`` no silence stands in, and the silences once these were heard.
+
+        None are given where one does.
+        """
+        first, silences = steps.next, self._silences()
+        if not silences or stop == first:
+            return stop, silences
+        until = plan.rows[stop - 1, HORIZON]
+        for silence in silences:
+            own = plan.of.get(silence.sensor, [])
+            times = [steps.t[k] for k in own[bisect_left(own, first) : bisect_left(own, stop)]]
+            if not silence.hears(times, until):
                 break
-            flat += (t, t, row, *aid.numbers(sample))
-            if t >= pauses_from:
-                break
-        return np.frombuffer(array("d", flat)).reshape(-1, WIDTH), heard
+        else:
+            return stop, silences
+        silences = self._silences()
+        for k, sample in enumerate(steps.samples[first:stop], first):
+            if sample is not None and plan.rows[k, WHAT] >= 0:
+                for silence in silences:
+                    if silence.stand_in(sample) is not None:
+                        return k, []  # one sample too many
+        return stop, silences
+
+    def _silences(self) -> list[Silence]:
+        return [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
 
 
 @njit

@@ -27,7 +27,7 @@ from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
 from nav.federation import Config
 from nav.fusion import reset
-from nav.increments import Increments, Step
+from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
 from nav.master import LEAST_SHARE, MasterFilter, noise_shares
 from nav.monitor import Change, Isolation, Monitor, shown_limit
@@ -202,15 +202,15 @@ class Federated:
         """Whether it takes many steps at once."""
         return self._state is not None and self.config.weighting == "none" and not self._reference.scalings
 
-    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
-        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+        """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubts.off.any():
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates
         )
         self.t = ahead.t
-        last = steps[taken - 1][2] if taken else None
+        last = steps.last(taken) if taken else None
         used = last is not None and not (isinstance(last, GnssSample) and not last.has_fix)
         if last is not None and used and last.t >= self.pauses_from:
             self._pause(self._state, last.t)

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Protocol, cast
 
 from nav.columns import Estimates, Reported, Reports, Told
-from nav.increments import COINCIDENT, Increments, Step, joined, share_of
+from nav.increments import COINCIDENT, Increments, Steps, joined, share_of
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
 
@@ -63,8 +63,8 @@ class TakesSteps(Protocol):
         """Whether it does so now: from then on it listens, and accepts the same sensors, for ever."""
         ...
 
-    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
-        """How many of the first ``steps`` it took, zero when the first of them must be taken by itself."""
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+        """How many of the next ``steps`` it took, zero when the next of them must be taken by itself."""
         ...
 
 
@@ -147,7 +147,7 @@ class FusionHorizon:
 
     def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Told) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
-        steps: list[Step] = []
+        steps = Steps()
         lag = self.lag_s if self.estimator.listening else 0.0
         queue, accepts, due = self._queue, self.estimator.accepts, 0
         all_times = [*times, float(self._ahead.imu.t[-1])]
@@ -156,20 +156,20 @@ class FusionHorizon:
             while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
                 turn, _, _, sample = queue[due]
                 if accepts(sample):
-                    steps.append((sample.t, turn, sample))
+                    steps.append(sample.t, turn, sample)
                 due += 1
-            steps.append((t, horizon, None))
+            steps.append(t, horizon)
         del queue[:due]
-        steps[-1] = math.nan, steps[-1][1], None
-        while steps:
+        steps.t[-1] = math.nan
+        while steps.next < len(steps.t):
             taken = estimator.take(steps, self._ahead, reports, estimates)
             if not taken:
-                self._go(steps[0], reports, estimates)
-            del steps[: max(taken, 1)]
+                self._go(steps, reports, estimates)
+            steps.next += max(taken, 1)
 
-    def _go(self, step: Step, reports: Reported, estimates: Told) -> None:
+    def _go(self, steps: Steps, reports: Reported, estimates: Told) -> None:
         """Take one step by itself."""
-        t, horizon, sample = step
+        t, horizon, sample = steps.t[steps.next], steps.horizon[steps.next], steps.samples[steps.next]
         if sample is not None:
             self._apply(horizon, sample, reports)
             return

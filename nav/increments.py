@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +17,31 @@ COINCIDENT = 1e-6  # two times this close are the same [s]
 TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
 ESTIMATE, ADVANCE = -1, -2
 
-# What an estimator is to do next, (t, horizon, sample): go on to the horizon [s] and say what it knows of t [s], later
-# or the same. With a sample it is to use that, which is valid at t; a t of NaN asks for nothing.
-Step: TypeAlias = tuple[float, float, Sample | None]
+
+@dataclass
+class Steps:
+    """What an estimator is to do, step by step, from the ``next`` one on; those before it are done.
+
+    Each time to go on to the ``horizon`` [s] and say what it knows of ``t`` [s], later or the same. With a sample it is
+    to use that, which is valid at ``t``; a ``t`` of NaN asks for nothing. ``plan`` is room for what an estimator makes
+    of all of them at once.
+    """
+
+    t: list[float] = field(default_factory=list)
+    horizon: list[float] = field(default_factory=list)
+    samples: list[Sample | None] = field(default_factory=list)
+    next: int = 0
+    plan: Any = None
+
+    def append(self, t: float, horizon: float, sample: Sample | None = None) -> None:
+        """One more."""
+        self.t.append(t)
+        self.horizon.append(horizon)
+        self.samples.append(sample)
+
+    def last(self, count: int) -> Sample | None:
+        """The sample of the last of the next ``count``."""
+        return self.samples[self.next + count - 1]
 
 
 @dataclass

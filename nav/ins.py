@@ -25,7 +25,7 @@ from nav.columns import Estimates, Reported, Told
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
-from nav.increments import Increments, Step
+from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
 from nav.reference import (
@@ -202,8 +202,8 @@ class Ins:
         """Whether it takes many steps at once."""
         return self._takes_steps and self._state is not None
 
-    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
-        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+        """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self._doubt.any() or self._wind_doubt.pending:
             return 0
         taken, self._last_bad = self._batch.take(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from nav.ahrs.state import BIAS, CORRECTIONS, FIXED, LEVELLINGS, PERIOD_END, PHI
 from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
-from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Step
+from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Steps
 from nav.kalman import update
 from nav.motion import TrueAirspeed, true_over_equivalent
 from nav.rotation import quat_from_euler, quat_multiply, quat_rotate
@@ -138,8 +138,8 @@ class Ahrs:
         """Whether it takes many steps at once: it has an attitude, and levels as usual."""
         return self.aligned and self._usual
 
-    def take(self, steps: Sequence[Step], ahead: Increments, reports: Reported, estimates: Told) -> int:
-        """Take the first of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+        """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         s, imu, plan = self._state, ahead.imu, self._plan(steps)
         if s is None or not len(plan):
             return 0
@@ -158,11 +158,11 @@ class Ahrs:
             estimates.append(self._described(wholes[:drafted], *when[:drafted].T.copy()))
         return taken
 
-    def _plan(self, steps: Sequence[Step]) -> Array:
-        """The first of the ``steps`` that look plain, as rows for `nav.ahrs.steps.follow`."""
+    def _plan(self, steps: Steps) -> Array:
+        """The next of the ``steps`` that look plain, as rows for `nav.ahrs.steps.follow`."""
         flat: list[float] = []
         nothing = 0.0, 0.0, 0.0, 0.0
-        for t, horizon, sample in steps:
+        for t, horizon, sample in islice(zip(steps.t, steps.horizon, steps.samples, strict=True), steps.next, None):
             if sample is None:
                 flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *nothing)
                 continue

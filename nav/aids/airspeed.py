@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,7 +22,6 @@ STANDING = Ruling(Outcome.OUT_OF_RANGE, "standing, and blown upon")
 STANDING_SPEED = 2.0  # over ground: what blows at a vehicle at rest tells of gusts near the ground only [m/s]
 SILENT_S, SILENT_INTERVALS = 1.0, 3.0  # without a sample for longer than both, a pitot tube has fallen silent
 TIME_TOLERANCE = 1e-4  # [s]
-_NONE = (0.0,) * 11
 
 
 @dataclass(frozen=True)
@@ -70,9 +70,9 @@ class AirspeedAid:
         """See `PlainAid`: its two variances, and below what it tells nothing."""
         return Kind.AIRSPEED, (self._R[0][0], self._R[1][0], self.minimum)
 
-    def numbers(self, sample: AirspeedSample) -> tuple[float, ...]:
+    def numbers(self, samples: Sequence[AirspeedSample]) -> Array:
         """See `PlainAid`."""
-        return (sample.eas, *_NONE)
+        return np.array([[one.eas] for one in samples])
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
@@ -105,6 +105,21 @@ class Silence:
     _heard: float = -math.inf  # the latest sample [s]
     _interval: float = math.inf  # between the latest two
     _stood_in: float = -math.inf
+
+    def hears(self, times: Sequence[float], until: float) -> bool:
+        """Hear samples of the sensor at ``times`` [s], and others up to ``until``.
+
+        False, and nothing is heard, where it may have been silent for so long that something would have stood in.
+        """
+        heard, interval = self._heard, self._interval
+        for t in times:
+            if t - heard > max(SILENT_S, SILENT_INTERVALS * interval):
+                return False
+            heard, interval = t, t - heard
+        if until - heard > max(SILENT_S, SILENT_INTERVALS * interval):
+            return False
+        self._heard, self._interval = heard, interval
+        return True
 
     def stand_in(self, sample: Sample) -> AirspeedSample | None:
         """What stands in for the tube, given the newest ``sample`` of any sensor: nothing unless it has fallen silent.

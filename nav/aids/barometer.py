@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -16,7 +17,6 @@ from nav.samples import Array, BarometerSample, Sample
 
 CLOSE_S = 0.25  # between neighbours: 10 m/s^2 bend the line by 0.1 m then [s]
 SCATTER_SAMPLES, OUTLYING = 100, 10.0  # that are averaged; times the mean square that one of them counts at most
-_NONE = (0.0,) * 11
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly report [Pa]
 
 
@@ -58,9 +58,9 @@ class BarometerAid:
         """See `PlainAid`: its variance."""
         return None if self.scatters else (Kind.BAROMETER, (self._R[0],))
 
-    def numbers(self, sample: BarometerSample) -> tuple[float, ...]:
+    def numbers(self, samples: Sequence[BarometerSample]) -> Array:
         """See `PlainAid`."""
-        return (sample.pressure, *_NONE)
+        return np.array([[one.pressure] for one in samples])
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

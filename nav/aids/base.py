@@ -127,8 +127,8 @@ class PlainAid(Protocol):
         """What it is, and up to twelve numbers of its own; None where it needs more than that."""
         ...
 
-    def numbers(self, sample: Any) -> Sequence[float]:
-        """Twelve numbers of a sound sample."""
+    def numbers(self, samples: Any) -> Array:
+        """Up to twelve numbers of each of N samples, sound or not (N, _)."""
         ...
 
 

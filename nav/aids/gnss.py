@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -109,10 +110,11 @@ class GnssAid:
             return None
         return Kind.GNSS, (*self._correlated[0], *self._correlated[1], *self.arm)
 
-    def numbers(self, sample: GnssSample) -> tuple[float, ...]:
+    def numbers(self, samples: Sequence[GnssSample]) -> Array:
         """See `PlainAid`."""
-        sigma_p, sigma_v = sample.sigma_position_n.tolist(), sample.sigma_velocity_n.tolist()
-        return (sample.lat, sample.lon, sample.h, *sample.v_n.tolist(), *sigma_p, *sigma_v)
+        places = [(one.lat, one.lon, one.h) for one in samples]
+        vectors = [(one.v_n, one.sigma_position_n, one.sigma_velocity_n) for one in samples]
+        return np.hstack([np.array(places), np.array(vectors).reshape(-1, 9)])
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

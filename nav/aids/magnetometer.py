@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,6 @@ from nav.error_model import PHI, Block, markov
 from nav.rotation import dcm_from_quat
 from nav.samples import Array, MagnetometerSample, Sample
 
-_NONE = (0.0,) * 9
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
 FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Earth's is 22 to 67 uT [T]
 
@@ -67,9 +67,9 @@ class MagnetometerAid:
         """See `PlainAid`: its variances."""
         return None if self.doubt else (Kind.MAGNETOMETER, tuple(self._R.tolist()))
 
-    def numbers(self, sample: MagnetometerSample) -> tuple[float, ...]:
+    def numbers(self, samples: Sequence[MagnetometerSample]) -> Array:
         """See `PlainAid`."""
-        return (*sample.field_b.tolist(), *_NONE)
+        return np.array([one.field_b for one in samples])
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
