@@ -113,7 +113,8 @@ class FusionHorizon:
         estimator = self.estimator
         if getattr(estimator, "in_steps", False) and self._ahead.next:
             self._take(cast(TakesSteps, estimator), times, reports, estimates)
-            return Reports.joined([Reports(reports)]), Estimates.of(estimates)
+            told = Reports(reports)
+            return Reports.joined([told]) if len(reports) > 1 else told, Estimates.of(estimates)
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))

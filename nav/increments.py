@@ -13,6 +13,7 @@ from nav._jit import inlined, njit
 from nav.samples import Array, ImuSamples, Sample
 
 COINCIDENT = 1e-6  # two times this close are the same [s]
+FEW = 8  # times are found sooner one by one than by calls of numpy
 # A `Step` among the rows of numbers that a kernel is handed: its times, and what it is where that is no sample.
 TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
 ESTIMATE, ADVANCE = -1, -2
@@ -74,6 +75,8 @@ class Increments:
 
     def ends_by(self, times: Sequence[float]) -> list[float]:
         """The end of the last row by each of the ``times`` [s], one at least having been used."""
+        if len(times) < FEW:
+            return [float(self.imu.t[self.row_after(t) - 1]) for t in times]
         rows = np.searchsorted(self.imu.t[self.next :], np.array(times) + COINCIDENT, side="right")
         ends: list[float] = self.imu.t[self.next - 1 + rows].tolist()
         return ends
