@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from nav._jit import inlined, njit
 from nav.aids import MagnetometerAid
-from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, airspeed, is_slow, sideslip
+from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, airspeed, is_slow, sideslip, widened
 from nav.aids.barometer import PRESSURE_LIMITS, barometer
 from nav.aids.base import Kind, PlainAid, well_within
 from nav.aids.gnss import gnss_position, gnss_velocity, is_whole, white
@@ -445,7 +445,7 @@ def _measure(
         plain = not is_slow(numbers[0], v_n, told[2])
         if part == 0:
             nu, H = airspeed(q_nb, v_n, lla, x, kind[2], kind[3], kind[4], numbers[0])
-            return plain, nu, H, told[:1]
+            return plain, nu, H, told[:1] * widened(numbers[0])
         nu, H = sideslip(q_nb, v_n, x, kind[2], kind[3])
         return plain, nu, H, told[1:2]
     arm = told[6:9]

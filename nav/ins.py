@@ -22,11 +22,12 @@ from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
 from nav.columns import Estimates, Reported, Told
-from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
+from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict, whiten
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
+from nav.monitor import shown_limit
 from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -411,11 +412,14 @@ class Ins:
             if with_velocity
             else (state.v_n.copy(), np.sqrt(np.diag(state.P[0])[VEL : VEL + 3]))
         )
-        threshold = self._gate.threshold(3)
+        threshold, judged = self._gate.threshold(3), self._filter.as_judged("gnss_position", sample, S)
+        statistic = nis if judged is S else whiten(nu, judged)[1]
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
-        odds = self._filter.odds(self._winds, state, v_n, sample.t) if nis > threshold else 0.0
+        odds = self._filter.odds(self._winds, state, v_n, sample.t) if statistic > threshold else 0.0
         fix = sample if sigma_p is sample.sigma_position_n else replace(sample, sigma_position_n=sigma_p)
-        verdict = self._monitor.judge(fix, v_n, sigma_v, nis <= threshold, odds)
+        verdict = self._monitor.judge(fix, v_n, sigma_v, statistic <= threshold, odds)
+        if verdict is not Verdict.PROBATION:
+            self._filter.heard(self._reference, state, "gnss_position", sample, nis, 3)
         self._doubt[:] = 0.0
         if self._monitor.contradicted:
             self._doubt[POS : POS + 3], self._doubt[VEL : VEL + 3] = nu, v_n - state.v_n
@@ -431,7 +435,7 @@ class Ins:
             assert wide is not None
             S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
         withheld = None if ruling.weight else without_position(ruling)
-        position = report_on(sample, "gnss_position", nu, S, nis, threshold, ruling)
+        position = report_on(sample, "gnss_position", nu, S, nis, shown_limit(threshold, statistic, nis), ruling)
         return [position, *self._update_gnss_further(state, sample, aid, withheld)]
 
     def _update_gnss_further(
@@ -457,6 +461,7 @@ class Ins:
         When velocity is off as well, it goes too, and with it wind and gusts that were estimated from it.
         """
         P = state.P[0]
+        self._filter.claim_as_told(self._reference)
         if use_velocity:
             velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None

@@ -28,6 +28,7 @@ from nav.aids.base import (
     report_on,
 )
 from nav.aids.gnss import Contradiction, GnssAid
+from nav.claims import Claim, FollowingAid
 from nav.detection import ChiSquareGate, Mask, WindMemory
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate, scratch
@@ -46,7 +47,8 @@ class LocalFilter:
     """One filter's aids and what becomes of their samples; the numbers are rows ``row`` of a `State`.
 
     ``closed`` filters put each correction into the nominal state at once. With a ``scaling`` they work by sigma points
-    around the filter's own estimate. Parts without a `Monitor` pass the ``gate``.
+    around the filter's own estimate. Parts without a `Monitor` pass the ``gate``. Claims follow innovations
+    (`nav.claims`) in closed filters only: monitors judge by what is told.
     """
 
     def __init__(
@@ -68,6 +70,12 @@ class LocalFilter:
         self.noises: dict[str, SageHusa] = {}  # of parts without a monitor, as the two below
         self.policies: dict[str, Policy] = {}
         self.fadings: Mapping[str, Fading] = {}
+        self.claims = {
+            (aid.sensor, part): Claim(following)
+            for aid in aids
+            if closed and isinstance(aid, FollowingAid)
+            for part, following in aid.following.items()
+        }
         self.smoother: Smoother | None = None  # told of each update of a closed filter, if there is one
         self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
         self.starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
@@ -88,11 +96,12 @@ class LocalFilter:
         self.of_sensor[sensor] = [self.monitors[sensor, part] for part, _ in monitored.aid.parts]
 
     def weigh_by(self, policies: Mapping[str, Policy]) -> None:
-        """Weigh the parts of samples that have no monitor, by their names."""
+        """Weigh the parts of samples that have no monitor, by their names; what learns R replaces a claim on it."""
         for part, policy in policies.items():
             noise, rest = split(policy)
             if noise is not None:
                 self.noises[part] = noise
+                self.claims = {key: claim for key, claim in self.claims.items() if key[1] != part}
             if rest is not None:
                 self.policies[part] = rest
 
@@ -159,6 +168,8 @@ class LocalFilter:
             return None
         limits = []
         for part, m in self.aids[sensor].parts:
+            if (sensor, part) in self.claims:
+                return None
             monitor = self.monitors.get((sensor, part))
             if monitor is None:
                 special = part in self.policies or part in self.fadings or part in self.noises
@@ -174,6 +185,28 @@ class LocalFilter:
         """What learns the variances of one part of a sensor's samples."""
         monitor = self.monitors.get((sensor, part))
         return self.noises.get(part) if monitor is None else monitor.noise
+
+    def heard(self, reference: Reference, state: State, part: str, sample: Sample, nis: float, m: int) -> None:
+        """One part of a sample, of ``m`` axes, was held against the estimate: what is claimed of it may follow."""
+        claim = self.claims.get((sample.sensor, part))
+        if claim is None:
+            return
+        before = claim.scale
+        claim.heard(nis / m, sample.t)
+        self._drive(reference, claim)
+        if claim.following.state and claim.scale > before:  # the error is stationary: what it may be now grows as well
+            k = self.model.start(claim.following.state)
+            state.P[self.row][k, k] *= claim.scale / before
+
+    def claim_as_told(self, reference: Reference) -> None:
+        """The filter begins anew, and so do its claims."""
+        for claim in self.claims.values():
+            claim.scale = 1.0
+            self._drive(reference, claim)
+
+    def _drive(self, reference: Reference, claim: Claim) -> None:
+        if claim.following.state:
+            reference.scale_noise(self.row, self.model.slices[claim.following.state], claim.scale)
 
     def learned_sigma(self, part: str, sigma: Array) -> Array:
         """A sensor's 1-sigma (m,) of one part of its samples: the ``sigma`` it reports, or what was learned."""
@@ -218,6 +251,9 @@ class LocalFilter:
         if measurement is not None and isinstance(sample, BarometerSample) and aid.sensor in self._scatters:
             scatter = self._scatters[aid.sensor].heard(sample)
             measurement = measurement._replace(R=np.maximum(measurement.R, scatter))
+        claim = self.claims.get((aid.sensor, part))
+        if measurement is not None and claim is not None and not claim.following.state:
+            measurement = measurement._replace(R=claim.scale * measurement.R)
         if measurement is None or noise is None:
             return measurement
         return measurement._replace(R=noise.learned(measurement.R), reported=measurement.R)
@@ -229,7 +265,7 @@ class LocalFilter:
         return x
 
     def as_judged(self, part: str, sample: Sample, S: Array) -> Array:
-        """S (m, m) as a detector is given it: of positions wider by what the receiver's velocities contradict them."""
+        """S (m, m) as a detector or a gate is given it: of positions wider by what velocities contradict them."""
         if part != "gnss_position" or sample.sensor not in self._contradictions:
             return S
         assert isinstance(sample, GnssSample)
@@ -307,6 +343,8 @@ class LocalFilter:
         simple = part not in self.policies and part not in self.fadings and part not in self.noises
         limit = threshold if simple and not withheld else -math.inf
         S, nis = self.absorb(reference, state, nu, H, R, limit, at_points)
+        if not withheld:
+            self.heard(reference, state, part, sample, nis, len(nu))
         ruling = withheld or (FUSED if nis <= threshold else OUTSIDE)
         if not simple and ruling is FUSED:
             ruling = self.weigh(reference, state, sample, part, measurement, S)

@@ -95,6 +95,10 @@ class Reference:
         self._variance_rate[:, : self.common] = self._noise[:, : self.common] / each
         self._in_motion[:] = np.array([model.imu.in_motion for model in self.models]) / each
 
+    def scale_noise(self, row: int, where: slice, scale: float) -> None:
+        """From now on, ``scale`` times the told driving noise of some of a filter's own states (not common ones)."""
+        self._variance_rate[row, where] = scale * self._noise[row, where]
+
     @property
     def moving(self) -> tuple[Indices, Array, Array, Array, Array, Array, int]:
         """What `nav.state.propagate` is told beside a state, up to the period."""

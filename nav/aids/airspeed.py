@@ -19,6 +19,7 @@ from nav.samples import AirspeedSample, Array, Outcome, Sample
 AIRSPEED_LIMITS = (-10.0, 300.0)  # what an instrument could possibly report [m/s]
 TOO_SLOW = Ruling(Outcome.OUT_OF_RANGE, "too slow for the pitot tube")
 STANDING = Ruling(Outcome.OUT_OF_RANGE, "standing, and blown upon")
+SLOW = 10.0  # equivalent, below which pressures are so small that their errors count as speeds [m/s]
 STANDING_SPEED = 2.0  # over ground: what blows at a vehicle at rest tells of gusts near the ground only [m/s]
 SILENT_S, SILENT_INTERVALS = 1.0, 3.0  # without a sample for longer than both, a pitot tube has fallen silent
 TIME_TOLERANCE = 1e-4  # [s]
@@ -28,6 +29,9 @@ TIME_TOLERANCE = 1e-4  # [s]
 class AirspeedAid:
     """Airspeed along body x, and the constraint of no sideslip (None leaves it out); a filter has one wind.
 
+    ``sigma`` is that of `SLOW` and faster. Of one that tells something below, it grows there as 1/EAS, as errors of
+    pressure do.
+
     A sample of no airspeed, NaN, stands for a tube that has fallen silent (`Silence`): of that the constraint is left,
     as long as the filter's own velocity through the air is that of flight.
     """
@@ -35,7 +39,7 @@ class AirspeedAid:
     sensor: str = "airspeed"
     sigma: float = 0.5  # [m/s]
     scale_sigma: float = 0.0  # [1]
-    minimum: float = 10.0  # equivalent; below it neither airspeed nor sideslip is used [m/s]
+    minimum: float = SLOW  # equivalent; below it neither airspeed nor sideslip is used [m/s]
     sideslip_sigma: float | None = 1.0  # [m/s]
     wind_sigma: float = 8.0  # per horizontal axis, before anything is known [m/s]
     wind_walk: float = 0.03  # [m/s/sqrt(s)]
@@ -88,7 +92,7 @@ class AirspeedAid:
             slow = STANDING if eas >= self.minimum else TOO_SLOW
         if part == "airspeed":
             nu, H = airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, sample.eas)
-            return Measurement(nu, H, self._R[0], slow)
+            return Measurement(nu, H, self._R[0] * widened(eas), slow)
         nu, H = sideslip(state.q_nb, state.v_n, at.x, wind, gust)
         return Measurement(nu, H, self._R[1], slow)
 
@@ -142,6 +146,12 @@ class Silence:
 def problem(sample: AirspeedSample) -> str:
     """See `nav.aids.problem`."""
     return range_problem("airspeed", sample.eas, AIRSPEED_LIMITS)
+
+
+@njit
+def widened(eas: float) -> float:
+    """How much larger the variance of an airspeed ``eas`` [m/s] is for being slow; one at `SLOW` and faster."""
+    return (SLOW / eas) ** 2 if 0.0 < eas < SLOW else 1.0
 
 
 @njit

@@ -11,6 +11,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
+from nav.claims import Following
 from nav.earth import pressure_altitude
 from nav.error_model import POS, Block, markov
 from nav.samples import Array, BarometerSample, Sample
@@ -23,7 +24,7 @@ PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly repo
 @dataclass(frozen=True)
 class BarometerAid:
     """Pressure altitude with a walking bias, weather and geoid before the first GNSS height tells, and the airframe's
-    wake, a first-order Markov error.
+    wake, a first-order Markov error. With ``follow_s`` that is claimed to be less as long as it is (`nav.claims`).
     """
 
     sensor: str = "barometer"
@@ -33,8 +34,15 @@ class BarometerAid:
     error_sigma: float = 0.0  # of the wake [m]
     error_correlation_s: float = 10.0
     scatters: bool = False  # its samples may scatter by more than sigma: see `Scatter`
+    follow_s: float = 0.0  # over which what is claimed of the wake follows innovations, 0: it does not [s]
 
     parts = (("barometer", 1),)
+
+    @property
+    def following(self) -> dict[str, Following]:
+        """See `nav.claims.FollowingAid`."""
+        follows = self.follow_s and self.error_sigma
+        return {"barometer": Following(self.follow_s, 1 / 4, state=self.states[1])} if follows else {}
 
     @property
     def states(self) -> tuple[str, ...]:

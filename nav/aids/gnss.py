@@ -23,6 +23,7 @@ from nav.aids.base import (
     put_skew,
     well_within,
 )
+from nav.claims import WIDEST, Following
 from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross, dcm_from_quat, quat_rotate
@@ -58,7 +59,8 @@ class GnssAid:
     valid, two states say by how much earlier the position was, and by how much more the velocity lags. The receiver's
     own filters make both change with each manoeuvre by as much: velocity times that is noise of the position beside its
     sigma, and acceleration times that of the velocity. Positions of a sound receiver that jump against its velocities
-    by no more than ``largest_jump`` are no fault: see `Contradiction`.
+    by no more than ``largest_jump`` are no fault: see `Contradiction`. All this is what manoeuvres may do: with
+    ``follow_s`` positions are claimed to be better as long as they are, and velocities to be worse (`nav.claims`).
     """
 
     sensor: str = "gnss"
@@ -72,6 +74,15 @@ class GnssAid:
     latency_sigma: float = 0.0  # how well it is known when a sample was valid [s]
     velocity_lag: float = 0.0  # by which its velocity is older than its position [s]
     largest_jump: float = 0.0  # [m]
+    follow_s: float = 0.0  # over which what is claimed follows innovations, 0: it does not [s]
+
+    @property
+    def following(self) -> dict[str, Following]:
+        """See `nav.claims.FollowingAid`."""
+        if not self.follow_s:
+            return {}
+        velocity = Following(self.follow_s, 1.0, WIDEST)
+        return {"gnss_position": Following(self.follow_s), "gnss_velocity": velocity}
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:

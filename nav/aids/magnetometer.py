@@ -11,11 +11,13 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
+from nav.claims import Following
 from nav.error_model import PHI, Block, markov
 from nav.rotation import dcm_from_quat
 from nav.samples import Array, MagnetometerSample, Sample
 
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
+LEAST = 1 / 4  # of the variance that is told: currents come and go within minutes
 FIELD_LIMITS = (5e-6, 200e-6)  # magnitude that a sound sample may have; the Earth's is 22 to 67 uT [T]
 
 
@@ -24,7 +26,8 @@ class MagnetometerAid:
     """Three axes; without a reference field it is not used.
 
     A current beside it bends the field and makes it longer or shorter: by as much of that as the ``doubt`` says each
-    axis is doubted, whatever the attitude.
+    axis is doubted, whatever the attitude. With ``follow_s`` noise and doubt are claimed to be less as long as they are
+    (`nav.claims`).
     """
 
     sensor: str = "magnetometer"
@@ -35,8 +38,14 @@ class MagnetometerAid:
     error_correlation_s: float = 30.0
     soft_iron_sigma: float = 0.0  # of each element of the matrix that soft iron left after calibration is [1]
     doubt: float = 0.0  # of what the field's length is off by, the share that each axis may be, beside the noise
+    follow_s: float = 0.0  # over which what is claimed of both follows innovations, 0: it does not [s]
 
     parts = (("magnetometer", 3),)
+
+    @property
+    def following(self) -> dict[str, Following]:
+        """See `nav.claims.FollowingAid`."""
+        return {"magnetometer": Following(self.follow_s, LEAST)} if self.follow_s else {}
 
     @property
     def states(self) -> tuple[str, ...]:

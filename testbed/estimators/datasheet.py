@@ -142,6 +142,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
                 latency_sigma=e.latency_sigma,
                 velocity_lag=e.velocity_lag,
                 largest_jump=e.largest_jump,
+                follow_s=section.follow_s,
             )
         case BarometerConfig():
             return _barometer(name, section)
@@ -154,6 +155,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
                 name,
                 sigma=math.hypot(math.hypot(a.noise, a.unsteady), SHORT_GUSTS * gust),
                 scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
+                minimum=section.slowest_mps,
                 sideslip_sigma=None if section.slips else math.hypot(SIDESLIP, SHORT_GUSTS * gust),
                 wind_walk=max(air.wind_walk, section.wind_walk_mps_per_sqrt_s),
                 gust_sigma=gust,
@@ -186,6 +188,7 @@ def _barometer(name: str, section: BarometerConfig) -> Aid:
         error_sigma=b.unsteady * METRES_PER_PASCAL,
         error_correlation_s=b.unsteady_tau,
         scatters=b.unsteady > 0,
+        follow_s=section.follow_s,
     )
 
 
@@ -196,7 +199,10 @@ def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
     if not m.doubt:
         return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
     iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
-    return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt)
+    return MagnetometerAid(
+        name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt,
+        follow_s=section.follow_s,
+    )  # fmt: skip
 
 
 def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, usual: Usual) -> Aid:

@@ -43,6 +43,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "gust_mps": 1.5,
         "gust_time_s": 3.0,
         "slips": True,
+        "slowest_mps": 5.0,
         "fused_hz": 10.0,
     },
 }
@@ -94,6 +95,10 @@ class AirspeedConfig(AidingTiming):
         None, gt=0, le=1e3, description="told to filters: how long a gust lasts; none: as long as the aircraft is in it"
     )
     slips: bool = Field(False, description="told to filters: it slips, so that no sideslip is no constraint")
+
+    slowest_mps: float = Field(
+        10.0, gt=0, le=10, description="told to filters: equivalent airspeed below which it says nothing"
+    )
 
     @model_validator(mode="before")
     @classmethod

@@ -33,6 +33,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "noise_pa": 3.0,
         "unsteady_pa": 40.0,
         "unsteady_time_s": 8.0,
+        "follow_s": 5.0,
         "dynamic_percent": 15.0,
         "sideslip_percent": 10.0,
         "fused_hz": 10.0,
@@ -86,6 +87,9 @@ class BarometerConfig(AidingTiming):
     noise_pa: float = Field(0.0, ge=0, le=1e5, description="white noise of the pressure")
     unsteady_pa: float = Field(0.0, ge=0, le=1e5, description="Gauss-Markov error of the airframe's wake")
     unsteady_time_s: float = Field(8.0, gt=0, le=1e4, description="correlation time of that")
+    follow_s: float = Field(
+        0.0, ge=0, le=3600, description="told to an INS: over which that error follows innovations; 0: it does not"
+    )
     dynamic_percent: float = Field(
         0.0, ge=0, le=100, description="of dynamic pressure that gets into the static one, constant in a run"
     )

@@ -113,6 +113,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "vertical_velocity_white_mps": 0.3,
         "vertical_velocity_correlated_mps": 0.1,
         "latency_sigma_s": 0.1,
+        "follow_s": 5.0,
         "velocity_correlation_time_s": 10.0,
         "latency_s": 0.2,
         "jitter_s": 0.01,
@@ -205,6 +206,12 @@ class GnssConfig(AidingTiming):
         ge=-10,
         le=10,
         description="by which velocity is older than the position beside it; at least 0 if simulated",
+    )
+    follow_s: float = Field(
+        0.0,
+        ge=0,
+        le=3600,
+        description="told to an INS: over which noise of positions and velocities follows innovations; 0: not",
     )
     jumps_per_h: float = Field(0.0, ge=0, le=3600, description="how often the position jumps away")
     jump_m: float = Field(5.0, ge=0, le=1e5, description="size of jumps, north and east each; 1.5 times that down")

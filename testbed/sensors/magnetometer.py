@@ -45,6 +45,7 @@ GRADES: dict[str, dict[str, Any]] = {
         "soft_iron_percent": 5.0,
         "current_ut_per_a": 0.1,
         "doubt_percent": 100.0,
+        "follow_s": 60.0,
         "fused_hz": 10.0,
         "range_ut": 400.0,
     },
@@ -185,6 +186,9 @@ class MagnetometerConfig(AidingTiming):
     )
     doubt_percent: float = Field(
         0.0, ge=0, le=1000, description="told to filters: doubt of each axis, of what the field's length is off by"
+    )
+    follow_s: float = Field(
+        0.0, ge=0, le=3600, description="told to an INS: over which its noise and doubt follow innovations; 0: not"
     )
     range_ut: float | None = Field(None, gt=0, le=1e6, description="largest field per axis; none: no limit")
 

@@ -169,14 +169,14 @@ def forecast(smoothed: Smoothed, where: slice, starts: Sequence[float], marks: S
     return {name: np.median(rows, axis=0) for name, rows in drifts.items()}
 
 
-def aided(reports: Sequence[UpdateReport], after: float) -> str:
+def aided(reports: Sequence[UpdateReport], after: float) -> dict[str, tuple[float, float]]:
     """NIS per degree of freedom of each aid, and the share that was refused."""
-    said = []
+    said = {}
     for aid in dict.fromkeys(one.aid for one in reports):
         own = [one for one in reports if one.aid == aid and one.t > after]
         nis = np.mean([one.nis / len(one.innovation) for one in own])
-        said.append(f"{aid} {nis:.2f} ({np.mean([one.outcome is not Outcome.FUSED for one in own]):.1%})")
-    return ", ".join(said)
+        said[aid] = float(nis), float(np.mean([one.outcome is not Outcome.FUSED for one in own]))
+    return said
 
 
 @pytest.mark.slow
@@ -196,9 +196,13 @@ def test_outages_of_recorded_flights(name: str, tmp_path: Path, monkeypatch: pyt
     print(f"{name}: {marks} s: error {np.median(error, axis=0).round(1)} m (median), NEES per axis "
           f"{nees.mean(axis=0).round(2)} (mean), claims {np.median(claimed, axis=0).round(1)} m")  # fmt: skip
     flight.fly(ends - 2, False, [])
-    print(f"{name}: NIS per degree of freedom with GNSS (refused): {aided(flight.reports, begins)}")
+    with_gnss = aided(flight.reports, begins)
+    said = ", ".join(f"{aid} {nis:.2f} ({refused:.1%})" for aid, (nis, refused) in with_gnss.items())
+    print(f"{name}: NIS per degree of freedom with GNSS (refused): {said}")
     assert (np.median(error, axis=0) < MOST[name]).all()
     assert (nees.mean(axis=0) < 3.5).all()
+    if name != "quad":  # whose claims are at their limits
+        assert all(0.5 < nis < 2.0 and refused < 0.03 for nis, refused in with_gnss.values())
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from worlds.ins import CONSUMER, FIELD_N, flight, gnss, imu, magnetometer
 
 from nav.aids import AirspeedAid, GnssAid, MagnetometerAid
+from nav.aids.airspeed import SLOW
 from nav.aids.base import OperatingPoint
 from nav.alignment import InitialState
 from nav.earth import gravity
@@ -88,6 +89,18 @@ def test_a_pitot_that_is_blown_upon_at_rest_tells_nothing_of_the_wind():
     assert at_rest.withheld.outcome is Outcome.OUT_OF_RANGE
     flown = AirspeedAid().measure("airspeed", sample, circling(AirspeedAid()))
     assert flown.withheld is None
+
+
+def test_errors_of_pressure_count_for_more_when_it_is_slow():
+    aid = AirspeedAid(minimum=5.0)
+    fast, slow, none = (
+        aid.measure("airspeed", AirspeedSample(0.7, 0.7, eas), circling(aid)) for eas in (SLOW, 6.0, 4.0)
+    )
+    assert fast.withheld is slow.withheld is None
+    assert none.withheld.outcome is Outcome.OUT_OF_RANGE
+    np.testing.assert_allclose(slow.R, fast.R * (SLOW / 6.0) ** 2)
+    usual = AirspeedAid().measure("airspeed", AirspeedSample(0.7, 0.7, 6.0), circling(aid))
+    assert usual.withheld.outcome is Outcome.OUT_OF_RANGE
 
 
 def aligned(seconds, hard_iron, **aids):
