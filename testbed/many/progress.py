@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 PLAIN_LINES = 10  # for the whole
 PLAIN_EVERY_S = 5.0  # wall time
-PACE_S = 2.0  # wall time before it is said how long the rest will take
+PACE_S, PACE_DONE = 2.0, 0.005  # wall time, and share of the whole, before it is said how long the rest will take
 
 Tell: TypeAlias = Callable[[float, str], None]
 
@@ -50,7 +50,7 @@ class _Pace:
         if self._began is None:
             self._began = now, fraction
         elapsed, done = now - self._began[0], fraction - self._began[1]
-        if elapsed < PACE_S or done <= 0.0 or fraction >= 1.0:
+        if elapsed < PACE_S or done < PACE_DONE or fraction >= 1.0:
             return text
         return f"{text}  {_about(elapsed / done * (1.0 - fraction))} to go"
 
