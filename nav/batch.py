@@ -237,15 +237,17 @@ class Batch:
                 aid[where] = OTHERWISE
                 continue
             row, plain, _ = self._aids[sensor]
-            samples = [cast(Sample, steps.samples[k]) for k in where]
-            numbers = plain.numbers(samples)
-            rows[where, NUMBERS : NUMBERS + numbers.shape[1]] = numbers
-            rows[where, WHAT] = row
-            aid[where] = np.where(t[where] == horizon[where], row, OTHERWISE)  # too late, or not known when
-            if isinstance(samples[0], GnssSample):
-                fixed = [k for k, one in zip(where, samples, strict=True) if cast(GnssSample, one).has_fix]
-                rows[sorted({*where} - {*fixed}), WHAT] = SPLIT
-                fixes += fixed
+            on_time = [k for k in where if steps.t[k] == steps.horizon[k]]  # not too late, nor not known when
+            aid[where], aid[on_time] = OTHERWISE, row
+            rows[where, WHAT] = SPLIT
+            telling = [k for k in on_time if _tells(steps.samples[k])]
+            if not telling:
+                continue
+            numbers = plain.numbers([steps.samples[k] for k in telling])
+            rows[telling, NUMBERS : NUMBERS + numbers.shape[1]] = numbers
+            rows[telling, WHAT] = row
+            if isinstance(steps.samples[telling[0]], GnssSample):
+                fixes += telling
         return Plan(rows, aid, sorted(fixes), of)
 
     def _plan(self, taker: Taker, steps: Steps, last_fix: float) -> tuple[Array, list[Silence]]:
@@ -279,7 +281,7 @@ class Batch:
         first, silences = steps.next, self._silences()
         if not silences or stop == first:
             return stop, silences
-        until = plan.rows[stop - 1, HORIZON]
+        until = plan.rows[first:stop, HORIZON].max()
         for silence in silences:
             own = plan.of.get(silence.sensor, [])
             times = [steps.t[k] for k in own[bisect_left(own, first) : bisect_left(own, stop)]]
@@ -297,6 +299,11 @@ class Batch:
 
     def _silences(self) -> list[Silence]:
         return [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
+
+
+def _tells(sample: Sample | None) -> bool:
+    """Whether there is anything in a sample to be used: there is not in one without a fix."""
+    return not isinstance(sample, GnssSample) or sample.has_fix
 
 
 @njit

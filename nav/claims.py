@@ -25,7 +25,7 @@ LONGEST_S, PAUSE_S = 1.0, 10.0  # between two samples: that count at most, and a
 
 
 class Following(NamedTuple):
-    """How a claim follows: its time constant and limits, and the Markov error that it is on, by the name of its state.
+    """How a claim follows: its time constant and limits; the Markov error that it is on, by its state, and as told.
 
     Of that it is the driving noise that is scaled; without one, the variances of the measurement.
     """
@@ -34,6 +34,7 @@ class Following(NamedTuple):
     least: float = NARROWEST
     most: float = 1.0
     state: str = ""
+    sigma: float = 0.0
 
 
 @runtime_checkable
@@ -54,14 +55,20 @@ class Claim:
     scale: float = 1.0
     _heard: float = math.nan  # when the latest sample was [s]
 
+    def at(self, t: float) -> float:
+        """The scale that counts for a sample at ``t`` [s]."""
+        return 1.0 if t - self._heard > PAUSE_S else self.scale
+
+    def begin(self) -> None:
+        """Forget everything."""
+        self.scale, self._heard = 1.0, math.nan
+
     def heard(self, ratio: float, t: float) -> None:
         """A sample at ``t`` [s] had nu' S^-1 nu / m = ``ratio``; one that it was told of before changes nothing."""
         since = t - self._heard if math.isfinite(self._heard) else 0.0
         if since < 0.0 or not math.isfinite(ratio):
             return
-        self._heard = t
-        if since > PAUSE_S:
-            self.scale = 1.0
-        _, least, most, _ = self.following
+        before, self._heard = self.at(t), t
+        _, least, most, *_ = self.following
         step = min(since, LONGEST_S) / self.following.time_s * (min(ratio, OUTLYING) - 1.0)
-        self.scale = min(max(self.scale * math.exp(step), least), most)
+        self.scale = min(max(before * math.exp(min(step, math.log(most / least))), least), most)

@@ -14,7 +14,7 @@ from nav.samples import Array, ImuSamples, Sample
 
 COINCIDENT = 1e-6  # two times this close are the same [s]
 FEW = 8  # times are found sooner one by one than by calls of numpy
-# A `Step` among the rows of numbers that a kernel is handed: its times, and what it is where that is no sample.
+# One of `Steps` among the rows of numbers that a kernel is handed: its times, and what it is where that is no sample.
 TIME, HORIZON, WHAT, NUMBERS = 0, 1, 2, 3
 ESTIMATE, ADVANCE = -1, -2
 

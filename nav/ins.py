@@ -27,7 +27,6 @@ from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
-from nav.monitor import shown_limit
 from nav.motion import TurnDetector
 from nav.reference import (
     BAD_SAMPLE_S,
@@ -176,6 +175,7 @@ class Ins:
         self._draft = self._state.copy()
         self.t = initial.t
         self._monitor.last_fused = initial.t
+        self._filter.claim_as_told(self._reference, self._state)
         if self._smoother is not None:
             self._smoother.pause(self.t, self._state)
 
@@ -413,7 +413,10 @@ class Ins:
             else (state.v_n.copy(), np.sqrt(np.diag(state.P[0])[VEL : VEL + 3]))
         )
         threshold, judged = self._gate.threshold(3), self._filter.as_judged("gnss_position", sample, S)
-        statistic = nis if judged is S else whiten(nu, judged)[1]
+        statistic, shown = nis, threshold
+        if judged is not S:
+            statistic = whiten(nu, judged)[1]
+            shown = threshold * nis / statistic if statistic > 0.0 else threshold  # on what is reported
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
         odds = self._filter.odds(self._winds, state, v_n, sample.t) if statistic > threshold else 0.0
         fix = sample if sigma_p is sample.sigma_position_n else replace(sample, sigma_position_n=sigma_p)
@@ -433,9 +436,10 @@ class Ins:
         elif verdict is Verdict.RECOVER:
             wide = self._filter.measure(self._reference, state, aid, "gnss_position", sample)
             assert wide is not None
-            S, nis = self._filter.absorb(self._reference, state, nu, H, R, math.inf, wide.at_points)
+            S, nis = self._filter.absorb(self._reference, state, nu, H, wide.R, math.inf, wide.at_points)
+            shown = threshold
         withheld = None if ruling.weight else without_position(ruling)
-        position = report_on(sample, "gnss_position", nu, S, nis, shown_limit(threshold, statistic, nis), ruling)
+        position = report_on(sample, "gnss_position", nu, S, nis, shown, ruling)
         return [position, *self._update_gnss_further(state, sample, aid, withheld)]
 
     def _update_gnss_further(
@@ -461,7 +465,7 @@ class Ins:
         When velocity is off as well, it goes too, and with it wind and gusts that were estimated from it.
         """
         P = state.P[0]
-        self._filter.claim_as_told(self._reference)
+        self._filter.claim_as_told(self._reference, state)
         if use_velocity:
             velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
             assert velocity is not None

@@ -193,20 +193,23 @@ class LocalFilter:
             return
         before = claim.scale
         claim.heard(nis / m, sample.t)
-        self._drive(reference, claim)
-        if claim.following.state and claim.scale > before:  # the error is stationary: what it may be now grows as well
-            k = self.model.start(claim.following.state)
-            state.P[self.row][k, k] *= claim.scale / before
+        self._rescale(reference, state, claim, before)
 
-    def claim_as_told(self, reference: Reference) -> None:
+    def claim_as_told(self, reference: Reference, state: State) -> None:
         """The filter begins anew, and so do its claims."""
         for claim in self.claims.values():
-            claim.scale = 1.0
-            self._drive(reference, claim)
+            before = claim.scale
+            claim.begin()
+            self._rescale(reference, state, claim, before)
 
-    def _drive(self, reference: Reference, claim: Claim) -> None:
-        if claim.following.state:
-            reference.scale_noise(self.row, self.model.slices[claim.following.state], claim.scale)
+    def _rescale(self, reference: Reference, state: State, claim: Claim, before: float) -> None:
+        """Let an error be driven as is claimed now; it is stationary: what it may be grows at once, to what is told."""
+        if not claim.following.state:
+            return
+        reference.scale_noise(self.row, self.model.slices[claim.following.state], claim.scale)
+        k, P = self.model.start(claim.following.state), state.P[self.row]
+        if claim.scale > before:
+            P[k, k] = max(P[k, k], min(P[k, k] * claim.scale / before, claim.following.sigma**2))
 
     def learned_sigma(self, part: str, sigma: Array) -> Array:
         """A sensor's 1-sigma (m,) of one part of its samples: the ``sigma`` it reports, or what was learned."""
@@ -253,7 +256,7 @@ class LocalFilter:
             measurement = measurement._replace(R=np.maximum(measurement.R, scatter))
         claim = self.claims.get((aid.sensor, part))
         if measurement is not None and claim is not None and not claim.following.state:
-            measurement = measurement._replace(R=claim.scale * measurement.R)
+            measurement = measurement._replace(R=claim.at(sample.t) * measurement.R)
         if measurement is None or noise is None:
             return measurement
         return measurement._replace(R=noise.learned(measurement.R), reported=measurement.R)
@@ -343,11 +346,11 @@ class LocalFilter:
         simple = part not in self.policies and part not in self.fadings and part not in self.noises
         limit = threshold if simple and not withheld else -math.inf
         S, nis = self.absorb(reference, state, nu, H, R, limit, at_points)
-        if not withheld:
-            self.heard(reference, state, part, sample, nis, len(nu))
         ruling = withheld or (FUSED if nis <= threshold else OUTSIDE)
         if not simple and ruling is FUSED:
             ruling = self.weigh(reference, state, sample, part, measurement, S)
+        if not withheld:
+            self.heard(reference, state, part, sample, nis, len(nu))
         return report_on(sample, part, nu, S, nis, threshold, ruling)
 
     def weigh(

@@ -29,8 +29,8 @@ TIME_TOLERANCE = 1e-4  # [s]
 class AirspeedAid:
     """Airspeed along body x, and the constraint of no sideslip (None leaves it out); a filter has one wind.
 
-    ``sigma`` is that of `SLOW` and faster. Of one that tells something below, it grows there as 1/EAS, as errors of
-    pressure do.
+    ``sigma`` is that of `SLOW` and faster. Where one of a smaller ``minimum`` is used below, it grows as 1/EAS, as
+    errors of pressure do.
 
     A sample of no airspeed, NaN, stands for a tube that has fallen silent (`Silence`): of that the constraint is left,
     as long as the filter's own velocity through the air is that of flight.
@@ -92,7 +92,7 @@ class AirspeedAid:
             slow = STANDING if eas >= self.minimum else TOO_SLOW
         if part == "airspeed":
             nu, H = airspeed(state.q_nb, state.v_n, state.lla, at.x, wind, gust, scale, sample.eas)
-            return Measurement(nu, H, self._R[0] * widened(eas), slow)
+            return Measurement(nu, H, self._R[0] if slow else self._R[0] * widened(eas), slow)
         nu, H = sideslip(state.q_nb, state.v_n, at.x, wind, gust)
         return Measurement(nu, H, self._R[1], slow)
 

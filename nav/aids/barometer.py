@@ -18,6 +18,7 @@ from nav.samples import Array, BarometerSample, Sample
 
 CLOSE_S = 0.25  # between neighbours: 10 m/s^2 bend the line by 0.1 m then [s]
 SCATTER_SAMPLES, OUTLYING = 100, 10.0  # that are averaged; times the mean square that one of them counts at most
+LEAST = 1 / 4  # of what is told to drive the wake
 PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly report [Pa]
 
 
@@ -42,7 +43,7 @@ class BarometerAid:
     def following(self) -> dict[str, Following]:
         """See `nav.claims.FollowingAid`."""
         follows = self.follow_s and self.error_sigma
-        return {"barometer": Following(self.follow_s, 1 / 4, state=self.states[1])} if follows else {}
+        return {"barometer": Following(self.follow_s, LEAST, 1.0, self.states[1], self.error_sigma)} if follows else {}
 
     @property
     def states(self) -> tuple[str, ...]:

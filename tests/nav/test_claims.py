@@ -60,8 +60,17 @@ def test_a_pause_teaches_as_a_second_does_and_a_long_one_takes_back_what_was_lea
     assert long.scale == short.scale == pytest.approx(math.exp(-1 / 30.0))
     for k in range(20):
         long.heard(0.0, PAUSE_S + k)
-    long.heard(1.0, 40.1 + PAUSE_S)
+    t = 40.0 + PAUSE_S
+    assert long.at(t) == 1.0 > long.scale  # for what is made of the first sample, too
+    long.heard(1.0, t)
     assert long.scale == 1.0
+
+
+def test_however_short_the_time_it_stays_within_its_limits():
+    claim = Claim(Following(1e-4, 1.0, WIDEST))
+    for t in range(3):
+        claim.heard(1e6, float(t))
+    assert claim.scale == WIDEST
 
 
 FOLLOWED = (GnssAid(follow_s=5.0), BarometerAid(error_sigma=3.0, follow_s=30.0), MagnetometerAid(follow_s=60.0))
@@ -134,11 +143,16 @@ def test_what_a_wake_may_be_grows_with_what_drives_it():
     claim = ins._filter.claims["barometer", "barometer"]
     for row in range(1, 100):
         held(ins, BarometerSample(PERIOD_S * row, PERIOD_S * row, 97_772.6))
-    before, scale = ins._state.P[0, k, k], claim.scale
+    P, before, scale = ins._state.P[0], 1.0, claim.scale
+    P[k], P[:, k] = 0.0, 0.0  # as small as it has become by now in flight
+    P[k, k] = before
     report = held(ins, BarometerSample(PERIOD_S * 100, PERIOD_S * 100, 97_272.6))[0]
     assert report.outcome is Outcome.OUTSIDE_GATE  # so that nothing else moved it
     assert claim.scale > scale
     assert ins._state.P[0, k, k] / before == pytest.approx(claim.scale / scale)
+    for row in range(101, 200):
+        held(ins, BarometerSample(PERIOD_S * row, PERIOD_S * row, 97_772.6 - 500.0 * (row % 5 == 0)))
+        assert ins._state.P[0, k, k] <= 9.0 * (1 + 1e-12)  # never to more than what is told
 
 
 def test_a_filter_that_begins_anew_claims_what_is_told():
@@ -164,7 +178,7 @@ def test_a_gate_lets_a_receiver_contradict_itself_as_far_as_a_sound_one_does():
         report = held(ins, fix(PERIOD_S * 30, off=6.0))[0]
         assert report.outcome is outcome
         assert report.nis > ins._gate.threshold(3)
-        assert math.isnan(report.threshold) == bool(told)  # it was not by what is shown that it was judged
+        assert (report.nis <= report.threshold) == (outcome is Outcome.FUSED)
     assert held(ins, fix(PERIOD_S * 31, off=30.0))[0].outcome is Outcome.OUTSIDE_GATE
 
 
