@@ -22,7 +22,7 @@ from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
 from nav.columns import Estimates, Reported, Told
-from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict, whiten
+from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.increments import Increments, Steps
@@ -412,11 +412,7 @@ class Ins:
             if with_velocity
             else (state.v_n.copy(), np.sqrt(np.diag(state.P[0])[VEL : VEL + 3]))
         )
-        threshold, judged = self._gate.threshold(3), self._filter.as_judged("gnss_position", sample, S)
-        statistic, shown = nis, threshold
-        if judged is not S:
-            statistic = whiten(nu, judged)[1]
-            shown = threshold * nis / statistic if statistic > 0.0 else threshold  # on what is reported
+        statistic, threshold, shown = self._filter.gated("gnss_position", sample, nu, S, nis)
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
         odds = self._filter.odds(self._winds, state, v_n, sample.t) if statistic > threshold else 0.0
         fix = sample if sigma_p is sample.sigma_position_n else replace(sample, sigma_position_n=sigma_p)

@@ -29,7 +29,7 @@ from nav.aids.base import (
 )
 from nav.aids.gnss import Contradiction, GnssAid
 from nav.claims import Claim, FollowingAid
-from nav.detection import ChiSquareGate, Mask, WindMemory
+from nav.detection import ChiSquareGate, Mask, WindMemory, whiten
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
 from nav.kalman import innovate, scratch
 from nav.monitor import Monitor, MonitoredAid, Patience
@@ -266,6 +266,14 @@ class LocalFilter:
         x: Array = state.x[self.row].copy()
         x[: len(state.imu)] = state.imu
         return x
+
+    def gated(self, part: str, sample: Sample, nu: Array, S: Array, nis: float) -> tuple[float, float, float]:
+        """The statistic that the gate judges, its threshold, and what that is of the ``nis``, which is reported."""
+        judged, threshold = self.as_judged(part, sample, S), self.gate.threshold(len(nu))
+        if judged is S:
+            return nis, threshold, threshold
+        statistic = whiten(nu, judged)[1]
+        return statistic, threshold, threshold * nis / statistic if statistic > 0.0 else threshold
 
     def as_judged(self, part: str, sample: Sample, S: Array) -> Array:
         """S (m, m) as a detector or a gate is given it: of positions wider by what velocities contradict them."""
