@@ -109,11 +109,16 @@ class EventWatch:
             if name not in self.silent and t > self.heard[name] + most:
                 self.silent.add(name)
                 self.emit(t, "warning", f"{name} silent")
+        if self.faults:
+            self._edges(t)
+        self.t = t
+
+    def _edges(self, t: float) -> None:
+        """Faults that have begun or ended since the row before."""
         edges = [(one.start, "begins", one) for one in self.faults] + [(one.end, "ends", one) for one in self.faults]
         for when, what, one in sorted(edges, key=lambda edge: edge[0]):
             if self.t < when <= t:
                 self.emit(when, "info", f"fault {one.name} {what}: {one}")
-        self.t = t
 
 
 def legs_unflown(scenario: Scenario, leg: float) -> str:
