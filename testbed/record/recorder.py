@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 COLUMN_OVERHEAD = 4096  # bytes of a file for each column, and for itself, beside the rows: a generous guess
-FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
+FLUSH_WALL_S = 1.0  # a killed run loses at most this much work, and twice as much when it is about to end
 UNTENDED_S = 5.0  # or this much of a live one, which writes when there is time, if there was none
 PIECE_S = 0.004  # what one piece of that work may take, on a busy machine
 COPY_BYTES = 1 << 20  # at a time, from a file to a larger one
@@ -97,7 +97,7 @@ class Recorder:
         self._increments = np.zeros((0, 6))  # dtheta and dv of the ticks since the last recorded row
         self._t = 0.0  # of the newest row of truth
         self._heard = 0.0  # up to where all else has been taken, which comes after truth
-        self._last_flush = time.monotonic()
+        self._last_flush = self._began = time.monotonic()
         self._tended = False
         self._file: FileIO | None = None
         self._closed = False
@@ -114,8 +114,13 @@ class Recorder:
         for table in self._tables.values():
             if len(table.objects) >= PACK_ROWS:
                 table.pack()
-        if time.monotonic() - self._last_flush >= (UNTENDED_S if self._tended else FLUSH_WALL_S):
+        if time.monotonic() - self._last_flush >= (UNTENDED_S if self._tended else FLUSH_WALL_S) and not self._ending():
             self.flush()
+
+    def _ending(self) -> bool:
+        """Whether all will be written soon anyway, at the pace so far: most runs take no longer than two seconds."""
+        elapsed = time.monotonic() - self._began
+        return not self._tended and elapsed * (self._duration - self._t) < FLUSH_WALL_S * self._t
 
     def imu(self, name: str, samples: ImuSamples) -> None:
         """Take inertial increments at their full rate, if the scenario records them."""

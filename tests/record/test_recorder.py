@@ -294,6 +294,20 @@ def test_a_record_without_spare_moments_is_written_all_the_same(
     recorder.close()
 
 
+@pytest.mark.parametrize(("duration", "written"), [(600.0, True), (10.5, False)])
+def test_rows_are_written_on_the_way_unless_the_end_is_near(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, duration: float, written: bool
+) -> None:
+    now = 0.0
+    monkeypatch.setattr(record.time, "monotonic", lambda: now)
+    recorder = Recorder(tmp_path / "run.nc", scenario(duration), 3)
+    now = 1.5  # in which ten seconds went by
+    recorder.truth(circle(10.0))
+    assert (tmp_path / "run.nc").exists() == written
+    recorder.close()
+    assert load(tmp_path / "run.nc")["truth"].sizes["time"] == 101
+
+
 def test_long_text_is_cut_at_a_whole_character() -> None:
     recorder = Recorder(None, scenario(), 3)
     recorder.event(0.0, "warning", "é" * 100 + "!")
