@@ -15,7 +15,7 @@ from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.monitor import MonitoredAid
 from nav.motion import LowDynamics
-from nav.samples import FixType, ImuSamples, Outcome, PositionSample
+from nav.samples import NO_SENSOR, FixType, ImuSamples, Outcome, PositionSample
 
 ARM = (0.5, 0.1, -0.3)
 AIDS = (
@@ -67,6 +67,8 @@ def rough(increments, samples):
             change = {"v_n": sample.v_n + 9.0}
         elif within(sample, "gnss", 26, 28):
             change = {"v_n": np.full(3, np.nan)}
+        elif within(sample, "gnss", 30, 31):  # of which nothing else counts
+            change = {"fix_type": FixType.NO_FIX, "v_n": np.empty(0), "sigma_position_n": None}
         elif within(sample, "gnss", 30, 44):
             change = {"fix_type": FixType.NO_FIX, "lat": np.nan, "v_n": np.full(3, np.nan)}
         elif within(sample, "gnss", 48, 48.5):
@@ -182,6 +184,24 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         assert all(map(same, estimates, told))
         assert np.array_equal(ins._state.whole, other._state.whole)
         assert same(ins._monitor, other._monitor)
+
+
+def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
+    """Just when its silence has lasted long enough, wherever a turn ends and times are rounded."""
+    times, stood_in = np.arange(0.2, 22.0, 0.2).tolist(), 0
+    for silent_from in np.arange(15.0, 18.0, 0.1).tolist():
+        found = []
+        for one_by_one in (True, False):
+            truth, rng = flight(23.0), np.random.default_rng(1)
+            increments, _, _ = imu(truth, CONSUMER, rng)
+            tube = [sample for sample in airspeed(truth, rng) if sample.t < silent_from + 1e-9]
+            samples = [*gnss(truth, rng, 5.0, latency_s=0.1), *barometer(truth, rng), *tube]
+            ins = Ins(InsConfig(CONSUMER, (GnssAid(), BarometerAid(), AirspeedAid())), field_n)
+            reports, _, _ = run(one_by_one, ins, increments, samples, 0.2, times)
+            found.append([report.t for report in reports if report.sensor == NO_SENSOR])
+        assert found[0] == found[1]
+        stood_in += len(found[0])
+    assert stood_in
 
 
 @pytest.mark.parametrize(
