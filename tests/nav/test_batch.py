@@ -188,11 +188,11 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
 
 def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
     """Just when its silence has lasted long enough, wherever a turn ends and times are rounded."""
-    times, stood_in = np.arange(0.2, 22.0, 0.2).tolist(), 0
-    for silent_from in np.arange(15.0, 18.0, 0.1).tolist():
+    times, stood_in = np.arange(0.2, 18.0, 0.2).tolist(), 0
+    for silent_from in np.arange(15.0, 15.6, 0.1).tolist():
         found = []
         for one_by_one in (True, False):
-            truth, rng = flight(23.0), np.random.default_rng(1)
+            truth, rng = flight(18.0), np.random.default_rng(1)
             increments, _, _ = imu(truth, CONSUMER, rng)
             tube = [sample for sample in airspeed(truth, rng) if sample.t < silent_from + 1e-9]
             samples = [*gnss(truth, rng, 5.0, latency_s=0.1), *barometer(truth, rng), *tube]
