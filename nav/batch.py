@@ -45,6 +45,7 @@ from nav.increments import (
 from nav.kalman import scratch
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
+from nav.realignment import tilt_is_lost
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
 from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
 from nav.state import State, absorb, parts, propagate
@@ -161,7 +162,7 @@ class Batch:
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
                 ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
-                self._filters[0].closed, told, wholes, when,
+                self._filters[0].closed, len(self._filters), told, wholes, when,
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
@@ -311,15 +312,16 @@ def follow(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int,
     t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
-    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool,
+    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool, own: int,
     reports: Array, estimates: Array, when: Array,
 ) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
     """Take ``steps`` (K, WIDTH) as far as they are plain: see `Done`. In place on all that is handed over.
 
     The state and how it moves as of `nav.state.propagate`, the increments of `nav.increments.Increments`; ``kinds`` (A,
-    8) and ``told`` (A, 12) of the aids (`_measure`), the last place of the reference ``field`` (6,), and whether the
-    filters are ``closed``. Into ``reports`` (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2): of each of
-    these its time and that of the last bad increment.
+    8) and ``told`` (A, 12) of the aids (`_measure`), the last place of the reference ``field`` (6,), whether the
+    filters are ``closed``, and how many of them are no shadows but the estimator's ``own``. Into ``reports``
+    (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2): of each of these its time and that of the last bad
+    increment.
     """
     q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
@@ -382,6 +384,8 @@ def follow(
             now = time
         if what == SPLIT:
             continue
+        if tilt_is_lost(P, own):
+            return k, 0, row, now, last_bad, written, drafted
         for part in range(kinds[what, 1]):
             f, limit = kinds[what, 7], told[what, LIMITS + part]
             plain, nu, H, R = _measure(

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nav.aids import GnssAid
+from nav.aids.base import OUTSIDE, Ruling
 from nav.aids.gnss import has_velocity
 from nav.detection import PROBATION_S, RECOVERY_S, SURE, GnssMonitor, Refusals, Verdict, whiten
 from nav.error_model import MOTION, POS, VEL
@@ -15,6 +16,12 @@ from nav.local_filter import LocalFilter
 from nav.samples import Array, GnssSample, Outcome, Sample, UpdateReport, WindSample
 from nav.state import State
 
+RULINGS = {
+    Verdict.FUSE: Ruling(Outcome.FUSED, weight=1.0),
+    Verdict.REJECT: OUTSIDE,
+    Verdict.PROBATION: Ruling(Outcome.WITHHELD, "on probation after an outage"),
+    Verdict.RECOVER: Ruling(Outcome.FUSED, "outside the gate, but consistent for long: covariance reset", weight=1.0),
+}
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 
 

@@ -31,6 +31,7 @@ from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
 from nav.master import LEAST_SHARE, MasterFilter, noise_shares
 from nav.monitor import Change, Isolation, Monitor, shown_limit
+from nav.realignment import Realignment
 from nav.reference import (
     BAD_SAMPLE_S,
     FUSED,
@@ -91,6 +92,7 @@ class Federated:
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
+        self._realignment = Realignment(self._alignment, self._aligning, self._reference)
         self._batch = Batch(self.locals, self._reference)
         self._master = MasterFilter(config, self.locals, self._reference, self._copies)
 
@@ -148,6 +150,7 @@ class Federated:
             self._alignment.propagate(imu)
         else:
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
+            self._realignment.propagate(imu)
         self.t = float(imu.t[-1])
 
     def accepts(self, sample: Sample) -> bool:
@@ -171,6 +174,8 @@ class Federated:
                 self.start(initial)
             return []
         self._reference.settle(state)
+        if (kept := self._realignment.keeps(self, state, len(self.locals), sample)) is not None:
+            return kept
         reports: list[UpdateReport] = []
         for filter_ in self._users.get(sample.sensor, ()):
             reports += self._use(state, filter_, sample)
@@ -204,7 +209,7 @@ class Federated:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self._doubts.off.any():
+        if self._state is None or self._realignment.under_way or self._doubts.off.any():
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates
@@ -238,12 +243,12 @@ class Federated:
         assert self._state is not None
         return self._master.told(wholes, self._state.shape, t, status, self._doubts.off)
 
-    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+    def refuse(self, sample: Sample, reason: str, outcome: Outcome = Outcome.UNSOUND) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN), as `update` would give."""
         return [
             report
             for filter_ in self._users.get(sample.sensor, ())
-            for report in refusals(sample, filter_.aids[sample.sensor], reason, self.t)
+            for report in refusals(sample, filter_.aids[sample.sensor], reason, self.t, outcome)
         ]
 
     def estimate(self) -> Estimate:

@@ -16,18 +16,19 @@ import numpy as np
 
 from nav import aids
 from nav.aids import Aid, AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, RangefinderAid
-from nav.aids.base import OUTSIDE, Ruling, refusals, report_on, without_position
+from nav.aids.base import Ruling, refusals, report_on, without_position
 from nav.aids.gnss import has_velocity
 from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
 from nav.columns import Estimates, Reported, Told
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
-from nav.doubts import WindDoubt
+from nav.doubts import RULINGS, WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
 from nav.motion import TurnDetector
+from nav.realignment import Realignment
 from nav.reference import (
     BAD_SAMPLE_S,
     FUSED,
@@ -62,13 +63,6 @@ from nav.smoother import Smoother
 from nav.state import State, known
 from nav.unscented import Scaling
 from nav.weighting import Fading, Policy
-
-RULINGS = {
-    Verdict.FUSE: Ruling(Outcome.FUSED, weight=1.0),
-    Verdict.REJECT: OUTSIDE,
-    Verdict.PROBATION: Ruling(Outcome.WITHHELD, "on probation after an outage"),
-    Verdict.RECOVER: Ruling(Outcome.FUSED, "outside the gate, but consistent for long: covariance reset", weight=1.0),
-}
 
 # Relief refused for so long contradicts the position or the sensor. A filter that follows a slope of the map where it
 # is not takes its error for wind: so much, and since then. A sensor may be off by so much, as the ground may be.
@@ -150,6 +144,7 @@ class Ins:
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
+        self._realignment = Realignment(self._alignment, self._filter.aids, self._reference)
         self._batch = Batch([self._filter], self._reference)
         self._takes_steps = not (config.smooth or config.scaling or course)
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]
@@ -177,7 +172,7 @@ class Ins:
         self._monitor.last_fused = initial.t
         self._filter.claim_as_told(self._reference, self._state)
         if self._smoother is not None:
-            self._smoother.pause(self.t, self._state)
+            self._smoother.begin(self.t, self._state)
 
     def set_gate(self, false_rejection: float) -> None:
         """From now on, turn sound measurements away with this probability (`InsConfig.false_rejection`)."""
@@ -196,6 +191,7 @@ class Ins:
             if self._smoother is not None:
                 self._smoother.carry(self._state, imu)
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
+            self._realignment.propagate(imu)
         self.t = float(imu.t[-1])
 
     @property
@@ -205,7 +201,7 @@ class Ins:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self._doubt.any() or self._wind_doubt.pending:
+        if self._state is None or self._realignment.under_way or self._doubt.any() or self._wind_doubt.pending:
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._monitor.last_fused, steps, ahead, reports, estimates
@@ -276,6 +272,8 @@ class Ins:
         if aid is None:
             return []
         self._reference.settle(state)
+        if (kept := self._realignment.keeps(self, state, 1, sample)) is not None:
+            return kept
         if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
             reports = self._update_gnss(state, sample, aid)
         else:
@@ -377,10 +375,10 @@ class Ins:
         for t, state in self._smoother.states(times):
             yield self._described(state.whole[None].copy(), np.array([t]), [Status.ALIGNED], np.zeros(MOTION))[0]
 
-    def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+    def refuse(self, sample: Sample, reason: str, outcome: Outcome = Outcome.UNSOUND) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
         aid = self._filter.aids.get(sample.sensor)
-        return [] if aid is None else refusals(sample, aid, reason, self.t)
+        return [] if aid is None else refusals(sample, aid, reason, self.t, outcome)
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""

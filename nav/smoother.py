@@ -53,13 +53,19 @@ class Smoother:
     """Keeps what one closed filter of a ``model`` does, and looks back in the end (`states`).
 
     The filter tells it of each block of increments before it takes it (`carry`), of each update that it makes
-    (`updated`), and of each time at which it has used its samples (`pause`), the first being its start.
+    (`updated`), and of each time at which it has used its samples (`pause`). What was before its start (`begin`)
+    is forgotten.
     """
 
     def __init__(self, model: ErrorModel) -> None:
         self._model = model
         self._nodes: list[_Node] = []
         self._blocks: list[ImuSamples] = []
+
+    def begin(self, t: float, state: State) -> None:
+        """The filter starts at ``t`` [s]."""
+        self._nodes, self._blocks = [], []
+        self.pause(t, state)
 
     def carry(self, state: State, imu: ImuSamples) -> None:
         """The filter is about to go on from ``state`` by a block of increments."""

@@ -148,13 +148,15 @@ def aid_blocks(aids: Sequence[Aid]) -> list[Block]:
     return [block for block in blocks.values() if np.any(block.sigma)]
 
 
-def refusals(sample: Sample, aid: Aid, reason: str, now: float) -> list[UpdateReport]:
+def refusals(
+    sample: Sample, aid: Aid, reason: str, now: float, outcome: Outcome = Outcome.UNSOUND
+) -> list[UpdateReport]:
     """Reports on a sample that is not used, without innovations (NaN): one for each part of it."""
     t = sample.t if math.isfinite(sample.t) else now
     return [
         UpdateReport(
             t, sample.sensor, part, np.full(m, np.nan), np.full((m, m), np.nan), math.nan, math.nan,
-            0.0, Outcome.UNSOUND, reason,
+            0.0, outcome, reason,
         )
         for part, m in aid.parts
     ]  # fmt: skip

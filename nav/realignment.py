@@ -1,0 +1,99 @@
+"""Aligning anew, when increments were missing for so long that an attitude's error is not small any more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Container
+from copy import deepcopy
+from typing import Protocol
+
+from nav._jit import njit
+from nav.alignment import Alignment, InitialState
+from nav.error_model import PHI, POS, VEL
+from nav.reference import Reference, align
+from nav.samples import Array, ImuSamples, Outcome, Sample, UpdateReport
+from nav.state import State
+
+LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
+GRAVITY = 9.8  # [m/s^2]
+DV, DP = range(VEL, VEL + 3), range(POS, POS + 3)
+WAIT_S = 5.0  # the longest that samples are withheld for an alignment
+
+
+class Startable(Protocol):
+    """An estimator that can begin anew."""
+
+    def start(self, initial: InitialState) -> None:
+        """Begin at a given state."""
+        ...
+
+    def refuse(self, sample: Sample, reason: str, outcome: Outcome) -> list[UpdateReport]:
+        """Reports on a sample that is not used."""
+        ...
+
+
+class Realignment:
+    """Watches how well an estimator knows its tilt, and aligns it anew when that is lost.
+
+    A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
+    did not. So samples of the ``sensors`` go to an alignment, which is as ``alignment`` at its beginning and knows
+    nothing of before, and all are withheld from the filters; where it comes to no end in `WAIT_S`, they are used as
+    well as may be.
+    """
+
+    def __init__(self, alignment: Alignment, sensors: Container[str], reference: Reference) -> None:
+        self._beginning, self._sensors, self._reference = deepcopy(alignment), sensors, reference
+        self._alignment: Alignment | None = None
+        self._since = self._widened = math.nan
+
+    @property
+    def under_way(self) -> bool:
+        """Whether there is an alignment to be fed."""
+        return self._alignment is not None
+
+    def propagate(self, imu: ImuSamples) -> None:
+        """Add a block of increments."""
+        if self._alignment is not None:
+            self._alignment.propagate(imu)
+
+    def keeps(self, estimator: Startable, state: State, filters: int, sample: Sample) -> list[UpdateReport] | None:
+        """The reports on a sample that is kept from an estimator, None where it is not; it may be started by it.
+
+        The ``state``, of so many filters, is settled at the sample's time.
+        """
+        lost = tilt_is_lost(state.P, filters)
+        if self._alignment is None:
+            if not lost:
+                return None
+            self._alignment, self._since, self._widened = deepcopy(self._beginning), sample.t, sample.t
+        if sample.sensor in self._sensors:
+            initial = align(self._alignment, self._reference, sample)
+            if initial is not None:
+                self._alignment = None
+                estimator.start(initial)
+                return []
+        if sample.t - self._since <= WAIT_S:
+            self._widen(state.P, filters, sample.t)
+            return estimator.refuse(sample, "the attitude is lost: aligning anew", Outcome.WITHHELD)
+        if not lost:  # it has come back without
+            self._alignment = None
+        return None
+
+    def _widen(self, P: Array, filters: int, t: float) -> None:
+        """Let velocity and position be off as if gravity pulled anywhere, of which linear errors know nothing."""
+        before, now = self._widened - self._since, t - self._since
+        self._widened = t
+        P[:, DV, DV] += filters * GRAVITY**2 * (now**2 - before**2)
+        P[:, DP, DP] += filters * (0.5 * GRAVITY) ** 2 * (now**4 - before**4)
+
+
+@njit
+def tilt_is_lost(P: Array, filters: int) -> bool:
+    """Whether roll or pitch is less well known than `LOST_TILT` by the first ``filters`` of P (_, n, n) together."""
+    for axis in range(PHI, PHI + 2):
+        information = 0.0  # in that which would do
+        for f in range(filters):
+            information += LOST_TILT**2 / max(P[f, axis, axis], 1e-12)
+        if information < 1.0:
+            return True
+    return False

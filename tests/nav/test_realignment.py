@@ -1,0 +1,95 @@
+"""An attitude that is lost in a gap: what is claimed meanwhile, and that it is found again."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from worlds.federated import field, named, three, true_start
+from worlds.ins import CONSUMER, barometer, error, feed, flight, gnss, imu, magnetometer
+
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.federated import Federated
+from nav.federation import Config
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.realignment import tilt_is_lost
+from nav.samples import Outcome
+
+SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)  # whose gaps widen the claim
+AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
+
+
+def a_filter(kind):
+    if kind == "ins":
+        return Ins(InsConfig(SMALL, AIDS), field)
+    if kind == "smoother":
+        return Ins(InsConfig(SMALL, AIDS, smooth=True), field)
+    return Federated(Config(SMALL, three()), field)
+
+
+def flown(estimator, gap_s, seconds=1.0, aids=True):
+    """All sensors of a minute and a half but those of a gap after 50 s; its increments are no numbers."""
+    truth = flight(90)
+    rng = np.random.default_rng(5)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    lost = (increments.t > 50) & (increments.t <= 50 + gap_s)
+    for values in (increments.dtheta, increments.dv):
+        values[lost] = math.nan
+    samples = gnss(truth, rng, 5.0) + named(gnss(truth, rng, 5.0), "gnss2") + barometer(truth, rng)
+    samples += magnetometer(truth, rng) if aids else []
+    samples = [one for one in samples if not 50 < one.t <= 50 + gap_s]
+    estimator.start(true_start(truth))
+    estimates, reports = feed(FusionHorizon(estimator), increments, samples, seconds)
+    return truth, estimates, reports
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
+@pytest.mark.parametrize("gap_s", [3.0, 20.0])
+def test_after_a_gap_it_is_right_in_three_seconds_and_never_too_sure(kind, gap_s):
+    truth, estimates, reports = flown(a_filter(kind), gap_s)
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        assert (np.abs(off[:6]) < 5 * sigma[:6]).all(), estimate.t
+        if estimate.t > 50 + gap_s + 3.0:
+            assert np.hypot(*off[:2]) < 6.0
+            assert np.abs(off[6:8]).max() < math.radians(3)
+    withheld = [one for one in reports if one.outcome is Outcome.WITHHELD and "lost" in one.reason]
+    assert withheld
+    assert all(50 + gap_s <= one.t < 50 + gap_s + 3.0 for one in withheld)
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_however_it_is_cut_the_same_bits(kind):
+    whole, parts = (flown(a_filter(kind), 3.0, seconds)[1] for seconds in (10.0, 0.5))
+    by_time = {round(one.t, 3): one for one in parts}
+    for one in whole:
+        other = by_time[round(one.t, 3)]
+        assert np.array_equal(one.covariance, other.covariance)
+        assert (one.lat, one.lon, one.h) == (other.lat, other.lon, other.h)
+
+
+def test_what_can_not_be_aligned_goes_on_with_what_it_is_given():
+    """Too slow for the course, and no magnetometer: after five seconds fixes are used again."""
+    estimator = Ins(InsConfig(SMALL, (GnssAid(), BarometerAid())), field)
+    estimator._realignment._beginning.duration_s = 1e3  # as if there were no end to it
+    truth, estimates, reports = flown(estimator, 3.0, aids=False)
+    used = [one.t for one in reports if one.aid == "gnss_position" and one.weight > 0 and one.t > 50]
+    assert 53 + 5 <= used[0] < 53 + 7
+    assert np.hypot(*error(estimates[-1], truth)[:2]) < 1e3
+
+
+def test_a_short_gap_is_flown_over():
+    _, _, reports = flown(a_filter("ins"), 0.3)
+    assert not [one for one in reports if "lost" in one.reason]
+
+
+def test_filters_know_the_tilt_together():
+    """Two of 0.6 rad know it to 0.42, one of them does not; one axis is enough to be lost."""
+    P = np.zeros((2, 15, 15))
+    P[:, [0, 1], [0, 1]] = 0.6**2
+    assert not tilt_is_lost(P, 2)
+    assert tilt_is_lost(P, 1)
+    P[:, 1, 1] = 0.8**2
+    assert tilt_is_lost(P, 2)
+    assert not tilt_is_lost(np.zeros((1, 15, 15)), 1)
