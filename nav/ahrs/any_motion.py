@@ -30,10 +30,12 @@ import numpy as np
 
 from nav.ahrs.config import MAGNETIC_HEADING, AhrsConfig, AnyMotion
 from nav.ahrs.further import FurtherStates
-from nav.ahrs.state import BIAS, PHI, STATES, State
+from nav.ahrs.state import BIAS, FORCE_LIMIT, PHI, RATE_LIMIT, STATES, State
 from nav.kalman import update
+from nav.realignment import LOST_TILT
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array, Outcome, UpdateReport
+from nav.state import BRIDGED_RATE
 
 REST_GATE = 16.3  # chi-square of three, 99.9 %
 MOST_TILT = math.radians(60)  # claimed of a first levelling
@@ -64,6 +66,23 @@ class AnyMotionLevelling:
             return math.nan
         turning = 0.0 if compensated else self.told.unknown_speed * rate / self._g
         return min(math.hypot(self.config.tilt_sigma, force - 1, turning), MOST_TILT) ** 2
+
+    def miss(self, s: State, dtheta: Array, dv: Array, dt: Array) -> None:
+        """Count those of N increments that are not usable; unseen, the body may have turned."""
+        most = RATE_LIMIT * dt[:, None], FORCE_LIMIT * dt[:, None]
+        sound = (np.abs(dtheta) <= most[0]).all(axis=1) & (np.abs(dv) <= most[1]).all(axis=1)
+        axes = range(PHI, PHI + 3)
+        for T in dt[~sound].tolist():  # one by one: however they are cut into blocks, the same bits
+            s.in_motion.missing_s += T
+            s.P[axes, axes] += BRIDGED_RATE**2 * T
+
+    def misses(self, s: State) -> bool:
+        """Whether most of the period is missing, and it shows nothing."""
+        return s.in_motion.missing_s > 0.5 * float(s.elapsed[1])
+
+    def lost(self, s: State) -> bool:
+        """Whether the tilt is, so that it must be found anew."""
+        return bool(max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) > LOST_TILT**2)
 
     def half_noise(self, s: State) -> float:
         """Half of the variance that the turns of a period bring to each axis of the attitude."""

@@ -253,6 +253,8 @@ class Ahrs:
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[start + bad])
+                if self._any_motion is not None:
+                    self._any_motion.miss(s, imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
             start = rows.stop
             if end <= n:
                 self._end_period(s, float(imu.t[end - 1]), reports)
@@ -278,10 +280,15 @@ class Ahrs:
             self._settle(s)
             if self._any_motion is None:
                 self._level(s, t, reports)
-            else:
+            elif not self._any_motion.misses(s):
                 self._level_in_motion(s, self._any_motion, t, reports)
+            elif self._any_motion.lost(s):
+                self._begin_levelling(s)
+        elif self._any_motion is not None and self._any_motion.misses(s):
+            self._begin_levelling(s)
         else:
             self._find_level(s, t)
+        s.in_motion.missing_s = 0.0
         period = self.config.period_s if s.levelled else self.config.levelling_s
         kernels.begin_period(
             s.q_nb, s.air_velocity_n, s.counts, s.angle, s.force, s.elapsed, s.sums, self._airspeed.numbers, t, period
@@ -307,8 +314,7 @@ class Ahrs:
             unaccelerated = abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit
             tilt_variance = config.tilt_sigma**2 if unaccelerated else math.nan
         if no_field or math.isnan(tilt_variance):
-            s.q_nb[:] = 1.0, 0.0, 0.0, 0.0
-            s.field_n[:] = 0.0
+            self._begin_levelling(s)
             return
         roll, pitch = math.atan2(-f_0[1], -f_0[2]), math.atan2(f_0[0], math.hypot(f_0[1], f_0[2]))
         heading = config.heading
@@ -325,6 +331,12 @@ class Ahrs:
             s.in_motion.fields = 0
         s.turned[:] = 0.0
         s.elapsed[0] = 0.0
+
+    def _begin_levelling(self, s: State) -> None:
+        """Let n be the body axes now, and collect anew."""
+        s.levelled = False
+        s.q_nb[:] = 1.0, 0.0, 0.0, 0.0
+        s.field_n[:] = 0.0
 
     def _initial_covariance(self) -> Array:
         config = self.config

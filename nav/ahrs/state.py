@@ -42,6 +42,7 @@ class InMotion:
     other: Array = dataclasses.field(default_factory=lambda: UNKNOWN[:2])  # the same of a field that may replace it
     other_s: float = 0.0  # for how long that has been seen
     quiet: int = 0  # periods in a row
+    missing_s: float = 0.0  # of increments in the period
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""

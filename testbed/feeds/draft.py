@@ -125,6 +125,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
             used = [first[one] for one in AIDS[kind] if one in first]
             lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
             lines.append(f"aids = {_inline(used)}")
+            lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was
     lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
     return "\n".join(lines)
 

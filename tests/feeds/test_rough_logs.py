@@ -245,5 +245,6 @@ def test_log_shows_a_table_and_writes_a_scenario_that_runs(
     assert "is there already" in command("log", "rough.toml", "--scenario", "new.toml")
     scenario = Scenario.load("new.toml", {"duration_s": 15})
     assert run(scenario).metrics["ins.aligned_s"] < 5
+    assert [getattr(one, "profile", "") for one in scenario.estimator] == ["", "any_motion"]
     assert "without a log" in command("log", str(data_dir("scenarios") / "u_turn.toml"))
     assert "No such file" in command("log", "nowhere.bin")

@@ -13,7 +13,7 @@ from nav.ahrs import Ahrs, AhrsConfig
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
-from nav.samples import ImuSamples, MagnetometerSample, Outcome
+from nav.samples import ImuSamples, MagnetometerSample, Outcome, Status
 
 DEG = math.pi / 180
 LAT, DT = 0.9, 0.01
@@ -237,3 +237,37 @@ def test_it_errs_as_it_claims_where_velocities_are_as_it_thinks():
         found.append(np.einsum("ni,nij,nj->n", phi, np.linalg.inv(covariance), phi).mean() / 2)
     print(np.round(found, 2))
     assert 0.3 < np.mean(found) < 1.5
+
+
+@pytest.mark.parametrize("gap_s", [0.4, 3.0, 40.0])
+def test_after_a_gap_it_is_right_in_five_seconds(gap_s):
+    """A short gap widens what is claimed; in a long one the tilt is lost, and found anew by what is felt after it."""
+    motion = in_hand(30 + gap_s + 20)
+    lost = (motion.imu.t > 30) & (motion.imu.t <= 30 + gap_s)
+    for values in (motion.imu.dtheta, motion.imu.dv):
+        values[lost] = math.nan
+    samples = [one for one in fields(motion) if not 30 < one.t <= 30 + gap_s]
+    told = []
+    for cut in (1, 100):
+        horizon, found = FusionHorizon(Ahrs(TOLD, FIELD_N)), []
+        for k in range(0, len(motion.imu.t), 100 * cut):  # and the same bits, however it is cut
+            rows = slice(k, min(k + 100 * cut, len(motion.imu.t)))
+            part = ImuSamples(
+                *(values[rows] for values in (motion.imu.t, motion.imu.dt, motion.imu.dtheta, motion.imu.dv))
+            )
+            arrived = [one for one in samples if part.t[0] - 1e-6 < one.t <= part.t[-1] + 1e-6]
+            wanted = [t for t in part.t[99::100].tolist()]
+            found += list(horizon.track(part, arrived, wanted)[1])
+        told.append(found)
+    for one, other in zip(*told, strict=True):
+        assert np.array_equal(one.q_nb, other.q_nb, equal_nan=True)
+        assert np.array_equal(one.covariance, other.covariance, equal_nan=True)
+    known = [one for one in told[0] if one.t > 30 + gap_s + 5]
+    assert len(known) > 5
+    for one in known:
+        k = round(one.t / DT)
+        off = (Rotation.from_quat(one.q_nb, scalar_first=True) * motion.attitude[k].inv()).as_rotvec()
+        assert np.hypot(*off[:2]) < 5 * DEG
+        assert np.abs(off[2]) < 20 * DEG
+    aligning = [one.t for one in told[0] if Status.ALIGNING in one.status and one.t > 5]
+    assert bool(aligning) == (gap_s > 1.0)
