@@ -45,7 +45,7 @@ from nav.increments import (
 from nav.kalman import scratch
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
-from nav.realignment import tilt_is_lost
+from nav.realignment import Realignment, tilt_is_lost
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
 from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
 from nav.state import State, absorb, parts, propagate
@@ -84,6 +84,8 @@ class Plan(NamedTuple):
 
 class Taker(Protocol):
     """An estimator whose plain steps a `Batch` takes."""
+
+    realignment: Realignment
 
     def trusted(self, fix: GnssSample, before: float) -> bool:
         """Whether a sound fix, if it is inside its gate, is simply used when the one of the time ``before`` was."""
@@ -162,7 +164,7 @@ class Batch:
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
                 ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
-                self._filters[0].closed, len(self._filters), told, wholes, when,
+                self._filters[0].closed, len(self._filters), taker.realignment.since, told, wholes, when,
             )
         )  # fmt: skip
         ahead.next, ahead.t = done.row, done.t
@@ -312,16 +314,16 @@ def follow(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int,
     t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
-    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool, own: int,
+    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool, own: int, since: float,
     reports: Array, estimates: Array, when: Array,
 ) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
     """Take ``steps`` (K, WIDTH) as far as they are plain: see `Done`. In place on all that is handed over.
 
     The state and how it moves as of `nav.state.propagate`, the increments of `nav.increments.Increments`; ``kinds`` (A,
     8) and ``told`` (A, 12) of the aids (`_measure`), the last place of the reference ``field`` (6,), whether the
-    filters are ``closed``, and how many of them are no shadows but the estimator's ``own``. Into ``reports``
-    (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2): of each of these its time and that of the last bad
-    increment.
+    filters are ``closed``, how many of them are no shadows but the estimator's ``own``, and ``since`` when a missing
+    increment may be why a tilt is lost. Into ``reports`` (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2):
+    of each of these its time and that of the last bad increment.
     """
     q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
@@ -384,7 +386,7 @@ def follow(
             now = time
         if what == SPLIT:
             continue
-        if tilt_is_lost(P, own):
+        if last_bad > since and tilt_is_lost(P, own):
             return k, 0, row, now, last_bad, written, drafted
         for part in range(kinds[what, 1]):
             f, limit = kinds[what, 7], told[what, LIMITS + part]

@@ -92,7 +92,7 @@ class Federated:
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
-        self._realignment = Realignment(self._alignment, self._aligning, self._reference)
+        self.realignment = Realignment(self._alignment, self._aligning, self._reference)
         self._batch = Batch(self.locals, self._reference)
         self._master = MasterFilter(config, self.locals, self._reference, self._copies)
 
@@ -141,6 +141,8 @@ class Federated:
             reset(state.x[row], state.P[row], np.zeros(common), state.P[row, :common, :common] / share)
         self._state, self._draft = state, state.copy()
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
+        self.realignment.begin(initial.t)
+        self._doubts.off[:] = 0.0
 
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
@@ -150,7 +152,7 @@ class Federated:
             self._alignment.propagate(imu)
         else:
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
-            self._realignment.propagate(imu)
+            self.realignment.propagate(imu)
         self.t = float(imu.t[-1])
 
     def accepts(self, sample: Sample) -> bool:
@@ -174,7 +176,11 @@ class Federated:
                 self.start(initial)
             return []
         self._reference.settle(state)
-        if (kept := self._realignment.keeps(self, state, len(self.locals), sample)) is not None:
+        isolated = any(w.suspect for f in self._users.get(sample.sensor, ()) for w in f.of_sensor[sample.sensor])
+        kept = self.realignment.keeps(self, state, len(self.locals), sample, self._last_bad, not isolated)
+        if kept is not None:
+            for filter_ in self.locals:
+                filter_.stand_in(sample)
             return kept
         reports: list[UpdateReport] = []
         for filter_ in self._users.get(sample.sensor, ()):
@@ -209,7 +215,7 @@ class Federated:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self._realignment.under_way or self._doubts.off.any():
+        if self._state is None or self.realignment.under_way or self._doubts.off.any():
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates

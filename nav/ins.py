@@ -144,7 +144,7 @@ class Ins:
         self._last_bad = -math.inf  # time of the last sample refused as unsound
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
-        self._realignment = Realignment(self._alignment, self._filter.aids, self._reference)
+        self.realignment = Realignment(self._alignment, self._filter.aids, self._reference)
         self._batch = Batch([self._filter], self._reference)
         self._takes_steps = not (config.smooth or config.scaling or course)
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]
@@ -168,8 +168,9 @@ class Ins:
         """Begin at a given state instead of aligning."""
         self._state = self._reference.start(initial, [self._alignment.names])
         self._draft = self._state.copy()
-        self.t = initial.t
-        self._monitor.last_fused = initial.t
+        self.t = self._monitor.last_fused = initial.t
+        self.realignment.begin(initial.t)
+        self._doubt[:] = 0.0
         self._filter.claim_as_told(self._reference, self._state)
         if self._smoother is not None:
             self._smoother.begin(self.t, self._state)
@@ -191,7 +192,7 @@ class Ins:
             if self._smoother is not None:
                 self._smoother.carry(self._state, imu)
             self._last_bad = max(self._last_bad, self._reference.run(self._state, imu))
-            self._realignment.propagate(imu)
+            self.realignment.propagate(imu)
         self.t = float(imu.t[-1])
 
     @property
@@ -201,7 +202,7 @@ class Ins:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self._realignment.under_way or self._doubt.any() or self._wind_doubt.pending:
+        if self._state is None or self.realignment.under_way or self._doubt.any() or self._wind_doubt.pending:
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._monitor.last_fused, steps, ahead, reports, estimates
@@ -272,7 +273,8 @@ class Ins:
         if aid is None:
             return []
         self._reference.settle(state)
-        if (kept := self._realignment.keeps(self, state, 1, sample)) is not None:
+        if (kept := self.realignment.keeps(self, state, 1, sample, self._last_bad)) is not None:
+            self._filter.stand_in(sample)
             return kept
         if isinstance(sample, GnssSample) and isinstance(aid, GnssAid):
             reports = self._update_gnss(state, sample, aid)

@@ -9,6 +9,7 @@ from typing import Protocol
 
 from nav._jit import njit
 from nav.alignment import Alignment, InitialState
+from nav.earth import displacement_n
 from nav.error_model import PHI, POS, VEL
 from nav.reference import Reference, align
 from nav.samples import Array, ImuSamples, Outcome, Sample, UpdateReport
@@ -17,7 +18,9 @@ from nav.state import State
 LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
 GRAVITY = 9.8  # [m/s^2]
 DV, DP = range(VEL, VEL + 3), range(POS, POS + 3)
-WAIT_S = 5.0  # the longest that samples are withheld for an alignment
+WAIT_S = 5.0  # the longest that samples are withheld for an alignment,
+LONG_S = 30.0  # and that one goes on, though the tilt seems to be known again
+ELSEWHERE = 5.0  # sigmas
 
 
 class Startable(Protocol):
@@ -33,18 +36,23 @@ class Startable(Protocol):
 
 
 class Realignment:
-    """Watches how well an estimator knows its tilt, and aligns it anew when that is lost.
+    """Watches how well an estimator knows its tilt, and aligns it anew when that was lost by missing increments.
 
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
     did not. So samples of the ``sensors`` go to an alignment, which is as ``alignment`` at its beginning and knows
-    nothing of before, and all are withheld from the filters; where it comes to no end in `WAIT_S`, they are used as
-    well as may be.
+    nothing of before, and all are withheld from the filters; where it comes to no end in `WAIT_S` from the last missing
+    increment on, they are used as well as may be. The same where it contradicts the position that was known.
     """
 
     def __init__(self, alignment: Alignment, sensors: Container[str], reference: Reference) -> None:
         self._beginning, self._sensors, self._reference = deepcopy(alignment), sensors, reference
+        self.begin(math.inf)
+
+    def begin(self, t: float) -> None:
+        """The estimator starts at ``t`` [s]: what was missing before is of no account."""
+        self.since = t
         self._alignment: Alignment | None = None
-        self._since = self._widened = math.nan
+        self._lost_at = self._widened = math.nan
 
     @property
     def under_way(self) -> bool:
@@ -56,35 +64,48 @@ class Realignment:
         if self._alignment is not None:
             self._alignment.propagate(imu)
 
-    def keeps(self, estimator: Startable, state: State, filters: int, sample: Sample) -> list[UpdateReport] | None:
+    def keeps(
+        self, estimator: Startable, state: State, filters: int, sample: Sample, last_bad: float, sound: bool = True
+    ) -> list[UpdateReport] | None:
         """The reports on a sample that is kept from an estimator, None where it is not; it may be started by it.
 
-        The ``state``, of so many filters, is settled at the sample's time.
+        The ``state``, of so many filters, is settled at the sample's time; an increment was missing for the last time
+        at ``last_bad`` [s]. A sample that is not ``sound`` is no part of an alignment.
         """
-        lost = tilt_is_lost(state.P, filters)
+        lost = last_bad > self.since and tilt_is_lost(state.P, filters)
         if self._alignment is None:
             if not lost:
                 return None
-            self._alignment, self._since, self._widened = deepcopy(self._beginning), sample.t, sample.t
-        if sample.sensor in self._sensors:
+            self._alignment, self._lost_at, self._widened = deepcopy(self._beginning), sample.t, sample.t
+        waited = sample.t - max(self._lost_at, last_bad)
+        if sample.sensor in self._sensors and sound:
             initial = align(self._alignment, self._reference, sample)
+            if initial is not None and _contradicts(initial, state, filters):
+                self.begin(sample.t)
+                return None
             if initial is not None:
-                self._alignment = None
                 estimator.start(initial)
                 return []
-        if sample.t - self._since <= WAIT_S:
+        if waited <= WAIT_S:
             self._widen(state.P, filters, sample.t)
             return estimator.refuse(sample, "the attitude is lost: aligning anew", Outcome.WITHHELD)
-        if not lost:  # it has come back without
-            self._alignment = None
+        if waited > LONG_S and not lost:  # it has come back without
+            self.begin(sample.t)
         return None
 
     def _widen(self, P: Array, filters: int, t: float) -> None:
         """Let velocity and position be off as if gravity pulled anywhere, of which linear errors know nothing."""
-        before, now = self._widened - self._since, t - self._since
+        before, now = self._widened - self._lost_at, t - self._lost_at
         self._widened = t
         P[:, DV, DV] += filters * GRAVITY**2 * (now**2 - before**2)
         P[:, DP, DP] += filters * (0.5 * GRAVITY) ** 2 * (now**4 - before**4)
+
+
+def _contradicts(initial: InitialState, state: State, filters: int) -> bool:
+    """Whether it is elsewhere over ground than filters thought, who claim much already."""
+    north, east, _ = displacement_n(initial.lat, initial.lon, initial.h, *state.lla.tolist())
+    variance = state.P[:filters, DP, DP].max(axis=0) + initial.covariance[DP, DP]
+    return bool(north**2 + east**2 > ELSEWHERE**2 * variance[:2].sum())
 
 
 @njit

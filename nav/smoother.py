@@ -53,8 +53,7 @@ class Smoother:
     """Keeps what one closed filter of a ``model`` does, and looks back in the end (`states`).
 
     The filter tells it of each block of increments before it takes it (`carry`), of each update that it makes
-    (`updated`), and of each time at which it has used its samples (`pause`). What was before its start (`begin`)
-    is forgotten.
+    (`updated`), of each time at which it has used its samples (`pause`), and of each at which it starts (`begin`).
     """
 
     def __init__(self, model: ErrorModel) -> None:
@@ -63,9 +62,10 @@ class Smoother:
         self._blocks: list[ImuSamples] = []
 
     def begin(self, t: float, state: State) -> None:
-        """The filter starts at ``t`` [s]."""
-        self._nodes, self._blocks = [], []
-        self.pause(t, state)
+        """The filter starts at ``t`` [s]: what comes after tells nothing of what was before."""
+        if self._nodes:
+            self._nodes[-1].M[:] = 0.0
+        self._add(t, state)
 
     def carry(self, state: State, imu: ImuSamples) -> None:
         """The filter is about to go on from ``state`` by a block of increments."""
@@ -98,8 +98,11 @@ class Smoother:
     def pause(self, t: float, state: State) -> None:
         """The filter is at ``t`` [s] and settled: a node, if the last one is `NODE_S` ago."""
         if not self._nodes or t - self._nodes[-1].t >= NODE_S:
-            n = self._model.size
-            self._nodes.append(_Node(t, state.copy(), np.eye(n), np.zeros(n), np.zeros((n, n))))
+            self._add(t, state)
+
+    def _add(self, t: float, state: State) -> None:
+        n = self._model.size
+        self._nodes.append(_Node(t, state.copy(), np.eye(n), np.zeros(n), np.zeros((n, n))))
 
     def states(self, times: Sequence[float]) -> Iterator[Smoothed]:
         """The smoothed states at ``times`` [s], ascending; none of those before the filter's start."""

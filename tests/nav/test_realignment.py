@@ -28,18 +28,35 @@ def a_filter(kind):
     return Federated(Config(SMALL, three()), field)
 
 
-def flown(estimator, gap_s, seconds=1.0, aids=True):
-    """All sensors of a minute and a half but those of a gap after 50 s; its increments are no numbers."""
+def count(start):
+    """A ``start``, and how often it was called."""
+    calls = [0]
+
+    def counted(initial):
+        calls[0] += 1
+        start(initial)
+
+    return counted, calls
+
+
+def flown(estimator, gap_s, seconds=1.0, aids=True, all_lost=True, change=lambda fix: fix, start=True):
+    """A minute and a half with a gap after 50 s: of the increments, and, if ``all_lost``, of what else is measured.
+
+    Fixes are as ``change`` makes them.
+    """
     truth = flight(90)
     rng = np.random.default_rng(5)
     increments, *_ = imu(truth, CONSUMER, rng)
     lost = (increments.t > 50) & (increments.t <= 50 + gap_s)
     for values in (increments.dtheta, increments.dv):
         values[lost] = math.nan
-    samples = gnss(truth, rng, 5.0) + named(gnss(truth, rng, 5.0), "gnss2") + barometer(truth, rng)
+    samples = [change(fix) for fix in gnss(truth, rng, 5.0) + named(gnss(truth, rng, 5.0), "gnss2")] + barometer(
+        truth, rng
+    )
     samples += magnetometer(truth, rng) if aids else []
-    samples = [one for one in samples if not 50 < one.t <= 50 + gap_s]
-    estimator.start(true_start(truth))
+    samples = [one for one in samples if not (all_lost and 50 < one.t <= 50 + gap_s)]
+    if start:
+        estimator.start(true_start(truth))
     estimates, reports = feed(FusionHorizon(estimator), increments, samples, seconds)
     return truth, estimates, reports
 
@@ -72,11 +89,52 @@ def test_however_it_is_cut_the_same_bits(kind):
 def test_what_can_not_be_aligned_goes_on_with_what_it_is_given():
     """Too slow for the course, and no magnetometer: after five seconds fixes are used again."""
     estimator = Ins(InsConfig(SMALL, (GnssAid(), BarometerAid())), field)
-    estimator._realignment._beginning.duration_s = 1e3  # as if there were no end to it
+    estimator.realignment._beginning.duration_s = 1e3  # as if there were no end to it
     truth, estimates, reports = flown(estimator, 3.0, aids=False)
     used = [one.t for one in reports if one.aid == "gnss_position" and one.weight > 0 and one.t > 50]
     assert 53 + 5 <= used[0] < 53 + 7
     assert np.hypot(*error(estimates[-1], truth)[:2]) < 1e3
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+@pytest.mark.parametrize("gap_s", [7.0, 15.0])
+def test_of_increments_alone_it_is_right_in_three_seconds(kind, gap_s):
+    """The aids go on; nothing is concluded from them along axes that nobody knows."""
+    truth, estimates, _ = flown(a_filter(kind), gap_s, all_lost=False)
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        assert (np.abs(off) < 5.5 * sigma).all(), estimate.t
+        if estimate.t > 50 + gap_s + 3.0:
+            assert np.hypot(*off[:2]) < 6.0
+
+
+def test_a_bad_alignment_is_no_gap():
+    """Fixes with velocities of 8 m/s tell a tilt to 33 deg: the filter goes on from there."""
+    change = lambda fix: dataclasses.replace(fix, sigma_velocity_n=np.full(3, 8.0))  # noqa: E731
+    estimator = Ins(InsConfig(SMALL, AIDS), field)
+    estimator.start, begun = count(estimator.start)
+    _, _, reports = flown(estimator, 0.0, change=change, start=False)
+    assert begun == [1]
+    assert not [one for one in reports if "lost" in one.reason]
+
+
+def test_a_receiver_that_was_refused_does_not_start_it():
+    """It is 20 km off from 45 s on, without a word; after 30 s of that the filter gives in, as always."""
+    change = lambda fix: dataclasses.replace(fix, lat=fix.lat + 3e-3) if fix.t > 45 else fix  # noqa: E731
+    truth, estimates, _ = flown(a_filter("ins"), 3.0, change=change)
+    for estimate in estimates[:74]:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        assert np.hypot(*off[:2]) < 5 * np.hypot(*sigma[:2]), estimate.t
+
+
+def test_what_was_before_a_gap_is_smoothed_too():
+    estimator = a_filter("smoother")
+    truth, _, _ = flown(estimator, 3.0)
+    smoothed = list(estimator.smoothed(np.arange(5.0, 85.0).tolist()))
+    assert len(smoothed) == 80
+    for one in smoothed:
+        if not 49 < one.t < 57:
+            assert np.hypot(*error(one, truth)[:2]) < 3.0
 
 
 def test_a_short_gap_is_flown_over():
