@@ -86,7 +86,7 @@ class Federated:
         self.model = self.locals[0].model
         self._common = self._reference.common
         self._state: State | None = None
-        self._last_bad = self._last_fused = -math.inf
+        self._last_bad = self._last_unsound = self._last_fused = -math.inf
         self._fused_at = self._remembered_at = -math.inf
         self._doubts = Doubts(self.locals, config.patience_s, gate.threshold(3))
         self._aligning = self._alignment_aids()
@@ -165,7 +165,7 @@ class Federated:
             return []
         trouble = aids.problem(sample)
         if trouble:
-            self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
+            self._last_unsound = max(self._last_unsound, sample.t if math.isfinite(sample.t) else self.t)
             return self.refuse(sample, trouble)
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
@@ -490,4 +490,4 @@ class Federated:
     def status(self, t: float, last_bad: float) -> Status:
         """What it says of itself at ``t``; see `nav.batch.Taker`."""
         status = Status.ALIGNING if self._state is None else FUSED if t - self._last_fused <= RECENT_S else UNAIDED
-        return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status
+        return status | Status.BAD_SAMPLE if t - max(last_bad, self._last_unsound) <= BAD_SAMPLE_S else status

@@ -141,7 +141,7 @@ class Ins:
         self._winds = self._filter.wind_memory()
         self._wind_doubt = WindDoubt(self._gate.threshold(2))
         self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
-        self._last_bad = -math.inf  # time of the last sample refused as unsound
+        self._last_bad = self._last_unsound = -math.inf  # when an increment, a sample was refused as unsound last
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
         self.realignment = Realignment(self._alignment, self._filter.aids, self._reference)
@@ -259,7 +259,7 @@ class Ins:
             return []
         trouble = aids.problem(sample)
         if trouble:
-            self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
+            self._last_unsound = max(self._last_unsound, sample.t if math.isfinite(sample.t) else self.t)
             return self.refuse(sample, trouble)
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
@@ -485,7 +485,7 @@ class Ins:
     def status(self, t: float, last_bad: float) -> Status:
         """What it says of itself at ``t``; see `nav.batch.Taker`."""
         status = Status.ALIGNING if self._state is None else FUSED if self._aided(t) else UNAIDED
-        return status | Status.BAD_SAMPLE if t - last_bad <= BAD_SAMPLE_S else status
+        return status | Status.BAD_SAMPLE if t - max(last_bad, self._last_unsound) <= BAD_SAMPLE_S else status
 
     def _described(self, wholes: Array, t: Array, status: Sequence[Status], doubt: Array) -> Estimates:
         """The estimates of N settled states (N, numbers), with a ``doubt`` (9,) of their motion."""

@@ -12,7 +12,7 @@ from nav.alignment import Alignment, InitialState
 from nav.earth import displacement_n
 from nav.error_model import PHI, POS, VEL
 from nav.reference import Reference, align
-from nav.samples import Array, ImuSamples, Outcome, Sample, UpdateReport
+from nav.samples import Array, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
 from nav.state import State
 
 LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
@@ -39,9 +39,10 @@ class Realignment:
     """Watches how well an estimator knows its tilt, and aligns it anew when that was lost by missing increments.
 
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
-    did not. So samples of the ``sensors`` go to an alignment, which is as ``alignment`` at its beginning and knows
-    nothing of before, and all are withheld from the filters; where it comes to no end in `WAIT_S` from the last missing
-    increment on, they are used as well as may be. The same where it contradicts the position that was known.
+    did not. So the fixes of one receiver, and samples of the ``sensors``, go to an alignment, which is as ``alignment``
+    at its beginning and knows nothing of before. All are withheld from the filters; where it comes to no end in
+    `WAIT_S` from the last missing increment on, they are used as well as may be. The same where it contradicts the
+    position that was known.
     """
 
     def __init__(self, alignment: Alignment, sensors: Container[str], reference: Reference) -> None:
@@ -52,6 +53,7 @@ class Realignment:
         """The estimator starts at ``t`` [s]: what was missing before is of no account."""
         self.since = t
         self._alignment: Alignment | None = None
+        self._receiver = ""
         self._lost_at = self._widened = math.nan
 
     @property
@@ -78,7 +80,7 @@ class Realignment:
                 return None
             self._alignment, self._lost_at, self._widened = deepcopy(self._beginning), sample.t, sample.t
         waited = sample.t - max(self._lost_at, last_bad)
-        if sample.sensor in self._sensors and sound:
+        if sound and self._is_part(sample):
             initial = align(self._alignment, self._reference, sample)
             if initial is not None and _contradicts(initial, state, filters):
                 self.begin(sample.t)
@@ -92,6 +94,13 @@ class Realignment:
         if waited > LONG_S and not lost:  # it has come back without
             self.begin(sample.t)
         return None
+
+    def _is_part(self, sample: Sample) -> bool:
+        """Whether the alignment is to have it: of receivers it is the first that is heard."""
+        if isinstance(sample, GnssSample):
+            self._receiver = self._receiver or sample.sensor
+            return sample.sensor == self._receiver
+        return sample.sensor in self._sensors
 
     def _widen(self, P: Array, filters: int, t: float) -> None:
         """Let velocity and position be off as if gravity pulled anywhere, of which linear errors know nothing."""

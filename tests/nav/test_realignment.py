@@ -8,13 +8,13 @@ import pytest
 from worlds.federated import field, named, three, true_start
 from worlds.ins import CONSUMER, barometer, error, feed, flight, gnss, imu, magnetometer
 
-from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.federated import Federated
 from nav.federation import Config
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.realignment import tilt_is_lost
-from nav.samples import Outcome
+from nav.samples import BarometerSample, Outcome
 
 SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)  # whose gaps widen the claim
 AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
@@ -39,10 +39,10 @@ def count(start):
     return counted, calls
 
 
-def flown(estimator, gap_s, seconds=1.0, aids=True, all_lost=True, change=lambda fix: fix, start=True):
+def flown(estimator, gap_s, seconds=1.0, aids=True, all_lost=True, change=lambda fix: fix, start=True, broken=False):
     """A minute and a half with a gap after 50 s: of the increments, and, if ``all_lost``, of what else is measured.
 
-    Fixes are as ``change`` makes them.
+    Fixes are as ``change`` makes them. A ``broken`` barometer is one that delivers no numbers after the gap.
     """
     truth = flight(90)
     rng = np.random.default_rng(5)
@@ -54,6 +54,11 @@ def flown(estimator, gap_s, seconds=1.0, aids=True, all_lost=True, change=lambda
         truth, rng
     )
     samples += magnetometer(truth, rng) if aids else []
+    if broken:
+        samples = [
+            dataclasses.replace(one, pressure=math.nan) if isinstance(one, BarometerSample) and one.t > 50 else one
+            for one in samples
+        ]
     samples = [one for one in samples if not (all_lost and 50 < one.t <= 50 + gap_s)]
     if start:
         estimator.start(true_start(truth))
@@ -90,7 +95,7 @@ def test_what_can_not_be_aligned_goes_on_with_what_it_is_given():
     """Too slow for the course, and no magnetometer: after five seconds fixes are used again."""
     estimator = Ins(InsConfig(SMALL, (GnssAid(), BarometerAid())), field)
     estimator.realignment._beginning.duration_s = 1e3  # as if there were no end to it
-    truth, estimates, reports = flown(estimator, 3.0, aids=False)
+    truth, estimates, reports = flown(estimator, 3.0, aids=False, broken=True)
     used = [one.t for one in reports if one.aid == "gnss_position" and one.weight > 0 and one.t > 50]
     assert 53 + 5 <= used[0] < 53 + 7
     assert np.hypot(*error(estimates[-1], truth)[:2]) < 1e3
@@ -125,6 +130,36 @@ def test_a_receiver_that_was_refused_does_not_start_it():
     for estimate in estimates[:74]:
         off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
         assert np.hypot(*off[:2]) < 5 * np.hypot(*sigma[:2]), estimate.t
+
+
+def test_a_receiver_that_is_not_isolated_starts_it():
+    """One is drawn away by 10 m/s from 25 s on, and isolated; after the gap only the other is used, for all."""
+
+    def change(fix):
+        drawn = fix.sensor == "gnss" and fix.t > 25
+        return dataclasses.replace(fix, lat=fix.lat + 10 * (fix.t - 25) / 6.37e6) if drawn else fix
+
+    estimator = Federated(Config(SMALL, three()), field)
+    starts, begun = count(estimator.start)
+    estimator.start = starts
+    truth, estimates, reports = flown(estimator, 3.0, change=change)
+    assert begun == [2]
+    last = [one.sensor for one in reports if one.aid == "gnss_position" and one.weight > 0][-1]
+    assert last == "gnss2"
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        assert np.hypot(*off[:2]) < 5 * np.hypot(*sigma[:2]), estimate.t
+
+
+def test_a_pitot_tube_is_not_thought_silent_for_the_gap():
+    """Its samples that are withheld count as heard."""
+    estimator = Ins(InsConfig(SMALL, (*AIDS, AirspeedAid())), field)
+    heard = []
+    stand_in = estimator._filter.stand_in
+    estimator._filter.stand_in = lambda one: heard.append(one.t) or stand_in(one)
+    _, _, reports = flown(estimator, 3.0)
+    withheld = {one.t for one in reports if one.outcome is Outcome.WITHHELD and "lost" in one.reason}
+    assert withheld <= set(heard)
 
 
 def test_what_was_before_a_gap_is_smoothed_too():
