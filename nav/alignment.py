@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
 from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
@@ -46,6 +47,13 @@ FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magn
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
 STEP = 1e-6  # of each input, relative, in the differences
+
+
+def usable(dtheta: Array, dv: Array, dt: Array) -> npt.NDArray[np.bool_]:
+    """Which of N increments an IMU could possibly report (N,): not those that are no numbers."""
+    sizes = np.maximum(np.abs(dtheta) / RATE_LIMIT, np.abs(dv) / FORCE_LIMIT).max(axis=1)
+    found: npt.NDArray[np.bool_] = sizes <= dt
+    return found
 
 
 @dataclass(frozen=True)
@@ -150,8 +158,7 @@ class Alignment:
         """Add a block of increments."""
         if self._first is None or not len(imu):
             return
-        sound = (np.abs(imu.dtheta) <= RATE_LIMIT * imu.dt[:, None]).all()
-        if not (sound and (np.abs(imu.dv) <= FORCE_LIMIT * imu.dt[:, None]).all()):
+        if not usable(imu.dtheta, imu.dv, imu.dt).all():
             self.problem = "an increment was not sound: collecting again"
             self._restart(None)
         else:

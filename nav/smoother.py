@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from nav._jit import njit
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT
+from nav.alignment import usable
 from nav.error_model import MOTION, ErrorModel, Indices, sensor_errors, transition
 from nav.samples import Array, ImuSamples
 from nav.state import State, inject, integrate
@@ -163,10 +163,7 @@ class Smoother:
 def _sound(imu: ImuSamples, rates: Array) -> ImuSamples:
     """The same increments, those that are no numbers or impossible replaced by the last sound ``rates`` (2, 3)."""
     dtheta, dv = imu.dtheta.copy(), imu.dv.copy()
-    with np.errstate(invalid="ignore"):
-        limits = imu.dt[:, None]
-        good = (np.abs(dtheta) <= RATE_LIMIT * limits).all(axis=1) & (np.abs(dv) <= FORCE_LIMIT * limits).all(axis=1)
-    for k in np.flatnonzero(~good):
+    for k in np.flatnonzero(~usable(dtheta, dv, imu.dt)):
         before = (dtheta[k - 1] / imu.dt[k - 1], dv[k - 1] / imu.dt[k - 1]) if k else rates
         dtheta[k], dv[k] = before[0] * imu.dt[k], before[1] * imu.dt[k]
     return ImuSamples(imu.t.copy(), imu.dt.copy(), dtheta, dv)

@@ -30,7 +30,8 @@ import numpy as np
 
 from nav.ahrs.config import MAGNETIC_HEADING, AhrsConfig, AnyMotion
 from nav.ahrs.further import FurtherStates
-from nav.ahrs.state import BIAS, FORCE_LIMIT, PHI, RATE_LIMIT, STATES, State
+from nav.ahrs.state import BIAS, PHI, STATES, State
+from nav.alignment import usable
 from nav.kalman import update
 from nav.realignment import LOST_TILT
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
@@ -69,10 +70,8 @@ class AnyMotionLevelling:
 
     def miss(self, s: State, dtheta: Array, dv: Array, dt: Array) -> None:
         """Count those of N increments that are not usable; unseen, the body may have turned."""
-        most = RATE_LIMIT * dt[:, None], FORCE_LIMIT * dt[:, None]
-        sound = (np.abs(dtheta) <= most[0]).all(axis=1) & (np.abs(dv) <= most[1]).all(axis=1)
         axes = range(PHI, PHI + 3)
-        for T in dt[~sound].tolist():  # one by one: however they are cut into blocks, the same bits
+        for T in dt[~usable(dtheta, dv, dt)].tolist():  # one by one: however they are cut into blocks, the same bits
             s.in_motion.missing_s += T
             s.P[axes, axes] += BRIDGED_RATE**2 * T
 

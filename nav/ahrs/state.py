@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from nav._jit import inlined, njit
+from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.rotation import rotation_coefficients
 from nav.samples import Array
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
-RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 UNKNOWN = np.full(3, np.nan)
 FIXED = 52  # numbers in a `State` of any size
 PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
