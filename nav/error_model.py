@@ -171,12 +171,10 @@ class ImuModel:
 
     @property
     def in_motion(self) -> Array:
-        """Squares (4,) of the shares by which noise follows motion and vibration; last 1 if any does, else 0.
-
-        That one is how much of an unseen motion is reckoned with where increments are missing.
+        """Squares (4,) of the shares by which noise follows motion and vibration, and, where increments are missing, an
+        unseen motion: whatever the sensors are, of that it is all.
         """
-        shares = np.array([self.gyro_motion, self.accel_motion, self.vibration]) ** 2
-        return np.append(shares, float(shares.any()))
+        return np.array([self.gyro_motion, self.accel_motion, self.vibration, 1.0]) ** 2
 
     def blocks(self) -> list[Block]:
         """The motion (its noise is the sensors' white noise) and the sensor errors that drive it."""

@@ -21,9 +21,10 @@ from nav.strapdown import step
 from nav.unscented import predict as predict_points
 from nav.unscented import remove
 
-FIXED = 66  # numbers in a `State` of any size
+FIXED = 67  # numbers in a `State` of any size
 SAME = 1e-9  # rates this close, relative, are those of one increment
-BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # what a small vehicle may do unseen, for a second each [rad/s, m/s^2]
+BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # by which those before a gap are off in the end [rad/s, m/s^2]
+CHANGE_S = 0.2  # in which they are by half of that
 SHAKEN_S = 1.0  # over which the noise of increments is averaged
 
 
@@ -43,7 +44,7 @@ class State:
     P: Array  # (filters, n, n)
     errors: Array  # (4, 3) nominal sensor errors by kind
     sums: Array  # (3, 3, 3), see `error_model.transition`
-    elapsed: Array  # (2,) seconds and samples since the last covariance step
+    elapsed: Array  # (3,) seconds and samples since the last covariance step; seconds since a sound increment
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
     shaking: Array  # (3, 3) rate and force of the increment before; densities of their noise, and the last one's length
 
@@ -101,7 +102,7 @@ def parts(
     return (
         whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
         whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
-        whole[49:51], whole[51:57].reshape(2, 3), whole[57:FIXED].reshape(3, 3),
+        whole[49:52], whole[52:58].reshape(2, 3), whole[58:FIXED].reshape(3, 3),
     )  # fmt: skip
 
 
@@ -301,12 +302,15 @@ def propagate(
                     _shake(shaking, rates, dtheta[k], dv[k], T)
                 for i in range(3):
                     rates[0, i], rates[1, i] = dtheta[k, i] / T, dv[k, i] / T
+                elapsed[2] = 0.0
             else:
                 bad = k
+                grown = unseen(elapsed[2] + T) - unseen(elapsed[2])
+                elapsed[2] += T
                 for f in range(filters):
-                    for i in range(3):  # in_motion is zero of filters that are told nothing of motion
-                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * BRIDGED_RATE**2 * T
-                        P[f, VEL + i, VEL + i] += in_motion[f, 3] * BRIDGED_FORCE**2 * T
+                    for i in range(3):
+                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * BRIDGED_RATE**2 * grown
+                        P[f, VEL + i, VEL + i] += in_motion[f, 3] * BRIDGED_FORCE**2 * grown
             for i in range(3):
                 angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
                 push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
@@ -323,6 +327,16 @@ def propagate(
                 driven, decay_rate, variance_rate, in_motion, Phi, FT, decay, half_noise, work,
             )  # fmt: skip
     return bad
+
+
+@inlined
+def unseen(gap: float) -> float:
+    """By what an angle may be off after so many seconds without increments, squared, over `BRIDGED_RATE` squared.
+
+    The rate before the gap is held on, and off by a share T / (T + `CHANGE_S`) of that after T seconds: so it is with
+    small aeroplanes, from 0.02 s to 2 s. The same of a velocity over `BRIDGED_FORCE`.
+    """
+    return (gap * gap / (gap + CHANGE_S)) ** 2
 
 
 @inlined

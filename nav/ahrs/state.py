@@ -43,6 +43,7 @@ class InMotion:
     other_s: float = 0.0  # for how long that has been seen
     quiet: int = 0  # periods in a row
     missing_s: float = 0.0  # of increments in the period
+    gap_s: float = 0.0  # since a sound increment
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""

@@ -100,19 +100,38 @@ def test_slow_motion_is_no_vibration():
     assert density[0] < (1e-3) ** 2 / HZ
 
 
-def test_a_gap_widens_what_is_claimed_by_what_may_happen_unseen():
-    """Two seconds without increments: half a radian and 3 m/s per root of a second, and their part in the position."""
-    model = replace(QUIET, gyro_motion=0.01)
+@pytest.mark.parametrize("shares", [{}, {"gyro_motion": 0.01}])
+@pytest.mark.parametrize("gap_s", [0.01, 0.1, 2.0])
+def test_a_gap_widens_what_is_claimed_by_what_may_happen_unseen(shares, gap_s):
+    """The rate before it is off by 0.5 T / (T + 0.2 s) rad/s after T seconds, the force by six times as much; whatever
+    the grade of the sensors is.
+    """
+    model = replace(QUIET, **shares)
     reference = Reference([ErrorModel(model)], [1.0], 10, None)
     start = InitialState(0.0, LAT, 0.1, 300.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros((MOTION, MOTION)))
     state = reference.start(start)
     dt = np.full(200, 0.01)
     force = np.outer(dt, [0.0, 0.0, -gravity(LAT, 300.0)])
-    reference.run(state, ImuSamples(np.cumsum(dt), dt, 0 * force, force), settle=True)
+    whole = ImuSamples(np.cumsum(dt), dt, 0 * force, force)
+    reference.run(state, whole, settle=True)
     before = np.sqrt(state.P[0].diagonal())
-    reference.run(state, ImuSamples(2 + np.cumsum(dt), dt, np.nan * force, np.nan * force), settle=True)
+    missing = round(gap_s * 100)
+    lost = np.full((missing, 3), np.nan)
+    for first, stop in ((0, missing // 3), (missing // 3, missing)):  # however they are cut
+        rows = slice(first, stop)
+        part = ImuSamples(2 + np.cumsum(dt)[rows], dt[rows], lost[rows], lost[rows])
+        reference.run(state, part, settle=stop == missing)
     sigma = np.sqrt(state.P[0].diagonal())
     assert before[VEL : VEL + 3].max() < 1e-3
-    np.testing.assert_allclose(sigma[PHI : PHI + 3], 0.5 * math.sqrt(2), rtol=0.01)
-    assert (sigma[VEL : VEL + 3] > 3 * math.sqrt(2) * 0.99).all()
-    assert (sigma[6:9] > 3 * math.sqrt(2**3 / 3) * 0.95).all()  # an integrated random walk
+    turned = 0.5 * gap_s**2 / (gap_s + 0.2)
+    np.testing.assert_allclose(sigma[PHI : PHI + 3], np.hypot(before[PHI : PHI + 3], turned), rtol=0.01)
+    assert (sigma[VEL : VEL + 3] > 6 * turned * 0.99).all()
+    if gap_s > 1:  # what comes of the velocity, were it off by parts that know nothing of each other
+        at = np.linspace(0, gap_s, 10_000)
+        grown = np.gradient((3 * at**2 / (at + 0.2)) ** 2, at)
+        assert (sigma[6:9] > 0.95 * math.sqrt(np.trapezoid((gap_s - at) ** 2 * grown, at))).all()
+    after = state.P[0].copy()
+    reference.run(state, ImuSamples(5 + np.cumsum(dt), dt, 0 * force, force), settle=True)
+    one = slice(0, 1)
+    reference.run(state, ImuSamples(np.array([7.01]), dt[one], lost[one], lost[one]), settle=True)
+    assert state.P[0, PHI, PHI] - after[PHI, PHI] < 1e-6 + (0.5 * 0.01**2 / 0.21) ** 2  # the next gap is one by itself

@@ -16,16 +16,16 @@ from nav.ins import Ins, InsConfig
 from nav.realignment import tilt_is_lost
 from nav.samples import BarometerSample, Outcome
 
-SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)  # whose gaps widen the claim
+SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)
 AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
 
 
-def a_filter(kind):
+def a_filter(kind, model=SMALL):
     if kind == "ins":
-        return Ins(InsConfig(SMALL, AIDS), field)
+        return Ins(InsConfig(model, AIDS), field)
     if kind == "smoother":
-        return Ins(InsConfig(SMALL, AIDS, smooth=True), field)
-    return Federated(Config(SMALL, three()), field)
+        return Ins(InsConfig(model, AIDS, smooth=True), field)
+    return Federated(Config(model, three()), field)
 
 
 def count(start):
@@ -79,6 +79,41 @@ def test_after_a_gap_it_is_right_in_three_seconds_and_never_too_sure(kind, gap_s
     withheld = [one for one in reports if one.outcome is Outcome.WITHHELD and "lost" in one.reason]
     assert withheld
     assert all(50 + gap_s <= one.t < 50 + gap_s + 3.0 for one in withheld)
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+@pytest.mark.parametrize("gap_s", [0.1, 0.5, 3.0, 20.0])
+@pytest.mark.parametrize("all_lost", [True, False])
+def test_of_whatever_grade_the_sensors_are(kind, gap_s, all_lost):
+    """What happens unseen is the vehicle's; half a second was enough for 1.6 km, claimed to be 150 m."""
+    truth, estimates, _ = flown(a_filter(kind, CONSUMER), gap_s, all_lost=all_lost)
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        assert (np.abs(off) < 5 * sigma).all(), estimate.t
+        if estimate.t > 50 + gap_s + 3.0:
+            assert np.hypot(*off[:2]) < 2.0
+
+
+def test_lost_increments_are_reckoned_with_one_by_one():
+    """Of 100 increments a second a tenth is lost: of the tilt's errors squared, over claimed, the mean is not matched by
+    design, as a vehicle turns as it likes; it was 15. The wide interval holds one that is within a factor of two.
+    """
+    truth = flight(90)
+    squares = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        increments, *_ = imu(truth, CONSUMER, rng)
+        lost = (rng.random(len(increments.t)) < 0.1) & (increments.t > 20)
+        for values in (increments.dtheta, increments.dv):
+            values[lost] = math.nan
+        estimator = a_filter("ins", CONSUMER)
+        estimator.start(true_start(truth))
+        samples = gnss(truth, rng, 5.0) + barometer(truth, rng) + magnetometer(truth, rng)
+        for one in feed(FusionHorizon(estimator), increments, samples, 1.0)[0]:
+            if one.t > 30:
+                off = error(one, truth)[6:8]
+                squares.append(off @ np.linalg.solve(one.covariance[6:8, 6:8], off) / 2)
+    assert 0.5 < np.mean(squares) < 2.0
 
 
 @pytest.mark.parametrize("kind", ["ins", "federated"])
