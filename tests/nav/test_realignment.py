@@ -95,8 +95,9 @@ def test_of_whatever_grade_the_sensors_are(kind, gap_s, all_lost):
 
 
 def test_lost_increments_are_reckoned_with_one_by_one():
-    """Of 100 increments a second a tenth is lost: of the tilt's errors squared, over claimed, the mean is not matched by
-    design, as a vehicle turns as it likes; it was 15. The wide interval holds one that is within a factor of two.
+    """Of 100 increments a second a tenth is lost: NEES of the tilt was 15.
+
+    It is not matched, as vehicles turn as they like: so the interval is wider than chance.
     """
     truth = flight(90)
     squares = []
