@@ -36,7 +36,6 @@ from nav.kalman import update
 from nav.realignment import LOST_TILT
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array, Outcome, UpdateReport
-from nav.state import BRIDGED_RATE, unseen
 
 REST_GATE = 16.3  # chi-square of three, 99.9 %
 MOST_TILT = math.radians(60)  # claimed of a first levelling
@@ -69,15 +68,9 @@ class AnyMotionLevelling:
         return min(math.hypot(self.config.tilt_sigma, force - 1, turning), MOST_TILT) ** 2
 
     def miss(self, s: State, dtheta: Array, dv: Array, dt: Array) -> None:
-        """Count those of N increments that are not usable; unseen, the body may have turned."""
-        axes, m = range(PHI, PHI + 3), s.in_motion
-        for T, sound in zip(dt.tolist(), usable(dtheta, dv, dt).tolist(), strict=True):
-            if sound:
-                m.gap_s = 0.0
-                continue
-            s.P[axes, axes] += BRIDGED_RATE**2 * (unseen(m.gap_s + T) - unseen(m.gap_s))
-            m.gap_s += T
-            m.missing_s += T
+        """Count those of N increments that are not usable."""
+        for T in dt[~usable(dtheta, dv, dt)].tolist():  # one by one: however they are cut into blocks, the same bits
+            s.in_motion.missing_s += T
 
     def misses(self, s: State) -> bool:
         """Whether most of the period is missing, and it shows nothing."""

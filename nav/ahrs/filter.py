@@ -249,12 +249,12 @@ class Ahrs:
             rows = slice(start, min(end, n))
             bad = propagate(
                 s.q_nb, s.gyro_bias, self._earth_n if s.levelled else np.zeros(3), s.rates, s.turned, s.angle, s.force,
-                s.elapsed, s.sums, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
+                s.elapsed, s.sums, s.P, imu.dtheta[rows], imu.dv[rows], imu.dt[rows],
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[start + bad])
-            if self._any_motion is not None and (bad >= 0 or s.in_motion.gap_s > 0.0):
-                self._any_motion.miss(s, imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
+                if self._any_motion is not None:
+                    self._any_motion.miss(s, imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
             start = rows.stop
             if end <= n:
                 self._end_period(s, float(imu.t[end - 1]), reports)

@@ -11,10 +11,11 @@ from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.rotation import rotation_coefficients
 from nav.samples import Array
+from nav.state import BRIDGED_RATE, unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 UNKNOWN = np.full(3, np.nan)
-FIXED = 52  # numbers in a `State` of any size
+FIXED = 53  # numbers in a `State` of any size
 PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
 
 
@@ -43,7 +44,6 @@ class InMotion:
     other_s: float = 0.0  # for how long that has been seen
     quiet: int = 0  # periods in a row
     missing_s: float = 0.0  # of increments in the period
-    gap_s: float = 0.0  # since a sound increment
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""
@@ -69,7 +69,8 @@ class State:
     turned: Array  # (3, 3) integral of C_nb since the last covariance step
     angle: Array  # (3,) integral of angular rate over the period, body axes
     force: Array  # (3,) integral of specific force over the period, n
-    elapsed: Array  # (3,) seconds since the last covariance step, since the start of the period; increments since then
+    elapsed: Array  # (4,) seconds since the last covariance step, since the start of the period; increments since then;
+    # and seconds since a sound increment
     sums: Array  # (3, 3) integrals over the period of specific force and of the squares of rate and of it, body axes
     x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
     P: Array  # (n, n)
@@ -105,7 +106,7 @@ def parts(
     x = FIXED + n
     return (
         whole[:4], whole[4:7], whole[7:10], whole[10:13], whole[13:16], whole[16:19], whole[19:25].reshape(2, 3),
-        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:43], whole[43:FIXED].reshape(3, 3),
+        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:44], whole[44:FIXED].reshape(3, 3),
         whole[FIXED:x], whole[x:].reshape(n, n),
     )  # fmt: skip
 
@@ -127,10 +128,11 @@ def transition(turned: Array, earth_n: Array, T: float) -> Array:
 @njit
 def propagate(
     q_nb: Array, gyro_bias: Array, earth_n: Array, rates: Array, turned: Array, angle: Array, force: Array,
-    elapsed: Array, sums: Array, dtheta: Array, dv: Array, dt: Array,
+    elapsed: Array, sums: Array, P: Array, dtheta: Array, dv: Array, dt: Array,
 ) -> int:  # fmt: skip
     """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
 
+    These are bridged with the last sound rates; unseen, the body may have turned (`nav.state.unseen`).
     q+ = exp(-w_ie dt / 2) q exp(dtheta / 2), and C_nb dv by the attitude half-way through the turn.
     """
     bad = -1
@@ -150,8 +152,13 @@ def propagate(
         ):  # fmt: skip
             rates[0, 0], rates[0, 1], rates[0, 2] = p0 / T, p1 / T, p2 / T
             rates[1, 0], rates[1, 1], rates[1, 2] = u0 / T, u1 / T, u2 / T
+            elapsed[3] = 0.0
         else:
             bad = k
+            grown = BRIDGED_RATE**2 * (unseen(elapsed[3] + T) - unseen(elapsed[3]))
+            elapsed[3] += T
+            for i in range(3):
+                P[PHI + i, PHI + i] += grown
             p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T
             u0, u1, u2 = rates[1, 0] * T, rates[1, 1] * T, rates[1, 2] * T
         angle[0] += p0

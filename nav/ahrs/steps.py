@@ -315,7 +315,7 @@ def advance(
         if ends:
             stop += 1
         bad = propagate(
-            q_nb, gyro_bias, told[:3], rates, turned, angle, force, elapsed, sums, dtheta[row:stop], dv[row:stop],
+            q_nb, gyro_bias, told[:3], rates, turned, angle, force, elapsed, sums, P, dtheta[row:stop], dv[row:stop],
             dt[row:stop],
         )  # fmt: skip
         if bad >= 0:

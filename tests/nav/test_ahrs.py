@@ -91,13 +91,13 @@ def test_transition_against_finite_differences():
             expected[:, PHI + axis] += sign * phi(attitude(increments, moved), attitude(increments, q_nb)) / (2 * h)
             biased = attitude(increments, q_nb, bias=np.eye(3)[axis] * sign * h)
             expected[:, BIAS + axis] += sign * phi(biased, attitude(increments, q_nb)) / (2 * h)
-    turned, elapsed, forget = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    turned, elapsed, forget = np.zeros((3, 3)), np.zeros(4), np.zeros(3)
     earth_n = np.array([math.cos(LAT), 0.0, -math.sin(LAT)]) * OMEGA_IE
     propagate(
         q_nb.copy(), np.zeros(3), earth_n, np.zeros((2, 3)), turned, forget, forget, elapsed,
-        np.zeros((3, 3)), increments.dtheta, increments.dv, increments.dt,
+        np.zeros((3, 3)), np.zeros((6, 6)), increments.dtheta, increments.dv, increments.dt,
     )  # fmt: skip
-    np.testing.assert_allclose(elapsed, [8.0, 8.0, 1600])
+    np.testing.assert_allclose(elapsed, [8.0, 8.0, 1600, 0.0])
     Phi = transition(turned, earth_n, 8.0)
     np.testing.assert_allclose(Phi[:, BIAS:], expected[:, BIAS:], atol=3e-3)
     np.testing.assert_allclose(Phi[:, :BIAS], expected[:, :BIAS], atol=1e-6)
@@ -247,6 +247,29 @@ def test_blocks_make_no_difference(size):
         np.testing.assert_array_equal(ours.q_nb, whole.q_nb)
         np.testing.assert_array_equal(ours.covariance, whole.covariance)
         np.testing.assert_array_equal(ours.gyro_bias, whole.gyro_bias)
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.5, 3.0])
+def test_what_happens_in_a_gap_is_claimed_however_increments_are_cut(gap_s):
+    """A body that swings by 0.8 rad/s: 3 s unseen turn it by up to a radian; afterwards the claim lasts."""
+    increments, first = wild(20), round(5 / DT)
+    lost = slice(first, first + round(gap_s / DT))
+    gone = ImuSamples(increments.t, increments.dt, increments.dtheta.copy(), increments.dv)
+    gone.dtheta[lost] = math.nan
+    whole, parts, true = Ahrs(INERTIAL), Ahrs(INERTIAL), Ahrs(INERTIAL)
+    for filter_ in (whole, parts, true):
+        filter_.start(0.0, [1.0, 0.0, 0.0, 0.0])
+    whole.propagate(gone)
+    for start in range(0, len(gone), 77):
+        parts.propagate(cut(gone, slice(start, start + 77)))
+    true.propagate(increments)
+    estimate, before = whole.estimate(), true.estimate()
+    np.testing.assert_array_equal(estimate.q_nb, parts.estimate().q_nb)
+    np.testing.assert_array_equal(estimate.covariance, parts.estimate().covariance)
+    off = phi(estimate.q_nb, before.q_nb)
+    widened = estimate.covariance.diagonal()[6:9] - before.covariance.diagonal()[6:9]
+    assert (np.abs(off) < 4 * np.sqrt(widened)).all()
+    np.testing.assert_allclose(np.sqrt(widened.sum() / 3), 0.5 * gap_s**2 / (gap_s + 0.2), rtol=0.02)
 
 
 def test_prediction_is_the_future_and_changes_nothing():
