@@ -68,3 +68,5 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     if scenario is not None:
         write_file(scenario, draft.scenario(found, scenario, truth).encode())
         print(printable(f"scenario: {scenario}"))
+        if not draft.is_placed(found.log):
+            print("Say in it where the flight was, in the line of start: the log does not.")

@@ -20,9 +20,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from nav.samples import Array, FixType, ImuSamples
+from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
+from testbed.feeds.reference import believed, doubt
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
@@ -65,9 +66,11 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     require_imu(path, imus, found, NEEDED)
     samples = _aiding(units, notes)
     solution = _solution(messages)
+    if solution is not None:
+        solution = believed(solution, _first_fix(samples))
     log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
-        date=_date(units),
+        date=_date(units), remark=doubt(solution, samples),
     )  # fmt: skip
     return at_pace(log, _pace(units))
 
@@ -223,6 +226,12 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
         fixes.sigma_position_n[at] = spread(told["HAcc"] / math.sqrt(2), told["VAcc"])
         fixes.sigma_velocity_n[at] = spread(told["SAcc"] / math.sqrt(3), told["SAcc"] / math.sqrt(3))
     return fixes.samples(name)
+
+
+def _first_fix(samples: Mapping[str, Samples]) -> float:
+    """When the autopilot first knew where it is [s]; where it has no receiver, it may have been told."""
+    fixes = [one for own in samples.values() for one in own if isinstance(one, GnssSample)]
+    return min((one.t for one in fixes if one.has_fix), default=math.inf if fixes else -math.inf)
 
 
 def _solution(messages: Mapping[str, list[dict[str, Any]]]) -> Reference | None:

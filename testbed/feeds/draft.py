@@ -11,6 +11,7 @@ from typing import Any
 
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.errors import UserError
+from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
@@ -111,23 +112,32 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
     place = os.path.relpath(log.path.resolve(), out.resolve().parent)
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
-    try:
-        first_place(log, 0.0)
-    except UserError:
+    if not is_placed(log):
         lines.append("# start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 400.0 }  # the log doesn't say where: give it")
     if truth is not None and truth.columns:
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]
     for name, keys in own.items():
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
     main = next(iter(log.imus))
-    for kind, needs in (("ins", "gnss"), ("ahrs", "magnetometer")):
-        if needs in first:
+    for kind in AIDS:
+        if kind != "ins" or log.receiver is not None:
             used = [first[one] for one in AIDS[kind] if one in first]
             lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
             lines.append(f"aids = {_inline(used)}")
             lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was
+            if kind == "ahrs" and "magnetometer" not in first:
+                lines.append("heading_deg = 0.0  # where it points at the start, which no magnetometer tells: give it")
     lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
     return "\n".join(lines)
+
+
+def is_placed(log: Log) -> bool:
+    """Whether a log says where it was."""
+    try:
+        first_place(log, 0.0)
+    except UserError:
+        return False
+    return True
 
 
 def _columns(truth: LogTruth) -> Mapping[str, Any]:

@@ -70,7 +70,7 @@ class Log:
     Without ``valid_times`` the times of samples are those at which they were told, and the sensor's latency is yet to
     be taken off. Accuracies and velocities that a receiver does not report are NaN. ``t0`` is the first time of all,
     ``start`` where the log itself says that it begins; ``messages`` the number of each kind that the file holds;
-    ``notes`` what was odd with it, a sentence each.
+    ``notes`` what was odd with it, a sentence each; ``remark`` what whoever is judged by its solution should know.
     """
 
     path: Path
@@ -84,6 +84,7 @@ class Log:
     valid_times: bool = False
     date: dt.date | None = None
     start: Place | None = None
+    remark: str = ""
 
     @property
     def names(self) -> list[str]:

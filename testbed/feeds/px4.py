@@ -24,6 +24,7 @@ from nav.earth import isa_pressure, radii
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
+from testbed.feeds.reference import believed, doubt
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, spread
 from testbed.feeds.stamps import integrated, ordered
 from testbed.motion.logged import Stream
@@ -61,7 +62,10 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
                 samples[name] = own
     solution = _solution(topics)
     start = beginning(imus, samples, solution)
-    return Log(path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics))
+    return Log(
+        path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),
+        remark=doubt(solution, samples),
+    )  # fmt: skip
 
 
 def _topics(path: Path) -> dict[str, dict[int, Rows]]:
@@ -285,7 +289,7 @@ def _solution(topics: Topics) -> Reference | None:
         columns["lat"] = lat0 + there("x", "xy_valid") / (R_M + h0)
         columns["lon"] = lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0))
         columns["h"] = h0 - there("z", "z_valid")
-    return Reference("the autopilot's own solution (EKF)", t, columns)
+    return believed(Reference("the autopilot's own solution (EKF)", t, columns))
 
 
 def _date(topics: Topics) -> dt.date | None:

@@ -16,7 +16,7 @@ from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
 from testbed.feeds.log import SAMPLES, Log, Reference
-from testbed.feeds.reference import ReferenceMotion, of_receiver, with_rates
+from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, with_rates
 from testbed.feeds.stamps import at_times, begun, bridged
 from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth, Place
@@ -87,7 +87,7 @@ def first_place(log: Log, start_s: float) -> Place:
             return _place(*(float(solution[key][known[0]]) for key in ("lat", "lon", "h")))
     for own in log.samples.values():
         for one in own:
-            if isinstance(one, GnssSample) and one.has_fix and one.t >= log.t0 + start_s:
+            if isinstance(one, GnssSample) and one.has_fix and one.t >= log.t0 + start_s and is_flown(one.lat, one.h):
                 return _place(one.lat, one.lon, one.h)
     raise UserError(f"{log.path}: says nowhere where it is: give truth.start with lat_deg, lon_deg and alt_m")
 
@@ -131,6 +131,7 @@ class Recorded:
         }
         self.faults = Faults(scenario.fault, sections, seed)
         self._told = False
+        self._remark = log.remark if truth.reference == "solution" else ""
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
         """The next rows, and what came with them."""
@@ -153,8 +154,8 @@ class Recorded:
         return [] if told else [(0.0, "info", f"log: {note}") for note in self.notes]
 
     def remark(self) -> str:
-        """Nothing."""
-        return ""
+        """Whether what errors are against contradicts the receiver."""
+        return self._remark
 
     def close(self) -> None:
         """Nothing is held."""

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
 from nav.earth import position_difference_n, radii, wrap_longitude
 from nav.samples import Array, GnssSample, ImuSamples
-from testbed.feeds.log import Reference
+from testbed.feeds.log import Reference, Samples
 from testbed.feeds.stamps import Rows
+from testbed.motion.sections import ALTITUDES, LATITUDE_LIMIT_DEG
 from testbed.motion.table import COLUMNS, TruthBlock
 
 SAME_TIME_S = 1e-6
 LONGEST_STEP_S = 1.5  # between rows that are joined: a receiver of 1 Hz may be late
+DOUBTED_M = 10.0  # of a solution from its receiver: more than both of them and a usual latency are off
 STEPS = 3.0  # or so many of its own, where it is slower
 KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
 
@@ -114,6 +119,48 @@ def _move(block: TruthBlock, reference: Reference, rows: Rows, ends: tuple[Rows,
     block.lat[rows] = lat + moved[:, 0] / (R_M + h)
     block.lon[rows] = wrap_longitude(lon + moved[:, 1] / ((R_N + h) * np.cos(lat)))
     block.h[rows] = h - moved[:, 2]
+
+
+def is_flown(lat: npt.ArrayLike, h: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Whether an aircraft may be at latitudes [rad] and heights [m], of which there may be many."""
+    north, high = np.asarray(lat, float), np.asarray(h, float)
+    there: npt.NDArray[np.bool_] = np.abs(north) < math.radians(LATITUDE_LIMIT_DEG)
+    there = there & (high >= ALTITUDES[0]) & (high <= ALTITUDES[1])
+    return there
+
+
+def believed(solution: Reference, since: float = -math.inf) -> Reference:
+    """An autopilot's solution without positions where no aircraft is, and, before ``since`` [s], without any, and
+    without velocities: until it has heard of a receiver, what it logs of them means nothing.
+    """
+    columns = dict(solution.columns)
+    unknown = solution.t < since
+    if "lat" in columns:
+        there = is_flown(columns["lat"], columns["h"]) & ~unknown
+        for name in ("lat", "lon", "h"):
+            columns[name] = np.where(there, columns[name], np.nan)
+    if "v_n" in columns:
+        columns["v_n"] = np.where(unknown[:, None], np.nan, columns["v_n"])
+    return replace(solution, columns=columns)
+
+
+def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
+    """What there is to say of a solution that is not where the first receiver with a fix was, nothing otherwise."""
+    for name, own in samples.items():
+        fixes = [one for one in own if isinstance(one, GnssSample) and one.has_fix and is_flown(one.lat, one.h)]
+        if fixes and solution is not None and "lat" in solution.columns:
+            at = ReferenceMotion(solution, 1.0, 0).at(np.array([one.t for one in fixes]))
+            there = np.array([(one.lat, one.lon, one.h) for one in fixes]).T
+            off = np.hypot(*position_difference_n(at.lat, at.lon, at.h, *there)[:, :2].T)
+            off = off[np.isfinite(off)]
+            rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
+            if rms <= DOUBTED_M:
+                return ""
+            return (
+                f"{solution.name} is {rms:.3g} m (RMS) from {name}, {off.max():.3g} m at most:"
+                ' truth.reference = "gnss" judges by the receiver'
+            )
+    return ""
 
 
 def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:

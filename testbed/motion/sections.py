@@ -12,12 +12,15 @@ from testbed.motion.segments import Body, GroundSpeed, Segment, Track, lay_track
 from testbed.schema import LONGEST_RUN_S, Heading, Section
 
 LATITUDE_LIMIT_DEG = 85.0  # north-east-down navigation loses its north near the poles
+ALTITUDES = -500.0, 10_000.0  # [m]
 
 Latitude: TypeAlias = Annotated[
     float, Field(gt=-LATITUDE_LIMIT_DEG, lt=LATITUDE_LIMIT_DEG, description="geodetic latitude, WGS84")
 ]
 Longitude: TypeAlias = Annotated[float, Field(ge=-180, le=180, description="longitude, east positive")]
-Altitude: TypeAlias = Annotated[float, Field(ge=-500, le=10_000, description="height above the WGS84 ellipsoid")]
+Altitude: TypeAlias = Annotated[
+    float, Field(ge=ALTITUDES[0], le=ALTITUDES[1], description="height above the WGS84 ellipsoid")
+]
 WindSpeed: TypeAlias = Annotated[float, Field(ge=0, le=50)]
 Shear: TypeAlias = Annotated[float, Field(ge=-5, le=5)]
 TickRate: TypeAlias = Annotated[

@@ -29,7 +29,7 @@ def tables(found: Survey) -> Iterator[Table]:
     listed = [f"{name} {count}" for name, count in sorted(log.messages.items())]
     more = " …" if len(listed) > MESSAGES_SHOWN else ""
     head.add_row("holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
-    for note in log.notes:
+    for note in [*log.notes, *([log.remark] if log.remark else [])]:
         head.add_row("note", note)
     yield head
     reports = _table("sensors", "sensor", "samples", "rate [Hz]", "jitter [ms]", "gaps", "longest step [s]", "proposed")

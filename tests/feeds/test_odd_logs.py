@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from worlds.log_writers import dataflash, dataflash_text, ulog, us
 
+import testbed.__main__ as cli
 from nav.samples import MagnetometerSample
 from testbed import Scenario, run
 from testbed.errors import UserError
@@ -133,6 +135,77 @@ def test_a_log_that_does_not_say_where_it_was_has_a_line_for_it(tmp_path: Path) 
     (tmp_path / "flight.toml").write_text(text)
     with pytest.raises(UserError, match="nowhere"):
         run(Scenario.load(tmp_path / "flight.toml"))
+
+
+def with_solution(messages: Messages, off_deg: float = 0.0, garbage_until: float = 0.0) -> Messages:
+    """The same with an autopilot that thinks it is ``off_deg`` south, and, up to a time, nowhere on Earth."""
+    found: Messages = []
+    for name, values in messages:
+        found.append((name, values))
+        if name == "GPS":
+            t, place = values[0], (values[7] - off_deg, values[8], values[9])
+            nowhere = t < us(garbage_until)
+            found.append(("XKF1", (t, 0, 0.0, 0.0, 0.0, *([4e5] * 3 if nowhere else [0.0] * 3))))
+            found.append(("POS", (t, *((-130.0, 8.0, 62815.0) if nowhere else place))))
+    return found
+
+
+def unfixed(messages: Messages, until: float) -> Messages:
+    """The same with a receiver that has no fix up to a time."""
+    return [
+        (name, (*values[:2], 1, *values[3:]) if name == "GPS" and values[0] < us(until) else values)
+        for name, values in messages
+    ]
+
+
+@pytest.mark.parametrize("until", [10.0, 100.0])
+@pytest.mark.parametrize("fields", [True, False])
+def test_what_an_autopilot_thinks_before_a_fix_is_not_believed(until: float, fields: bool, tmp_path: Path) -> None:
+    """Garbage for a position, and others that are on Earth, but nobody knew: a log with no fix is nowhere."""
+    messages = [one for one in circling() if fields or one[0] != "MAG"]
+    log = read(unfixed(with_solution(messages, garbage_until=5.0), until), tmp_path)
+    assert log.solution is not None
+    known = np.isfinite(log.solution.columns["lat"])
+    assert np.array_equal(known, log.solution.t >= until)
+    assert np.array_equal(np.isfinite(log.solution.columns["v_n"]).all(axis=1), known)
+    text = draft.scenario(survey(log), tmp_path / "x", None)
+    assert ("# start = " in text) == (until > SECONDS)
+    assert ('kind = "ins"' in text) == (until < SECONDS)
+    (tmp_path / "flight.toml").write_text(text.replace("# start", "start"))
+    result = run(Scenario.load(tmp_path / "flight.toml"))
+    assert np.isfinite(result.dataset["estimators/ahrs"].to_dataset(inherit=False).q_nb.values[-1]).all()
+
+
+def test_the_command_says_what_to_give(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for until, told in ((0.0, False), (100.0, True)):
+        read(unfixed(circling(), until), tmp_path)
+        monkeypatch.setattr("sys.argv", ["testbed", "log", "--force", "--scenario", "x.toml", "flight.bin"])
+        monkeypatch.chdir(tmp_path)
+        with suppress(SystemExit):
+            cli.main()
+        assert ("where the flight was" in capsys.readouterr().out) == told
+
+
+def test_places_where_no_aircraft_is_are_not_believed_without_a_receiver_either(tmp_path: Path) -> None:
+    log = read([one for one in with_solution(circling(), garbage_until=5.0) if one[0] != "GPS"], tmp_path)
+    assert log.solution is not None
+    known = np.isfinite(log.solution.columns["lat"])
+    assert known.any()
+    assert np.array_equal(known, log.solution.t >= 5.0)
+
+
+@pytest.mark.parametrize(("off_deg", "told"), [(0.0, False), (0.001, True)])
+def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, told: bool, tmp_path: Path) -> None:
+    log = read(with_solution(circling(), off_deg), tmp_path)
+    assert ("111 m (RMS) from gnss" in log.remark) == told
+    text = draft.scenario(survey(log), tmp_path / "x", None)
+    (tmp_path / "flight.toml").write_text(text)
+    scenario = Scenario.load(tmp_path / "flight.toml", {"duration_s": 20.0})
+    assert any("judges by the receiver" in one for one in run(scenario).remarks) == told
+    by_gnss = run(scenario.changed({"truth.reference": "gnss"}))
+    assert not any("judges by the receiver" in one for one in by_gnss.remarks)
 
 
 @pytest.mark.parametrize("later", [0.03, 0.31, 7.0])
