@@ -118,6 +118,11 @@ class Lane:
         return str(getattr(self.horizon.estimator, "failure", ""))
 
     @property
+    def problem(self) -> str:
+        """What its alignment waits for, of one that says so."""
+        return str(getattr(self.horizon.estimator, "problem", ""))
+
+    @property
     def imu(self) -> str:
         """The first IMU."""
         return next(iter(self.imus))

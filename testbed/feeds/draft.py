@@ -9,6 +9,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.errors import UserError
 from testbed.feeds.log import Log
@@ -126,7 +129,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
             lines.append(f"aids = {_inline(used)}")
             lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was
             if kind == "ahrs" and "magnetometer" not in first:
-                lines.append("heading_deg = 0.0  # where it points at the start, which no magnetometer tells: give it")
+                lines.append(_heading(log))
     lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
     return "\n".join(lines)
 
@@ -138,6 +141,16 @@ def is_placed(log: Log) -> bool:
     except UserError:
         return False
     return True
+
+
+def _heading(log: Log) -> str:
+    """The line that says where a vehicle without magnetometer points at the start: as its autopilot thought."""
+    q_nb = log.solution.columns.get("q_nb") if log.solution is not None else None
+    known = np.flatnonzero(np.isfinite(q_nb).all(axis=1)) if q_nb is not None else ()
+    if q_nb is None or not len(known):
+        return "heading_deg = 0  # at the start: nothing in the log tells it: give it"
+    heading = math.degrees(euler_from_quat(q_nb[known[0]])[2])
+    return f"heading_deg = {heading:.0f}  # at the start, as its autopilot thought: there is no magnetometer"
 
 
 def _columns(truth: LogTruth) -> Mapping[str, Any]:

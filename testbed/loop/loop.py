@@ -342,6 +342,10 @@ class _Passage:
             self.told.emit(end, "warning", unflown)
             remarks.append(unflown)
         remarks += [f"{name} has ended: {self.lanes[name].failure}" for name in self.lanes if name in self.ended]
+        for name, lane in self.lanes.items():
+            if lane.problem:
+                remarks.append(f"{name} has not aligned: {lane.problem}")
+                self.told.emit(end, "warning", remarks[-1])
         self.director.conclude(end)
         self.recorder.attributes |= self.feed.origin  # with why a far end failed
         if self.director.pacer is not None and self.director.pacer.missed:
