@@ -3,9 +3,10 @@
 Between two GNSS fixes the specific force, carried into the axes of one moment by the gyros, must equal the change of
 GNSS velocity less gravity: one pair of vectors known in body and in n, whatever the aircraft does in between. A second
 pair fixes the heading: the magnetic field; else, at rest, the Earth's rate if the gyros are good enough to sense it;
-else, in motion, the course, which is the heading but for wind. Two pairs make an attitude (TRIAD: Black, AIAA J. 2
-(1964)). The covariance follows by differences, correlation with the sensors' biases included: a tilt that was levelled
-on a biased accelerometer is not independent of that bias.
+else, in motion, the course, which is the heading but for wind; else what many pairs of the first kind tell together
+(`nav.velocity_matching`). Two pairs make an attitude (TRIAD: Black, AIAA J. 2 (1964)). The covariance follows by
+differences, correlation with the sensors' biases included: a tilt that was levelled on a biased accelerometer is not
+independent of that bias.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from nav.rotation import (
     quat_rotate,
 )
 from nav.samples import Array, GnssSample, ImuSamples
+from nav.velocity_matching import VelocityMatching
 
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REST_SPEED = 0.5  # slower than this is standing [m/s]
@@ -46,6 +48,8 @@ UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its fiel
 FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
+LONGEST = 3.0  # times the shortest pair of vectors, beyond which it is none for matching
+ACCELERATION_ERROR = 0.1  # of such a pair: latency, scale and tilt of what manoeuvres [m/s^2]
 STEP = 1e-6  # of each input, relative, in the differences
 
 
@@ -124,6 +128,11 @@ class Alignment:
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
         self._places: list[GnssSample] = []  # of a receiver that tells no velocity, the last ones
+        self._matching = VelocityMatching(
+            math.hypot(imu.gyro_bias_sigma, imu.gyro_drift_sigma),
+            math.hypot(imu.accel_bias_sigma, imu.accel_drift_sigma),
+        )
+        self._compassing = False
         self._restart(None)
 
     @classmethod
@@ -151,6 +160,7 @@ class Alignment:
         self._first = fix
         self._q_0b = np.array([1.0, 0.0, 0.0, 0.0])  # body axes now to those at the first fix
         self._angle_0, self._dv_0, self._field_0 = np.zeros(3), np.zeros(3), np.zeros(3)
+        self._turned_0 = np.zeros((3, 3))
         self._fields = 0
         self._omega_first_b, self._omega_b = np.full(3, np.nan), np.zeros(3)
 
@@ -160,9 +170,10 @@ class Alignment:
             return
         if not usable(imu.dtheta, imu.dv, imu.dt).all():
             self.problem = "an increment was not sound: collecting again"
+            self._matching.forget()
             self._restart(None)
         else:
-            _accumulate(self._q_0b, self._angle_0, self._dv_0, imu.dtheta, imu.dv)
+            _accumulate(self._q_0b, self._angle_0, self._dv_0, self._turned_0, imu.dtheta, imu.dv, imu.dt)
             self._omega_b = imu.dtheta[-1] / imu.dt[-1]
             if math.isnan(self._omega_first_b[0]):
                 self._omega_first_b = imu.dtheta[0] / imu.dt[0]
@@ -203,12 +214,15 @@ class Alignment:
         mismatch = abs(np.linalg.norm(dv_b) - np.linalg.norm(dv_n))
         if not mismatch <= 5 * sigma_dv:
             self.problem = f"accelerometers and GNSS velocity disagree by {mismatch / T:.3g} m/s^2"
+            self._matching.forget()
             self._restart(fix)
             return None
+        if duration_s * LONGEST < T:
+            self._matching.forget()
         field_bias = self._field_bias(field_n)
         heading = self._heading(C_b0, first, fix, T, field_n, field_bias)
         if heading is None:
-            if np.linalg.norm(fix.v_n) > REST_SPEED:
+            if not self._compassing:
                 self._restart(fix)
             return None
         # The antenna swings about the IMU: the velocity change of the IMU needs the attitude it serves to find.
@@ -275,22 +289,28 @@ class Alignment:
         if speed >= COURSE_SPEED:
             course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
             return _Heading(np.array([1.0, 0.0, 0.0]), course, 0.0, heading_sigma=min(1.0, self.aids.wind / speed))
-        if max(speed, float(np.linalg.norm(first.v_n))) > REST_SPEED:
-            lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
-            self.problem = f"{lacking}, and it is too slow for the course: waiting for flight"
-            return None
-        return self._gyrocompass(C_b0, fix, T, told)
-
-    def _gyrocompass(self, C_b0: Array, fix: GnssSample, T: float, told: bool) -> _Heading | None:
+        at_rest = max(speed, float(np.linalg.norm(first.v_n))) <= REST_SPEED
         earth_n = earth_rate_n(fix.lat)
+        left = math.hypot(self.imu.gyro_bias_sigma, self.imu.gyro_drift_sigma) / abs(float(earth_n[0]))
+        self._compassing = at_rest and left <= HEADING_SIGMA_LIMIT
+        if self._compassing:
+            return self._gyrocompass(C_b0, earth_n, T)
+        sigma_v = math.sqrt(float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2)))
+        sigma = math.hypot(sigma_v, ACCELERATION_ERROR * T)
+        self._matching.add(C_b0.T, self._dv_0, self._turned_0, self._specific_force_n(first, fix, T), sigma)
+        matched = self._matching.north()
+        if matched is not None:
+            north_b, matched_sigma = matched
+            return _Heading(north_b, np.array([1.0, 0.0, 0.0]), 0.0, heading_sigma=matched_sigma)
+        lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
+        slow = (
+            f"gyrocompassing would leave {math.degrees(left):.3g} deg" if at_rest else "it is too slow for the course"
+        )
+        self.problem = f"{lacking}, and {slow}: waiting for flight, or for accelerations that tell the heading"
+        return None
+
+    def _gyrocompass(self, C_b0: Array, earth_n: Array, T: float) -> _Heading | None:
         level_rate = abs(float(earth_n[0]))
-        bias_variance = self.imu.gyro_bias_sigma**2 + self.imu.gyro_drift_sigma**2
-        sigma = math.sqrt(bias_variance) / level_rate
-        if sigma > HEADING_SIGMA_LIMIT:
-            lacking = "no magnetometer" if told else "no calibrated magnetometer"
-            left = f"gyrocompassing would leave {math.degrees(sigma):.3g} deg"
-            self.problem = f"{lacking}, and {left}: waiting for flight"
-            return None
         needed = (self.imu.gyro_noise / (NOISE_SHARE * HEADING_SIGMA_LIMIT * level_rate)) ** 2
         if needed > T:
             self.problem = f"gyrocompassing, {needed - T:.0f} s to go"
@@ -418,16 +438,21 @@ def _attitude_jacobian(primary_b: Array, second_b: Array, primary_n: Array, seco
 
 
 @njit
-def _accumulate(q_0b: Array, angle_0: Array, dv_0: Array, dtheta: Array, dv: Array) -> None:
-    """Turn ``q_0b`` by increments (N, 3) and add them up in its axes, each taken half-way through its own turn."""
+def _accumulate(q_0b: Array, angle_0: Array, dv_0: Array, turned_0: Array, dtheta: Array, dv: Array, dt: Array) -> None:
+    """Turn ``q_0b`` by increments (N, 3) and add them up in its axes, each taken half-way through its own turn; into
+    ``turned_0`` (3, 3) the integral of C_0b.
+    """
     for k in range(len(dtheta)):
         turn = quat_from_rotvec(dtheta[k])
         after = quat_normalise(quat_multiply(q_0b, turn))
         turn[0] += 1.0  # half of it, when normalised
         middle = quat_multiply(q_0b, quat_normalise(turn))
         angle, push = quat_rotate(middle, dtheta[k]), quat_rotate(middle, dv[k])
+        C_0b = dcm_from_quat(middle)
         for i in range(3):
             angle_0[i] += angle[i]
             dv_0[i] += push[i]
+            for j in range(3):
+                turned_0[i, j] += C_0b[i, j] * dt[k]
         for i in range(4):
             q_0b[i] = after[i]

@@ -145,9 +145,9 @@ def is_placed(log: Log) -> bool:
 
 def _heading(log: Log) -> str:
     """The line that says where a vehicle without magnetometer points at the start: as its autopilot thought."""
-    q_nb = log.solution.columns.get("q_nb") if log.solution is not None else None
-    known = np.flatnonzero(np.isfinite(q_nb).all(axis=1)) if q_nb is not None else ()
-    if q_nb is None or not len(known):
+    q_nb = log.solution.columns.get("q_nb", np.empty((0, 4))) if log.solution is not None else np.empty((0, 4))
+    known = np.flatnonzero(np.isfinite(q_nb).all(axis=1))
+    if not len(known):
         return "heading_deg = 0  # at the start: nothing in the log tells it: give it"
     heading = math.degrees(euler_from_quat(q_nb[known[0]])[2])
     return f"heading_deg = {heading:.0f}  # at the start, as its autopilot thought: there is no magnetometer"

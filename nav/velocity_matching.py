@@ -1,0 +1,154 @@
+"""The heading of what has no compass and is too slow for its course, by the accelerations that change its velocity.
+
+Between two fixes the specific force, carried into the axes of one moment by the gyros, is the change of velocity less
+gravity: a vector known in body axes and in n (Wu and Pan, Velocity/Position Integration Formula, Part I: Application to
+In-Flight Coarse Alignment, IEEE Trans. Aerospace and Electronic Systems 49 (2), 2013). One pair is hardly more than
+gravity, which tells no heading. Of several in a row, k = 1 ... K, what is not gravity does,
+
+    y_k = C_n0 (exp(-[B_k b x]) s_k - A_k a),
+
+with s_k (3,) that push in the axes 0 of the newest moment, y_k (3,) the same in n, B_k and A_k (3, 3) the integrals of
+C_0b up to the middle of the pair and over it, and b, a the biases of gyros and accelerometers: of small units they tilt
+0 by degrees meanwhile. C_n0, b and a follow by least squares (Gauss-Newton), b and a with what is known of them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from nav.samples import Array
+
+PAIRS, LEAST = 15, 8  # the last ones that are used, and how many it takes
+STARTS, STEPS = 8, 5  # headings that it is tried from, steps from each
+SIGMA_LIMIT = 0.25  # a heading that is known less well is none [rad]
+EXPLAINED = 0.7  # share of the squares of horizontal pushes that a heading must explain, or they are the receiver's
+UNLIKE, ELSEWHERE = 16.0, 1.0  # by which a heading so far away must be worse, in squares of sigma [rad]
+BETTER = 9.0  # times smaller than told residuals may show squares of sigma to be
+AT_BEST = 0.15  # of a heading so found: latency and scale that nobody knows [rad]
+
+
+class _Pair(NamedTuple):
+    push_0: Array  # (3,) integral of specific force [m/s]
+    over: Array  # (3, 3) integral of C_0b over the pair [s]
+    before: Array  # (3, 3) and up to its middle
+    push_n: Array  # (3,)
+    sigma: float  # of any axis [m/s]
+
+
+class _Fit(NamedTuple):
+    cost: float
+    level_cost: float  # of horizontal residuals, and of what was known of biases
+    C_n0: Array
+    variance: float  # of the heading [rad^2]
+
+
+class VelocityMatching:
+    """Collects pairs of pushes, one after the other without a gap, until they tell a heading.
+
+    ``gyro_sigma`` [rad/s] and ``accel_sigma`` [m/s^2] are those of the biases, each axis alike.
+    """
+
+    def __init__(self, gyro_sigma: float, accel_sigma: float) -> None:
+        self._weights = np.repeat([0.0, 1.0, 1.0], 3)
+        self._weights[3:6] /= max(gyro_sigma, 1e-9) ** 2
+        self._weights[6:] /= max(accel_sigma, 1e-9) ** 2
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew: the chain of attitudes is broken."""
+        self._pairs: list[_Pair] = []
+        self._C_0b, self._turned = np.eye(3), np.zeros((3, 3))  # of 0, the axes when it began
+
+    def add(self, C_1b: Array, push_1: Array, turned_1: Array, push_n: Array, sigma: float) -> None:
+        """Add what was felt since the last pair: in the axes 1 at its beginning, to which ``C_1b`` turns those of now,
+        the push (3,) [m/s] and the integral (3, 3) of C_1b [s]; in n, the change of velocity less gravity (3,) [m/s].
+        """
+        over = self._C_0b @ turned_1
+        self._pairs.append(_Pair(self._C_0b @ push_1, over, self._turned + 0.5 * over, push_n, sigma))
+        del self._pairs[:-PAIRS]
+        self._C_0b, self._turned = self._C_0b @ C_1b, self._turned + over
+
+    def north(self) -> tuple[Array, float] | None:
+        """North in the body axes of now (3,), and the 1-sigma of the heading [rad]; None while it is not known."""
+        if len(self._pairs) < LEAST:
+            return None
+        sigma = np.array([one.sigma for one in self._pairs])[:, None]
+        level = float(np.sum((np.array([one.push_n[:2] for one in self._pairs]) / sigma) ** 2))
+        if level * SIGMA_LIMIT**2 * BETTER < 1.0:  # not enough for it, whatever they fit
+            return None
+        fits = sorted((self._fit(2 * math.pi * k / STARTS) for k in range(STARTS)), key=lambda one: one.cost)
+        best = fits[0]
+        shown = max(1 / BETTER, best.level_cost / (2 * len(self._pairs) - 5))  # over what was told
+        C_nb = best.C_n0 @ self._C_0b
+        others = [one.cost for one in fits if abs(_heading(one.C_n0 @ self._C_0b @ C_nb.T)) > ELSEWHERE]
+        heading_sigma = math.hypot(math.sqrt(best.variance * shown), AT_BEST)
+        if (
+            heading_sigma > SIGMA_LIMIT
+            or best.level_cost > (1 - EXPLAINED) * level
+            or min(others, default=math.inf) - best.cost < UNLIKE * shown
+        ):
+            return None
+        return C_nb[0].copy(), heading_sigma
+
+    def _fit(self, heading: float) -> _Fit:
+        """Least squares from this turn [rad] of what is level on."""
+        f, over, before, y, sigmas = (np.array(column) for column in zip(*self._pairs, strict=True))
+        before = before - self._turned
+        sigma = sigmas[:, None]
+        C_n0 = _turn(np.array([0.0, 0.0, heading])) @ _between(f.sum(axis=0), y.sum(axis=0))
+        biases = np.zeros(6)
+        for step in range(STEPS + 1):
+            turned = _turned(f, -(before @ biases[:3]))
+            found = (turned - over @ biases[3:]) @ C_n0.T
+            left = (y - found) / sigma
+            if step == STEPS:
+                break
+            J = np.concatenate([-_skew(found), C_n0 @ _skew(turned) @ before, -(C_n0 @ over)], axis=2) / sigma[:, None]
+            N = np.einsum("kij,kil->jl", J, J) + np.diag(self._weights)
+            known = self._weights * np.concatenate([np.zeros(3), biases])
+            change = np.linalg.solve(N, np.einsum("kij,ki->j", J, left) - known)
+            C_n0 = _turn(change[:3]) @ C_n0
+            biases = biases + change[3:]
+        prior = float(self._weights[3:] @ biases**2)
+        return _Fit(
+            float(np.sum(left**2)) + prior, float(np.sum(left[:, :2] ** 2)) + prior, C_n0, float(np.linalg.inv(N)[2, 2])
+        )
+
+
+def _heading(C: Array) -> float:
+    return math.atan2(C[1, 0], C[0, 0])
+
+
+def _turn(angle: Array) -> Array:
+    """exp([angle x]) (3, 3)."""
+    return _turned(np.eye(3), np.broadcast_to(angle, (3, 3))).T
+
+
+def _turned(v: Array, angle: Array) -> Array:
+    """Vectors (K, 3) turned by angles (K, 3): Rodrigues' formula."""
+    size = np.linalg.norm(angle, axis=1, keepdims=True)
+    about = angle / np.maximum(size, 1e-12)
+    along = np.sum(about * v, axis=1, keepdims=True)
+    turned: Array = np.cos(size) * v + np.sin(size) * np.cross(about, v) + (1 - np.cos(size)) * along * about
+    return turned
+
+
+def _between(a: Array, b: Array) -> Array:
+    """The shortest turn (3, 3) that takes the direction of ``a`` to that of ``b``."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis = np.cross(a, b)
+    size = float(np.linalg.norm(axis))
+    if size < 1e-9:  # alike, or opposite, where any axis across will do
+        axis, size = np.cross(a, np.eye(3)[np.argmin(np.abs(a))]), 1.0
+        axis /= np.linalg.norm(axis)
+    return _turn(axis / size * math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b)))
+
+
+def _skew(v: Array) -> Array:
+    """[v x] (K, 3, 3) of vectors (K, 3)."""
+    matrix = np.zeros((len(v), 3, 3))
+    matrix[:, 2, 1], matrix[:, 0, 2], matrix[:, 1, 0] = v.T
+    return matrix - matrix.transpose(0, 2, 1)
