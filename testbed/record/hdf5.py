@@ -50,7 +50,7 @@ def create(
     """
     import h5py
 
-    _see_that_it_fits(path, plans, attributes, whole=contents is not None)
+    reserve(path, plans, attributes)
     with h5py.File(path, "w", libver=("earliest", "v110"), track_order=True) as file:
         for name, value in attributes.items():
             file.attrs[name] = value
@@ -66,24 +66,17 @@ def create(
                 yield
 
 
-def _see_that_it_fits(
-    path: Path, plans: Mapping[str, Plan], attributes: Mapping[str, str | int | float], whole: bool
-) -> None:
-    """Raise OSError when there is no room for the file: HDF5 can crash the process when it meets a full disk.
+def reserve(path: Path, plans: Mapping[str, Plan], attributes: Mapping[str, str | int | float]) -> None:
+    """Raise OSError when there is no room for the file and all its rows.
 
-    ``whole`` if all rows are written at once; otherwise only what is not left as a hole.
+    HDF5 must not meet the end of the disk itself: what it can't write when it closes a file ends the process.
     """
-    columns = [
-        (plan.capacity * column.row_bytes, name == plan.time_name)
-        for plan in plans.values()
-        for name, column in plan.columns.items()
-    ]
+    columns = [plan.capacity * column.row_bytes for plan in plans.values() for column in plan.columns.values()]
     structure = COLUMN_BYTES * (len(columns) + 16) + sum(len(str(value)) for value in attributes.values())
-    size = structure + sum(size for size, _ in columns)
     with path.open("wb") as file:
-        os.ftruncate(file.fileno(), size)
+        os.ftruncate(file.fileno(), structure + sum(columns))
         if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, structure + sum(size for size, is_time in columns if whole or is_time))
+            os.posix_fallocate(file.fileno(), 0, structure + sum(columns))
 
 
 def _dataset(group: h5py.Group, plan: Plan, name: str, values: Data | None) -> Any:

@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-COLUMN_OVERHEAD = 4096  # bytes of a file for each column, and for itself, beside the rows: a generous guess
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work, and twice as much when it is about to end
 UNTENDED_S = 5.0  # or this much of a live one, which writes when there is time, if there was none
 PIECE_S = 0.004  # what one piece of that work may take, on a busy machine
@@ -319,7 +318,6 @@ class Recorder:
         assert self.path is not None
         self._laying = None
         plans = {path: Plan(t.time_name, t.rows_now, dict(t.columns)) for path, t in self._tables.items()}
-        _reserve(_part(self.path), plans)
         for _ in create(_part(self.path), plans, self.attributes | {"complete": 1}, rows):
             pass
         with interrupts.held():  # from here on the rows are there, and the file that grew is not
@@ -359,7 +357,6 @@ class Recorder:
             )
             for path, table in self._tables.items()
         }
-        _reserve(_part(self.path), plans)
         yield from create(_part(self.path), plans, dict(self.attributes))
         new = _part(self.path).open("r+b", buffering=0)
         try:
@@ -415,18 +412,6 @@ def _reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return os.strerror(int(number[1])) if number else str(error).splitlines()[0]
-
-
-def _reserve(path: Path, plans: Mapping[str, Plan]) -> None:
-    """See that a file of these plans has room on the disk. Raises OSError when it has not.
-
-    HDF5 must not meet the end of the disk itself: what it can't write when it closes a file ends the process.
-    """
-    if not hasattr(os, "posix_fallocate"):
-        return
-    size = sum(plan.capacity * c.row_bytes + COLUMN_OVERHEAD for plan in plans.values() for c in plan.columns.values())
-    with path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size + COLUMN_OVERHEAD)
 
 
 def _part(path: Path) -> Path:

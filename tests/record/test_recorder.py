@@ -29,8 +29,8 @@ from nav.samples import ImuSamples, Outcome, UpdateReport
 from testbed import interrupts
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
+from testbed.record import hdf5, tables
 from testbed.record import recorder as record
-from testbed.record import tables
 from testbed.record.columns import AXES
 from testbed.record.reader import load
 from testbed.record.recorder import Recorder
@@ -613,7 +613,7 @@ def test_a_disk_that_is_full_from_any_write_on_leaves_the_last_flush(
         with pytest.raises(UserError, match=r"run\.nc: can't write the record \(No space left on device\)"):
             recorder.flush()
     left = 0
-    monkeypatch.setattr(record, "_reserve", full)
+    monkeypatch.setattr(hdf5, "reserve", full)
     with pytest.raises(UserError, match="can't write the record"):
         recorder.close()
     recorder.close()
@@ -635,7 +635,7 @@ def test_an_error_of_another_kind_at_the_end_leaves_every_row(tmp_path: Path, mo
     def exhausted(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(record, "_reserve", exhausted)
+    monkeypatch.setattr(hdf5, "reserve", exhausted)
     with pytest.raises(MemoryError):
         recorder.finish()
     recorder.close()
@@ -657,7 +657,7 @@ def test_rows_since_the_last_flush_go_where_they_can_when_there_is_no_room_for_a
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(record, "_reserve", full)
+    monkeypatch.setattr(hdf5, "reserve", full)
     with pytest.raises(UserError, match="No space left"):
         recorder.close()
     assert len(load(path)["truth"]["time"]) == 23

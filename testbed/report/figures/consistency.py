@@ -41,7 +41,7 @@ MOST_DOTS = 4000  # of one aid
 OUTCOMES = {
     Outcome.OUTSIDE_GATE: "outside the gate",
     Outcome.ISOLATED: "sensor isolated",
-    Outcome.WITHHELD: "withheld: probation, or refused with another part",
+    Outcome.WITHHELD: "withheld: probation, attitude lost, or refused with another part",
     Outcome.WEAKENED: "weight zero",
     Outcome.OUT_OF_RANGE: "out of range",
     Outcome.UNSOUND: "unsound",
