@@ -150,7 +150,7 @@ def _heading(log: Log) -> str:
     if not len(known):
         return "heading_deg = 0  # at the start: nothing in the log tells it: give it"
     heading = math.degrees(euler_from_quat(q_nb[known[0]])[2])
-    return f"heading_deg = {heading:.0f}  # at the start, as its autopilot thought: there is no magnetometer"
+    return f"heading_deg = {round(heading)}  # at the start, as its autopilot thought: there is no magnetometer"
 
 
 def _columns(truth: LogTruth) -> Mapping[str, Any]:
