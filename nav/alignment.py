@@ -48,7 +48,8 @@ UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its fiel
 FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
-LONGEST = 3.0  # times the shortest pair of vectors, beyond which it is none for matching
+LONGEST_S = 6.0  # beyond which gyros drift too far within a pair of vectors for matching
+NORTH = np.array([1.0, 0.0, 0.0])
 ACCELERATION_ERROR = 0.1  # of such a pair: latency, scale and tilt of what manoeuvres [m/s^2]
 STEP = 1e-6  # of each input, relative, in the differences
 
@@ -217,10 +218,10 @@ class Alignment:
             self._matching.forget()
             self._restart(fix)
             return None
-        if duration_s * LONGEST < T:
-            self._matching.forget()
         field_bias = self._field_bias(field_n)
         heading = self._heading(C_b0, first, fix, T, field_n, field_bias)
+        if heading is None and not self._compassing:
+            heading = self._matched(C_b0, swing_b, first, fix, T)
         if heading is None:
             if not self._compassing:
                 self._restart(fix)
@@ -295,19 +296,26 @@ class Alignment:
         self._compassing = at_rest and left <= HEADING_SIGMA_LIMIT
         if self._compassing:
             return self._gyrocompass(C_b0, earth_n, T)
-        sigma_v = math.sqrt(float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2)))
-        sigma = math.hypot(sigma_v, ACCELERATION_ERROR * T)
-        self._matching.add(C_b0.T, self._dv_0, self._turned_0, self._specific_force_n(first, fix, T), sigma)
-        matched = self._matching.north()
-        if matched is not None:
-            north_b, matched_sigma = matched
-            return _Heading(north_b, np.array([1.0, 0.0, 0.0]), 0.0, heading_sigma=matched_sigma)
         lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
         slow = (
             f"gyrocompassing would leave {math.degrees(left):.3g} deg" if at_rest else "it is too slow for the course"
         )
         self.problem = f"{lacking}, and {slow}: waiting for flight, or for accelerations that tell the heading"
         return None
+
+    def _matched(self, C_b0: Array, swing_b: Array, first: GnssSample, fix: GnssSample, T: float) -> _Heading | None:
+        """By what was felt between the fixes, and before; ``swing_b`` (3,) [m/s] is what the antenna swung faster."""
+        sigma_v = math.sqrt(float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2)))
+        sigma = math.hypot(sigma_v, ACCELERATION_ERROR * T) if T <= LONGEST_S else math.inf
+        push_0 = self._dv_0 + C_b0.T @ swing_b
+        self._matching.add(C_b0.T, push_0, self._turned_0, self._specific_force_n(first, fix, T), sigma)
+        found = self._matching.north()
+        return None if found is None else _Heading(found[0], NORTH, 0.0, heading_sigma=found[1])
+
+    @property
+    def matching(self) -> bool:
+        """Whether it has no other heading than what accelerations may tell, which takes longer."""
+        return self._matching.under_way
 
     def _gyrocompass(self, C_b0: Array, earth_n: Array, T: float) -> _Heading | None:
         level_rate = abs(float(earth_n[0]))

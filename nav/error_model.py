@@ -171,8 +171,8 @@ class ImuModel:
 
     @property
     def in_motion(self) -> Array:
-        """Squares (4,) of the shares by which noise follows motion and vibration, and, where increments are missing, an
-        unseen motion: whatever the sensors are, of that it is all.
+        """Squares (4,) of the shares by which noise follows motion and vibration; last a 1, for the whole of a motion
+        that nobody sees where increments are missing. Filters that share one have each of them over its share.
         """
         return np.array([self.gyro_motion, self.accel_motion, self.vibration, 1.0]) ** 2
 

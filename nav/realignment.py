@@ -19,7 +19,7 @@ LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
 GRAVITY = 9.8  # [m/s^2]
 DV, DP = range(VEL, VEL + 3), range(POS, POS + 3)
 WAIT_S = 5.0  # the longest that samples are withheld for an alignment,
-LONG_S = 30.0  # and that one goes on, though the tilt seems to be known again
+LONG_S = 30.0  # the same of one that has no compass, and that one goes on though the tilt seems to be known again
 ELSEWHERE = 5.0  # sigmas
 
 
@@ -41,8 +41,8 @@ class Realignment:
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
     did not. So the fixes of one receiver, and samples of the ``sensors``, go to an alignment, which is as ``alignment``
     at its beginning and knows nothing of before. All are withheld from the filters; where it comes to no end in
-    `WAIT_S` from the last missing increment on, they are used as well as may be. The same where it contradicts the
-    position that was known.
+    `WAIT_S` from the last missing increment on, or in `LONG_S` without a compass, they are used as well as may be. The
+    same where it contradicts the position that was known.
     """
 
     def __init__(self, alignment: Alignment, sensors: Container[str], reference: Reference) -> None:
@@ -88,7 +88,8 @@ class Realignment:
             if initial is not None:
                 estimator.start(initial)
                 return []
-        if waited <= WAIT_S:
+        patience = LONG_S if self._alignment.matching else WAIT_S
+        if waited <= patience:
             self._widen(state.P, filters, sample.t)
             return estimator.refuse(sample, "the attitude is lost: aligning anew", Outcome.WITHHELD)
         if waited > LONG_S and not lost:  # it has come back without

@@ -25,6 +25,7 @@ FIXED = 67  # numbers in a `State` of any size
 SAME = 1e-9  # rates this close, relative, are those of one increment
 BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # by which those before a gap are off in the end [rad/s, m/s^2]
 CHANGE_S = 0.2  # in which they are by half of that
+ANYHOW = math.pi**2 / 3  # variance of an angle of which nothing is known [rad^2]
 SHAKEN_S = 1.0  # over which the noise of increments is averaged
 
 
@@ -305,12 +306,15 @@ def propagate(
                 elapsed[2] = 0.0
             else:
                 bad = k
-                grown = unseen(elapsed[2] + T) - unseen(elapsed[2])
+                if rates[1, 0] == 0.0 and rates[1, 1] == 0.0 and rates[1, 2] == 0.0:  # it has felt nothing yet
+                    weigh(rates[1], q_nb, lla)
+                turned = turn_unseen(elapsed[2] + T) - turn_unseen(elapsed[2])
+                pushed = push_unseen(elapsed[2] + T) - push_unseen(elapsed[2])
                 elapsed[2] += T
                 for f in range(filters):
                     for i in range(3):
-                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * BRIDGED_RATE**2 * grown
-                        P[f, VEL + i, VEL + i] += in_motion[f, 3] * BRIDGED_FORCE**2 * grown
+                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * turned
+                        P[f, VEL + i, VEL + i] += in_motion[f, 3] * pushed
             for i in range(3):
                 angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
                 push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
@@ -330,13 +334,28 @@ def propagate(
 
 
 @inlined
-def unseen(gap: float) -> float:
-    """By what an angle may be off after so many seconds without increments, squared, over `BRIDGED_RATE` squared.
+def push_unseen(gap: float) -> float:
+    """Variance [m^2/s^2] of what a velocity is off by after so many seconds without increments.
 
-    The rate before the gap is held on, and off by a share T / (T + `CHANGE_S`) of that after T seconds: so it is with
-    small aeroplanes, from 0.02 s to 2 s. The same of a velocity over `BRIDGED_FORCE`.
+    The force before the gap is held on, and off by a share T / (T + `CHANGE_S`) of `BRIDGED_FORCE` after T seconds: so
+    it is with small aeroplanes, from 0.02 s to 2 s.
     """
-    return (gap * gap / (gap + CHANGE_S)) ** 2
+    return (BRIDGED_FORCE * gap * gap / (gap + CHANGE_S)) ** 2
+
+
+@inlined
+def turn_unseen(gap: float) -> float:
+    """The same of an angle [rad^2], by `BRIDGED_RATE`."""
+    return min((BRIDGED_RATE * gap * gap / (gap + CHANGE_S)) ** 2, ANYHOW)
+
+
+@inlined
+def weigh(force: Array, q_nb: Array, lla: Array) -> None:
+    """Let a specific force (3,) [m/s^2] of body axes be that of a body which is not accelerated."""
+    w, x, y, z = q_nb[0], q_nb[1], q_nb[2], q_nb[3]
+    g = gravity(lla[0], lla[2])
+    force[0], force[1] = -2 * (x * z - w * y) * g, -2 * (y * z + w * x) * g
+    force[2] = -(1 - 2 * (x * x + y * y)) * g
 
 
 @inlined

@@ -7,9 +7,10 @@ gravity, which tells no heading. Of several in a row, k = 1 ... K, what is not g
 
     y_k = C_n0 (exp(-[B_k b x]) s_k - A_k a),
 
-with s_k (3,) that push in the axes 0 of the newest moment, y_k (3,) the same in n, B_k and A_k (3, 3) the integrals of
-C_0b up to the middle of the pair and over it, and b, a the biases of gyros and accelerometers: of small units they tilt
-0 by degrees meanwhile. C_n0, b and a follow by least squares (Gauss-Newton), b and a with what is known of them.
+with 0 the body axes at the beginning as the gyros carry them, s_k (3,) the push in these and y_k (3,) in n, A_k (3, 3)
+the integral of C_0b over the pair and B_k from now back to its middle (negative), b and a the biases of gyros and
+accelerometers: of small units they tilt 0 by degrees meanwhile. C_n0, b and a follow by least squares (Gauss-Newton),
+b and a with what is known of them; the derivative by b is of first order in the turn.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ AT_BEST = 0.15  # of a heading so found: latency and scale that nobody knows [ra
 class _Pair(NamedTuple):
     push_0: Array  # (3,) integral of specific force [m/s]
     over: Array  # (3, 3) integral of C_0b over the pair [s]
-    before: Array  # (3, 3) and up to its middle
+    before: Array  # (3, 3) the same from the beginning of the chain up to the middle of the pair
     push_n: Array  # (3,)
     sigma: float  # of any axis [m/s]
 
@@ -42,7 +43,7 @@ class _Fit(NamedTuple):
     cost: float
     level_cost: float  # of horizontal residuals, and of what was known of biases
     C_n0: Array
-    variance: float  # of the heading [rad^2]
+    variance: float  # of the heading [rad^2], if residuals are as told
 
 
 class VelocityMatching:
@@ -62,17 +63,24 @@ class VelocityMatching:
         self._pairs: list[_Pair] = []
         self._C_0b, self._turned = np.eye(3), np.zeros((3, 3))  # of 0, the axes when it began
 
+    @property
+    def under_way(self) -> bool:
+        """Whether there are pairs."""
+        return bool(self._pairs)
+
     def add(self, C_1b: Array, push_1: Array, turned_1: Array, push_n: Array, sigma: float) -> None:
         """Add what was felt since the last pair: in the axes 1 at its beginning, to which ``C_1b`` turns those of now,
-        the push (3,) [m/s] and the integral (3, 3) of C_1b [s]; in n, the change of velocity less gravity (3,) [m/s].
+        the push (3,) [m/s] and the integral (3, 3) of C_1b [s]; in n, the change of velocity less gravity (3,) [m/s],
+        of which ``sigma`` [m/s] is what any axis is wrong by. A pair of infinite sigma only carries the axes on.
         """
         over = self._C_0b @ turned_1
-        self._pairs.append(_Pair(self._C_0b @ push_1, over, self._turned + 0.5 * over, push_n, sigma))
-        del self._pairs[:-PAIRS]
+        if math.isfinite(sigma):
+            self._pairs.append(_Pair(self._C_0b @ push_1, over, self._turned + 0.5 * over, push_n, sigma))
+            del self._pairs[:-PAIRS]
         self._C_0b, self._turned = self._C_0b @ C_1b, self._turned + over
 
     def north(self) -> tuple[Array, float] | None:
-        """North in the body axes of now (3,), and the 1-sigma of the heading [rad]; None while it is not known."""
+        """North in the body axes of now (3,), and the 1-sigma of the heading [rad], `AT_BEST` included; or None."""
         if len(self._pairs) < LEAST:
             return None
         sigma = np.array([one.sigma for one in self._pairs])[:, None]

@@ -97,7 +97,9 @@ class Ahrs:
     @property
     def problem(self) -> str:
         """What the levelling is waiting for, empty once there is an attitude."""
-        return "" if self.aligned else "levelling: waiting for unaccelerated flight"
+        if self.aligned:
+            return ""
+        return "levelling" if self._any_motion is not None else "levelling: waiting for unaccelerated flight"
 
     def start(self, t: float, q_nb: Array) -> None:
         """Begin at a given attitude, known as well as the configuration's sigmas say, instead of levelling."""

@@ -11,7 +11,7 @@ from nav._jit import inlined, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.rotation import rotation_coefficients
 from nav.samples import Array
-from nav.state import BRIDGED_RATE, unseen
+from nav.state import turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 UNKNOWN = np.full(3, np.nan)
@@ -132,7 +132,7 @@ def propagate(
 ) -> int:  # fmt: skip
     """Attitude and the integrals over N increments in place; the last of them that was not usable, -1 for none.
 
-    These are bridged with the last sound rates; unseen, the body may have turned (`nav.state.unseen`).
+    These are bridged with the last sound rates; unseen, the body may have turned (`nav.state.turn_unseen`).
     q+ = exp(-w_ie dt / 2) q exp(dtheta / 2), and C_nb dv by the attitude half-way through the turn.
     """
     bad = -1
@@ -155,7 +155,7 @@ def propagate(
             elapsed[3] = 0.0
         else:
             bad = k
-            grown = BRIDGED_RATE**2 * (unseen(elapsed[3] + T) - unseen(elapsed[3]))
+            grown = turn_unseen(elapsed[3] + T) - turn_unseen(elapsed[3])
             elapsed[3] += T
             for i in range(3):
                 P[PHI + i, PHI + i] += grown

@@ -23,7 +23,7 @@ import numpy as np
 from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
-from testbed.feeds.reference import believed, doubt
+from testbed.feeds.reference import believed, doubt, is_flown
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
@@ -65,9 +65,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     found = {name: len(rows) for name, rows in messages.items()}
     require_imu(path, imus, found, NEEDED)
     samples = _aiding(units, notes)
-    solution = _solution(messages)
-    if solution is not None:
-        solution = believed(solution, _first_fix(samples))
+    solution = _solution(messages, _first_fix(samples))
     log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
         date=_date(units), remark=doubt(solution, samples),
@@ -234,8 +232,11 @@ def _first_fix(samples: Mapping[str, Samples]) -> float:
     return min((one.t for one in fixes if one.has_fix), default=math.inf if fixes else -math.inf)
 
 
-def _solution(messages: Mapping[str, list[dict[str, Any]]]) -> Reference | None:
-    """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position."""
+def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Reference | None:
+    """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
+
+    Position and velocity from ``since`` [s] on (`testbed.feeds.reference.believed`).
+    """
     source = next((name for name in SOLUTIONS if name in messages), None)
     if source is None:
         return None
@@ -257,14 +258,14 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]]) -> Reference | None:
             continue
         at, kept_at = _times(name, place, [])
         lat, lon = (np.radians(place[key][kept_at]) for key in ("Lat", "Lng"))
-        known = (lat != 0) | (lon != 0)
+        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, place["Alt"][kept_at])
         if known.sum() > 1:
             at, values = at[known], (lat[known], np.unwrap(lon[known]), place["Alt"][kept_at][known])
             for key, column in zip(("lat", "lon", "h"), values, strict=True):
                 columns[key] = np.interp(t, at, column, left=np.nan, right=np.nan)
             columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
             break
-    return Reference(f"the autopilot's own solution ({source})", t, columns)
+    return believed(Reference(f"the autopilot's own solution ({source})", t, columns), since)
 
 
 def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:

@@ -105,6 +105,8 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
     own = sections(found)
     aids = [name for name, keys in own.items() if keys["kind"] != "imu"]
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
+    if log.receiver is not None:
+        first["gnss"] = log.receiver  # the first with a fix
     lines = [
         f"title = {json.dumps(log.path.name)}",
         f"duration_s = {math.floor(10 * end) / 10:.1f}",

@@ -18,7 +18,7 @@ from testbed.motion.table import COLUMNS, TruthBlock
 
 SAME_TIME_S = 1e-6
 LONGEST_STEP_S = 1.5  # between rows that are joined: a receiver of 1 Hz may be late
-DOUBTED_M = 10.0  # of a solution from its receiver: more than both of them and a usual latency are off
+DOUBTED_M, LATE_S = 10.0, 0.5  # of a solution from its receiver: more than both are off, and the receiver is late
 STEPS = 3.0  # or so many of its own, where it is slower
 KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
 
@@ -154,7 +154,8 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
             off = np.hypot(*position_difference_n(at.lat, at.lon, at.h, *there)[:, :2].T)
             off = off[np.isfinite(off)]
             rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
-            if rms <= DOUBTED_M:
+            speed = float(np.nan_to_num(np.nanmedian([math.hypot(*one.v_n[:2]) for one in fixes])))
+            if rms <= DOUBTED_M + LATE_S * speed:
                 return ""
             return (
                 f"{solution.name} is {rms:.3g} m (RMS) from {name}, {off.max():.3g} m at most:"

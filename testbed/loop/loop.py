@@ -344,7 +344,7 @@ class _Passage:
         remarks += [f"{name} has ended: {self.lanes[name].failure}" for name in self.lanes if name in self.ended]
         for name, lane in self.lanes.items():
             if lane.problem:
-                remarks.append(f"{name} has not aligned: {lane.problem}")
+                remarks.append(f"{name} is not aligned at the end: {lane.problem}")
                 self.told.emit(end, "warning", remarks[-1])
         self.director.conclude(end)
         self.recorder.attributes |= self.feed.origin  # with why a far end failed

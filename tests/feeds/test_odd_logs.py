@@ -165,7 +165,7 @@ def test_what_an_autopilot_thinks_before_a_fix_is_not_believed(until: float, fie
     messages = [one for one in circling() if fields or one[0] != "MAG"]
     log = read(unfixed(with_solution(messages, garbage_until=5.0), until), tmp_path)
     assert log.solution is not None
-    known = np.isfinite(log.solution.columns["lat"])
+    known = np.isfinite(log.solution.columns.get("lat", np.full(len(log.solution.t), np.nan)))
     assert np.array_equal(known, log.solution.t >= until)
     assert np.array_equal(np.isfinite(log.solution.columns["v_n"]).all(axis=1), known)
     text = draft.scenario(survey(log), tmp_path / "x", None)
@@ -188,6 +188,27 @@ def test_the_command_says_what_to_give(
         assert ("where the flight was" in capsys.readouterr().out) == told
 
 
+@pytest.mark.parametrize("receiver", [True, False])
+def test_nothing_is_interpolated_from_nowhere(receiver: bool, tmp_path: Path) -> None:
+    """Positions come once a second, attitudes five times."""
+    told = [one for one in with_solution(circling(), garbage_until=9.9) if one[0] != "POS" or one[1][0] % 10**6 == 0]
+    messages = unfixed(told, 10.0) if receiver else [one for one in told if one[0] != "GPS"]
+    log = read(messages, tmp_path)
+    assert log.solution is not None
+    lat = np.degrees(log.solution.columns["lat"])
+    assert np.array_equal(np.isfinite(lat), log.solution.t >= 10.0)
+    assert np.nanmax(np.abs(lat - 47)) < 0.1
+
+
+def test_a_draft_takes_the_receiver_that_has_a_fix(tmp_path: Path) -> None:
+    second = [
+        (name, (values[0], 1, *values[2:])) for name, values in circling() if name == "GPS"
+    ]  # of the same kind, the second unit
+    messages = sorted([*unfixed(circling(), 100.0), *second], key=lambda one: one[1][0])
+    text = draft.scenario(survey(read(messages, tmp_path)), tmp_path / "x", None)
+    assert 'aids = ["gnss2"' in text
+
+
 def test_places_where_no_aircraft_is_are_not_believed_without_a_receiver_either(tmp_path: Path) -> None:
     log = read([one for one in with_solution(circling(), garbage_until=5.0) if one[0] != "GPS"], tmp_path)
     assert log.solution is not None
@@ -198,7 +219,7 @@ def test_places_where_no_aircraft_is_are_not_believed_without_a_receiver_either(
 
 @pytest.mark.parametrize(("off_deg", "told"), [(0.0, False), (0.001, True)])
 def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, told: bool, tmp_path: Path) -> None:
-    log = read(with_solution(circling(), off_deg), tmp_path)
+    log = read(with_solution(circling(), off_deg), tmp_path)  # 12 m/s, for which 16 m are allowed
     assert ("111 m (RMS) from gnss" in log.remark) == told
     text = draft.scenario(survey(log), tmp_path / "x", None)
     (tmp_path / "flight.toml").write_text(text)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from nav.alignment import InitialState
 from nav.earth import gravity
@@ -135,3 +136,26 @@ def test_a_gap_widens_what_is_claimed_by_what_may_happen_unseen(shares, gap_s):
     one = slice(0, 1)
     reference.run(state, ImuSamples(np.array([7.01]), dt[one], lost[one], lost[one]), settle=True)
     assert state.P[0, PHI, PHI] - after[PHI, PHI] < 1e-6 + (0.5 * 0.01**2 / 0.21) ** 2  # the next gap is one by itself
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 1.0])
+def test_before_anything_was_felt_a_body_is_not_accelerated(gap_s):
+    """Lost from the start on: held by gravity, however it lies, and not in free fall."""
+    reference = Reference([ErrorModel(QUIET)], [1.0], 10, None)
+    q_nb = Rotation.from_euler("ZYX", [1.0, 0.3, -0.5]).as_quat(scalar_first=True)
+    state = reference.start(InitialState(0.0, LAT, 0.1, 300.0, np.zeros(3), q_nb, np.zeros((MOTION, MOTION))))
+    dt = np.full(round(gap_s * 100), 0.01)
+    lost = np.full((len(dt), 3), np.nan)
+    reference.run(state, ImuSamples(np.cumsum(dt), dt, lost, lost), settle=True)
+    assert np.abs(state.v_n).max() < 1e-3
+    assert np.abs(state.v_n).max() < np.sqrt(state.P[0].diagonal()[VEL : VEL + 3]).min()
+
+
+def test_an_angle_is_no_more_than_unknown():
+    reference = Reference([ErrorModel(QUIET)], [1.0], 10, None)
+    start = InitialState(0.0, LAT, 0.1, 300.0, np.zeros(3), np.array([1.0, 0, 0, 0]), np.zeros((MOTION, MOTION)))
+    state = reference.start(start)
+    lost = np.full((6000, 3), np.nan)
+    dt = np.full(6000, 0.01)
+    reference.run(state, ImuSamples(np.cumsum(dt), dt, lost, lost), settle=True)
+    np.testing.assert_allclose(np.sqrt(state.P[0].diagonal()[PHI : PHI + 3]), math.pi / math.sqrt(3), rtol=0.01)

@@ -8,7 +8,8 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from worlds.ins import DEG, Flight, error, feed, gnss, imu
+from worlds.federated import true_start
+from worlds.ins import DEG, Flight, barometer, error, feed, gnss, imu
 
 from nav.aids import BarometerAid, GnssAid
 from nav.earth import radii
@@ -169,6 +170,50 @@ def test_a_filter_without_a_compass_finds_its_heading_below_the_speed_of_the_cou
     by_time = {round(one.t, 3): one for one in told[0]}
     for one in told[1]:
         assert np.array_equal(one.q_nb, by_time[round(one.t, 3)].q_nb, equal_nan=True)
+
+
+@pytest.mark.parametrize("gap_s", [2.0, 10.0, 30.0])
+@pytest.mark.parametrize("seed", [700, 701])
+def test_after_a_gap_it_waits_for_its_heading_and_is_not_too_sure(gap_s, seed):
+    """Corrected along wrong axes while it waited, one was 90 m off at a claim of metres, and kept to it."""
+    rng = np.random.default_rng(seed)
+    truth = hovering(100 + gap_s, rng)
+    made, *_ = imu(truth, HOBBY, rng)
+    lost = (made.t > 60) & (made.t <= 60 + gap_s)
+    made.dtheta[lost] = made.dv[lost] = np.nan
+    ins = Ins(InsConfig(HOBBY, (GnssAid(), BarometerAid())))
+    ins.start(true_start(truth))
+    samples = gnss(truth, np.random.default_rng(seed), 5.0) + barometer(truth, np.random.default_rng(seed))
+    for one in feed(FusionHorizon(ins), made, samples, 1.0)[0]:
+        wrong, sigma = error(one, truth), np.sqrt(np.diag(one.covariance))
+        assert (np.abs(wrong) < 5.5 * sigma).all(), one.t
+        if one.t > 60 + gap_s + 25:
+            assert np.hypot(*wrong[:2]) < 2.0
+            assert abs(wrong[8]) < 10 * DEG
+
+
+def test_an_antenna_that_swings_is_reckoned_with():
+    rng = np.random.default_rng(5)
+    truth, arm_b = hovering(60, rng), (-3.0, 0.0, 0.0)
+    made, *_ = imu(truth, HOBBY, rng)
+    ins = Ins(InsConfig(HOBBY, (GnssAid(arm_b=arm_b), BarometerAid())))
+    estimates, _ = feed(FusionHorizon(ins), made, gnss(truth, rng, 5.0, arm_b=arm_b), 1.0)
+    known = [one for one in estimates if math.isfinite(one.lat)]
+    assert known[0].t < 30
+    assert abs(error(known[0], truth)[8]) < 15 * DEG
+
+
+def test_a_slow_receiver_tells_it_too():
+    """Each 5 s; with outages of 20 s, which the gyros bridge."""
+    rng = np.random.default_rng(6)
+    truth = hovering(150, rng)
+    made, *_ = imu(truth, HOBBY, rng)
+    ins = Ins(InsConfig(HOBBY, (GnssAid(), BarometerAid())))
+    fixes = [one for one in gnss(truth, rng, 0.2) if not 20 < one.t < 40]
+    estimates, _ = feed(FusionHorizon(ins), made, fixes, 10.0)
+    known = [one for one in estimates if math.isfinite(one.lat)]
+    assert known[0].t < 100
+    assert abs(error(known[0], truth)[8]) < 3 * math.sqrt(known[0].covariance[8, 8])
 
 
 def test_one_that_hovers_still_says_what_it_waits_for():
