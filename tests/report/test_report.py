@@ -181,7 +181,7 @@ def test_refused_innovations_have_the_colour_of_their_outcome() -> None:
         "gate",
         "outside the gate",
         "sensor isolated",
-        "withheld: probation, or refused with another part",
+        "withheld: probation, attitude lost, or refused with another part",
     ]
     assert "out of range" not in told
 
