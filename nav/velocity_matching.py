@@ -28,6 +28,7 @@ SIGMA_LIMIT = 0.25  # a heading that is known less well is none [rad]
 EXPLAINED = 0.7  # share of the squares of horizontal pushes that a heading must explain, or they are the receiver's
 UNLIKE, ELSEWHERE = 16.0, 1.0  # by which a heading so far away must be worse, in squares of sigma [rad]
 BETTER = 9.0  # times smaller than told residuals may show squares of sigma to be
+DAMPING = 1e-6  # of a turn that nothing tells [1/rad^2]
 AT_BEST = 0.15  # of a heading so found: latency and scale that nobody knows [rad]
 
 
@@ -53,7 +54,7 @@ class VelocityMatching:
     """
 
     def __init__(self, gyro_sigma: float, accel_sigma: float) -> None:
-        self._weights = np.repeat([0.0, 1.0, 1.0], 3)
+        self._weights = np.repeat([DAMPING, 1.0, 1.0], 3)
         self._weights[3:6] /= max(gyro_sigma, 1e-9) ** 2
         self._weights[6:] /= max(accel_sigma, 1e-9) ** 2
         self.forget()
@@ -93,13 +94,12 @@ class VelocityMatching:
         C_nb = best.C_n0 @ self._C_0b
         others = [one.cost for one in fits if abs(_heading(one.C_n0 @ self._C_0b @ C_nb.T)) > ELSEWHERE]
         heading_sigma = math.hypot(math.sqrt(best.variance * shown), AT_BEST)
-        if (
-            heading_sigma > SIGMA_LIMIT
-            or best.level_cost > (1 - EXPLAINED) * level
-            or min(others, default=math.inf) - best.cost < UNLIKE * shown
-        ):
-            return None
-        return C_nb[0].copy(), heading_sigma
+        believed = (
+            heading_sigma <= SIGMA_LIMIT
+            and best.level_cost <= (1 - EXPLAINED) * level
+            and min(others, default=math.inf) - best.cost >= UNLIKE * shown
+        )
+        return (C_nb[0].copy(), heading_sigma) if believed else None
 
     def _fit(self, heading: float) -> _Fit:
         """Least squares from this turn [rad] of what is level on."""

@@ -104,6 +104,17 @@ def test_noise_tells_nothing(strength):
         assert matched(made, 0.5 * DEG, 0.1) is None
 
 
+@pytest.mark.parametrize("weight", [9.8, 0.0])
+def test_without_any_error_or_in_free_fall_there_is_nothing_to_tell_either(weight):
+    """At rest, where no turn about the vertical makes a difference; and where no direction is told at all."""
+    rng = np.random.default_rng(0)
+    still = np.array([0.0, 0.0, -2 * weight])
+    with np.errstate(all="ignore"):
+        made = [(np.eye(3), still, 2 * np.eye(3), still + 0.3 * rng.normal(size=3), 0.3) for _ in range(15)]
+        assert matched(made, 1e-6, 1e-6) is None
+        assert matched([(*one[:3], one[1], 0.3) for one in made], 1e-6, 1e-6) is None
+
+
 def test_velocities_that_are_worse_than_told_are_not_believed():
     made = []
     for seed in range(40):
