@@ -13,9 +13,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from types import FrameType
 
 GRACE_S = 2.0  # to close files and to end other processes
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+AGAIN_S = 0.01
+# What kernels call as they return, where most signals are heard: what is raised there becomes a SystemError of theirs.
+CALLED_BACK = ("_numba_unpickle",)
 _SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
 
 _left: list[Callable[[], str]] = []  # what the contexts that are open leave behind, the innermost last
@@ -59,8 +63,11 @@ def heeded() -> Iterator[None]:
     os.set_blocking(tell, False)
     interrupted = False
 
-    def interrupt(number: int, frame: object) -> None:
+    def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal interrupted
+        if frame is not None and frame.f_code.co_name in CALLED_BACK:
+            threading.Timer(AGAIN_S, os.kill, (os.getpid(), number)).start()
+            return
         interrupted = True
         for one in mine:
             signal.signal(one, signal.SIG_IGN)

@@ -102,3 +102,28 @@ with interrupts.heeded():
     )  # fmt: skip
     assert ended.stdout.split() == ["held", "closed"]
     assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
+
+
+def test_an_interrupt_that_is_heard_in_a_kernel_is_raised_when_it_has_returned() -> None:
+    """A kernel that boxes what it returns calls Python, where the signal is heard: raised there it was a traceback."""
+    script = """
+import os, signal, time
+from numba.core import serialize
+from testbed import interrupts
+
+called = serialize._numba_unpickle.__code__.co_name
+
+def wait():
+    os.kill(os.getpid(), signal.SIGTERM)
+    for _ in range(1000):
+        pass
+    print("returned", flush=True)
+
+wait.__code__ = wait.__code__.replace(co_name=called)
+with interrupts.heeded():
+    wait()
+    time.sleep(10)
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
+    assert ended.stdout.split() == ["returned"]
+    assert (ended.returncode, ended.stderr) == (143, "testbed: interrupted\n")
