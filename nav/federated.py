@@ -159,6 +159,7 @@ class Federated:
         """Whether the sample's sensor is an aid of some filter, or it can still serve the alignment."""
         return sample.sensor in (self._aligning if self._state is None else self._users)
 
+    @np.errstate(over="ignore")  # of one that has diverged, as its covariances tell
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample valid at the estimator's own time, else ValueError; a report per part and filter that has it."""
         if isinstance(sample, GnssSample) and not sample.has_fix:

@@ -23,7 +23,7 @@ import numpy as np
 from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
-from testbed.feeds.reference import believed, doubt, is_flown
+from testbed.feeds.reference import doubt, is_flown
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
@@ -235,7 +235,7 @@ def _first_fix(samples: Mapping[str, Samples]) -> float:
 def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Reference | None:
     """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
 
-    Position and velocity from ``since`` [s] on (`testbed.feeds.reference.believed`).
+    Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
     """
     source = next((name for name in SOLUTIONS if name in messages), None)
     if source is None:
@@ -248,7 +248,7 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
     angles = [np.radians(rows[key][kept]) for key in ("Roll", "Pitch", "Yaw")]
     columns = {
         "q_nb": quaternions(*angles),
-        "v_n": np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")]),
+        "v_n": np.column_stack([np.where(t >= since, rows[key][kept], np.nan) for key in ("VN", "VE", "VD")]),
     }
     for name in PLACES:
         if name not in messages:
@@ -265,7 +265,7 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
                 columns[key] = np.interp(t, at, column, left=np.nan, right=np.nan)
             columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
             break
-    return believed(Reference(f"the autopilot's own solution ({source})", t, columns), since)
+    return Reference(f"the autopilot's own solution ({source})", t, columns)
 
 
 def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:

@@ -24,7 +24,7 @@ from nav.earth import isa_pressure, radii
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
-from testbed.feeds.reference import believed, doubt
+from testbed.feeds.reference import doubt, is_flown
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, spread
 from testbed.feeds.stamps import integrated, ordered
 from testbed.motion.logged import Stream
@@ -289,7 +289,9 @@ def _solution(topics: Topics) -> Reference | None:
         columns["lat"] = lat0 + there("x", "xy_valid") / (R_M + h0)
         columns["lon"] = lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0))
         columns["h"] = h0 - there("z", "z_valid")
-    return believed(Reference("the autopilot's own solution (EKF)", t, columns))
+        somewhere = is_flown(columns["lat"], columns["h"])
+        columns |= {name: np.where(somewhere, columns[name], np.nan) for name in ("lat", "lon", "h")}
+    return Reference("the autopilot's own solution (EKF)", t, columns)
 
 
 def _date(topics: Topics) -> dt.date | None:

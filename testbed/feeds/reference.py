@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -127,21 +126,6 @@ def is_flown(lat: npt.ArrayLike, h: npt.ArrayLike) -> npt.NDArray[np.bool_]:
     there: npt.NDArray[np.bool_] = np.abs(north) < math.radians(LATITUDE_LIMIT_DEG)
     there = there & (high >= ALTITUDES[0]) & (high <= ALTITUDES[1])
     return there
-
-
-def believed(solution: Reference, since: float = -math.inf) -> Reference:
-    """An autopilot's solution without positions where no aircraft is, and, before ``since`` [s], without any, and
-    without velocities: until it has heard of a receiver, what it logs of them means nothing.
-    """
-    columns = dict(solution.columns)
-    unknown = solution.t < since
-    if "lat" in columns:
-        there = is_flown(columns["lat"], columns["h"]) & ~unknown
-        for name in ("lat", "lon", "h"):
-            columns[name] = np.where(there, columns[name], np.nan)
-    if "v_n" in columns:
-        columns["v_n"] = np.where(unknown[:, None], np.nan, columns["v_n"])
-    return replace(solution, columns=columns)
 
 
 def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:

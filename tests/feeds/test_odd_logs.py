@@ -12,11 +12,12 @@ import pytest
 from worlds.log_writers import dataflash, dataflash_text, ulog, us
 
 import testbed.__main__ as cli
-from nav.samples import MagnetometerSample
+from nav.samples import FixType, GnssSample, MagnetometerSample
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import draft, formats
-from testbed.feeds.log import Log
+from testbed.feeds.log import Log, Reference
+from testbed.feeds.reference import doubt
 from testbed.feeds.stamps import pace
 from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
@@ -227,6 +228,24 @@ def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, t
     assert any("judges by the receiver" in one for one in run(scenario).remarks) == told
     by_gnss = run(scenario.changed({"truth.reference": "gnss"}))
     assert not any("judges by the receiver" in one for one in by_gnss.remarks)
+
+
+@pytest.mark.parametrize(("late_s", "told"), [(0.2, False), (1.0, True)])
+def test_a_fast_aircraft_is_no_reason_to_doubt_its_solution(late_s: float, told: bool) -> None:
+    """At 60 m/s a receiver that is told of late is 12 m behind an exact solution; a second late is another matter."""
+    t = np.arange(0.0, 60.0, 0.1)
+    north, zero = np.radians(47) + 60.0 * t / 6.37e6, np.zeros(len(t))
+    v_n = np.tile([60.0, 0.0, 0.0], (len(t), 1))
+    solution = Reference("its own solution", t, {"lat": north, "lon": zero, "h": zero + 500.0, "v_n": v_n})
+    fixes = [
+        GnssSample(
+            t=one, t_arrival=one, lat=np.interp(one - late_s, t, north), lon=0.0, h=500.0, v_n=v_n[0],
+            sigma_position_n=np.ones(3), sigma_velocity_n=np.ones(3), fix_type=FixType.FIX_3D, satellites=9, hdop=1.0,
+            vdop=1.0, sensor="gnss",
+        )
+        for one in np.arange(2.0, 59.0, 0.2).tolist()
+    ]  # fmt: skip
+    assert bool(doubt(solution, {"gnss": fixes})) == told
 
 
 @pytest.mark.parametrize("later", [0.03, 0.31, 7.0])
