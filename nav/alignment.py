@@ -362,7 +362,7 @@ class Alignment:
         C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
         J = [_attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, which) for which in range(4)]
 
-        variance_v = np.diag(_whole(fix.sigma_velocity_n, self.aids.gnss_velocity))
+        variance_v = np.diag(whole(fix.sigma_velocity_n, self.aids.gnss_velocity))
         up = dv_n / np.linalg.norm(dv_n)
         gyro_turn = (self.imu.gyro_bias_sigma * T) ** 2 + self.imu.gyro_noise**2 * T
         P = np.zeros((MOTION, MOTION))
@@ -378,7 +378,7 @@ class Alignment:
         P[phi, vel] = J[_DV_N] @ (variance_v - np.diag(self.aids.gnss_velocity**2))
         P[vel, phi] = P[phi, vel].T
         P[vel, vel] = variance_v
-        P[pos, pos] = np.diag(_whole(fix.sigma_position_n, self.aids.gnss_position))
+        P[pos, pos] = np.diag(whole(fix.sigma_position_n, self.aids.gnss_position))
 
         # Every estimated error is zero, so its error is minus what it is: hence the signs.
         correlated = {name: np.zeros((MOTION, 3)) for name in ("gnss_position_error", "gnss_velocity_error")}
@@ -405,7 +405,7 @@ class Alignment:
         )
 
 
-def _whole(reported: Array, correlated: Array) -> Array:
+def whole(reported: Array, correlated: Array) -> Array:
     """Variances (3,) of what a receiver says to be as good as ``reported`` (3,), ``correlated`` (3,) being slow errors.
 
     A receiver may claim to be better than its slow errors are told to be. What begins at its fix has both them and its

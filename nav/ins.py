@@ -144,7 +144,7 @@ class Ins:
         self._last_bad = self._last_unsound = -math.inf  # when an increment, a sample was refused as unsound last
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
-        self.realignment = Realignment(self._alignment, self._filter.aids, self._reference)
+        self.realignment = Realignment(self._alignment, self._filter.aids, self._reference, self._smoother)
         self._batch = Batch([self._filter], self._reference)
         self._takes_steps = not (config.smooth or config.scaling or course)
         self._extra = [(name, where) for name, where in self.model.slices.items() if name not in REPORTED]

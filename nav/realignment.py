@@ -8,11 +8,13 @@ from copy import deepcopy
 from typing import Protocol
 
 from nav._jit import njit
-from nav.alignment import Alignment, InitialState
+from nav.aids.gnss import has_velocity
+from nav.alignment import Alignment, InitialState, whole
 from nav.earth import displacement_n
 from nav.error_model import PHI, POS, VEL
 from nav.reference import Reference, align
 from nav.samples import Array, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
+from nav.smoother import Smoother
 from nav.state import State
 
 LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
@@ -21,6 +23,7 @@ DV, DP = range(VEL, VEL + 3), range(POS, POS + 3)
 WAIT_S = 5.0  # the longest that samples are withheld for an alignment,
 LONG_S = 30.0  # the same of one that has no compass, and that one goes on though the tilt seems to be known again
 ELSEWHERE = 5.0  # sigmas
+SWING = 1.0  # of an antenna about the IMU, in a body whose turns nobody knows [rad/s]
 
 
 class Startable(Protocol):
@@ -40,13 +43,17 @@ class Realignment:
 
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
     did not. So the fixes of one receiver, and samples of the ``sensors``, go to an alignment, which is as ``alignment``
-    at its beginning and knows nothing of before. All are withheld from the filters; where it comes to no end in
-    `WAIT_S` from the last missing increment on, or in `LONG_S` without a compass, they are used as well as may be. The
-    same where it contradicts the position that was known.
+    at its beginning and knows nothing of before. All are withheld from the filters, whose velocity and position are
+    those of the receiver meanwhile; where it comes to no end in `WAIT_S` from the last missing increment on, or in
+    `LONG_S` without a compass, they are used as well as may be. The same where it contradicts the position that was
+    known.
     """
 
-    def __init__(self, alignment: Alignment, sensors: Container[str], reference: Reference) -> None:
+    def __init__(
+        self, alignment: Alignment, sensors: Container[str], reference: Reference, smoother: Smoother | None = None
+    ) -> None:
         self._beginning, self._sensors, self._reference = deepcopy(alignment), sensors, reference
+        self._smoother = smoother  # to which what was before tells nothing of what is put in its place
         self.begin(math.inf)
 
     def begin(self, t: float) -> None:
@@ -54,7 +61,7 @@ class Realignment:
         self.since = t
         self._alignment: Alignment | None = None
         self._receiver = ""
-        self._lost_at = self._widened = math.nan
+        self._lost_at = self._moved_at = self._widened = math.nan
 
     @property
     def under_way(self) -> bool:
@@ -78,11 +85,13 @@ class Realignment:
         if self._alignment is None:
             if not lost:
                 return None
-            self._alignment, self._lost_at, self._widened = deepcopy(self._beginning), sample.t, sample.t
+            self._alignment = deepcopy(self._beginning)
+            self._lost_at = self._moved_at = self._widened = sample.t
         waited = sample.t - max(self._lost_at, last_bad)
-        if sound and self._is_part(sample):
+        is_part = sound and self._is_part(sample)
+        if is_part:
             initial = align(self._alignment, self._reference, sample)
-            if initial is not None and _contradicts(initial, state, filters):
+            if initial is not None and _is_elsewhere(initial, initial.covariance[DP, DP], state, filters):
                 self.begin(sample.t)
                 return None
             if initial is not None:
@@ -91,6 +100,8 @@ class Realignment:
         patience = LONG_S if self._alignment.matching else WAIT_S
         if waited <= patience:
             self._widen(state.P, filters, sample.t)
+            if is_part and isinstance(sample, GnssSample):
+                self._follow(state, filters, sample)
             return estimator.refuse(sample, "the attitude is lost: aligning anew", Outcome.WITHHELD)
         if waited > LONG_S and not lost:  # it has come back without
             self.begin(sample.t)
@@ -103,19 +114,40 @@ class Realignment:
             return sample.sensor == self._receiver
         return sample.sensor in self._sensors
 
+    def _follow(self, state: State, filters: int, fix: GnssSample) -> None:
+        """Take velocity and position of a receiver, if they are known and not elsewhere; of the attitude they tell
+        nothing that a linear correction could use.
+        """
+        aids, arm = self._beginning.aids, math.hypot(*self._beginning.arm_b)
+        variance_p = whole(fix.sigma_position_n, aids.gnss_position) + arm**2
+        variance_v = whole(fix.sigma_velocity_n, aids.gnss_velocity) + (SWING * arm) ** 2
+        if not fix.has_fix or not has_velocity(fix) or _is_elsewhere(fix, variance_p, state, filters):
+            return
+        moved = [*DV, *DP]
+        state.lla[:], state.v_n[:] = (fix.lat, fix.lon, fix.h), fix.v_n
+        state.x[:, moved] = 0.0
+        state.P[:, moved, :] = 0.0
+        state.P[:, :, moved] = 0.0
+        state.P[:, DV, DV], state.P[:, DP, DP] = filters * variance_v, filters * variance_p
+        self._moved_at = self._widened = fix.t
+        if self._smoother is not None:
+            self._smoother.begin(fix.t, state)
+
     def _widen(self, P: Array, filters: int, t: float) -> None:
         """Let velocity and position be off as if gravity pulled anywhere, of which linear errors know nothing."""
-        before, now = self._widened - self._lost_at, t - self._lost_at
+        before, now = self._widened - self._moved_at, t - self._moved_at
         self._widened = t
         P[:, DV, DV] += filters * GRAVITY**2 * (now**2 - before**2)
         P[:, DP, DP] += filters * (0.5 * GRAVITY) ** 2 * (now**4 - before**4)
 
 
-def _contradicts(initial: InitialState, state: State, filters: int) -> bool:
-    """Whether it is elsewhere over ground than filters thought, who claim much already."""
-    north, east, _ = displacement_n(initial.lat, initial.lon, initial.h, *state.lla.tolist())
-    variance = state.P[:filters, DP, DP].max(axis=0) + initial.covariance[DP, DP]
-    return bool(north**2 + east**2 > ELSEWHERE**2 * variance[:2].sum())
+def _is_elsewhere(place: InitialState | GnssSample, variance: Array, state: State, filters: int) -> bool:
+    """Whether a place, known with a ``variance`` (3,) [m^2], is elsewhere over ground than filters thought, who claim
+    much already.
+    """
+    north, east, _ = displacement_n(place.lat, place.lon, place.h, *state.lla.tolist())
+    both = state.P[:filters, DP, DP].max(axis=0) + variance
+    return bool(north**2 + east**2 > ELSEWHERE**2 * both[:2].sum())
 
 
 @njit
