@@ -88,7 +88,9 @@ def names(dataset: xarray.DataTree) -> list[str]:
     """The recorded estimators with estimates, in the order of the scenario: a run that was cut off may lack some."""
     if "estimators" not in dataset.children:
         return []
-    return [name for name, node in dataset["estimators"].children.items() if "time" in node.coords]
+    found = [name for name, node in dataset["estimators"].children.items() if "time" in node.coords]
+    order = list(json.loads(str(dataset.attrs.get("estimator_imus", "{}"))))  # a file has them as they came to speak
+    return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
 
 
 def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,10 +22,10 @@ from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.report import campaign_figures, differences, style, tables
 from testbed.report import page as report
-from testbed.report.figures import consistency, imu
+from testbed.report.figures import consistency, flight, imu
 from testbed.report.run import Run
 from testbed.results import start_anew
-from testbed.score import metrics
+from testbed.score import accuracy, metrics
 from testbed.score.differences import Case
 from testbed.sensors.faults import FaultTruth
 
@@ -304,3 +305,25 @@ def test_a_page_tells_which_estimator_is_better_than_the_first() -> None:
     assert (block.count("better"), block.count("worse")) == (1, 1)
     assert [cells[3:5] for _, cells in rows] == [["+200.0 %", "worse"], ["-50.0 %", "better"]]
     assert block.note == differences.ALONE
+
+
+def test_estimators_are_in_the_order_of_the_scenario_whoever_speaks_first() -> None:
+    """So that a report has the colours that the run had."""
+    run = synthetic_run.dataset(20.0, {"second": Errors(), "first": Errors()})
+    run.attrs["estimator_imus"] = json.dumps({"first": "imu", "second": "imu"})
+    assert accuracy.names(run) == ["first", "second"]
+
+
+@pytest.mark.parametrize(("grown", "unit"), [(10.0, "km"), (1.0, "m")])
+def test_a_short_track_is_in_metres(grown: float, unit: str) -> None:
+    run = synthetic_run.dataset(120.0, {"ins": Errors(aligned_after=0.0)})
+    for group in ("truth", "estimators/ins"):
+        for axis in ("lat", "lon"):
+            own = run[group][axis].values
+            own[:] = own[0] + grown * (own - own[0])
+    figure = flight.ground_track(Run(run))
+    assert figure is not None
+    ax = figure.axes[0]
+    assert ax.get_xlabel().endswith(f"[{unit}]")
+    assert ax.get_ylabel().endswith(f"[{unit}]")
+    assert unit == "km" or ax.xaxis.get_major_formatter()(0.5, 0) == "500"

@@ -25,6 +25,8 @@ from testbed.report.style import (
 from testbed.score import accuracy
 from testbed.score.accuracy import column
 
+SHORT_KM, TICKS = 2.0, 6
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -46,7 +48,6 @@ def ground_track(run: Run) -> Figure | None:
     for ax in drawn.axes[0]:
         _tracks(run, ax, truth, believed)
     first = drawn.axes[0, 0]
-    first.set_ylabel("north of the start [km]")
     first.set_aspect("equal", adjustable="box" if far else "datalim")
     if far:
         centre, half = (low + high) / 2, 0.62 * extent
@@ -55,6 +56,9 @@ def ground_track(run: Run) -> Figure | None:
         first.set_title("around the true track", y=1.0, fontsize=10)
         drawn.axes[0, 1].set_title("as far as the estimates go", y=1.0, fontsize=10)
         drawn.axes[0, 1].set_aspect("equal", adjustable="datalim")
+    first.set_ylabel(f"north of the start [{_distances(first)}]")
+    for ax in drawn.axes[0]:
+        ax.set_xlabel(f"east of the start [{_distances(ax)}]")
     keys = keys_of(drawn.axes.flat)
     if run.windows:
         keys["no GNSS fix"] = patch(SHADE)
@@ -77,7 +81,18 @@ def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> Non
     known = truth[np.isfinite(truth).all(axis=1)]
     ax.plot(known[0, 1], known[0, 0], "o", color=TRUTH, ms=7, label="start", zorder=5)
     ax.plot(known[-1, 1], known[-1, 0], "s", color=TRUTH, ms=7, label="end", zorder=5)
-    ax.set_xlabel("east of the start [km]")
+
+
+def _distances(ax: Axes) -> str:
+    """Let both axes, which are in kilometres, be read in metres where they are short; the unit."""
+    from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+    short = max(np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())) < SHORT_KM
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(TICKS))
+        if short:
+            axis.set_major_formatter(FuncFormatter(lambda x, _: f"{1000 * x:.6g}"))
+    return "m" if short else "km"
 
 
 def flight(run: Run) -> Figure:
