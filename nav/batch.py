@@ -347,7 +347,7 @@ def follow(
         if what == ADVANCE:
             continue
         if what == ESTIMATE:
-            if time < now - COINCIDENT:
+            if now > time + COINCIDENT:
                 return k, 0, row, now, last_bad, written, drafted
             stop = row if abs(time - now) <= COINCIDENT else row_after(t, time, row)
             further = 0.0 if abs(time - now) <= COINCIDENT else time - max(t[stop - 1], now)

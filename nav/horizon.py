@@ -128,11 +128,11 @@ class FusionHorizon:
         Raises ValueError when ``t`` is a whole increment past the newest or before what the estimator has already used.
         """
         ahead = self._ahead
-        if abs(t - ahead.t) <= COINCIDENT:
+        if ahead.t > t + COINCIDENT:  # added as where increments are looked up, so that rounding is the same
+            raise ValueError(f"the estimator is at {ahead.t} s already, it cannot tell the state at {t} s")
+        if t <= ahead.t + COINCIDENT:
             estimate = self.estimator.estimate()
             return replace(estimate, t=t) if math.isnan(estimate.t) else estimate  # it may have seen nothing yet
-        if t < ahead.t:
-            raise ValueError(f"the estimator is at {ahead.t} s already, it cannot tell the state at {t} s")
         stop = ahead.row_after(t)
         if not stop:
             estimate = self.estimator.estimate()
@@ -198,7 +198,7 @@ class FusionHorizon:
         t = sample.t if math.isfinite(sample.t) else turn
         if turn > t:  # too late, wherever the blocks were cut
             self._propagate_to(turn, reports)
-        if t < self._ahead.t - COINCIDENT:
+        if self._ahead.t > t + COINCIDENT:
             reports += self.estimator.refuse(sample, f"{self._ahead.t - t:.3g} s too late")
             return
         self._propagate_to(t, reports)

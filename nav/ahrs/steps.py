@@ -356,7 +356,7 @@ def follow(
     then = now
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
-        if what >= 0 and time < now - COINCIDENT:  # too late
+        if what >= 0 and now > time + COINCIDENT:  # too late
             return k, row, now, last_bad, written, drafted
         stop = row_after(t, steps[k, HORIZON], row)
         if stop > row:
@@ -369,7 +369,7 @@ def follow(
             continue
         state, partly, part, of_row, bad = whole, False, 0.0, row, last_bad
         if what == ESTIMATE:
-            if time < now - COINCIDENT:
+            if now > time + COINCIDENT:
                 return k, row, now, last_bad, written, drafted
             stop = row if abs(time - now) <= COINCIDENT else row_after(t, time, row)
             further = 0.0 if abs(time - now) <= COINCIDENT else time - max(t[stop - 1], now)

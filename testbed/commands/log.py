@@ -69,4 +69,4 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         write_file(scenario, draft.scenario(found, scenario, truth).encode())
         print(printable(f"scenario: {scenario}"))
         if not draft.is_placed(found.log):
-            print("Say in it where the flight was, in the line of start: the log does not.")
+            print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")

@@ -24,6 +24,7 @@ from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
 from testbed.feeds.reference import doubt, is_flown
+from testbed.feeds.rest import believed
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
@@ -45,8 +46,9 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "barometer": ("BARO", "BAR2", "BAR3"),
     "airspeed": ("ARSP", "ASP2"),
 }
-SOLUTIONS = ("XKF1", "NKF1", "EKF1")
+SOLUTIONS = ("XKF1", "NKF1", "EKF1", "ATT")  # the last is what it flew by, whoever found it
 PLACES = ("POS", "AHR2")
+TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in the vehicle [rad]
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
 
@@ -65,7 +67,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     found = {name: len(rows) for name, rows in messages.items()}
     require_imu(path, imus, found, NEEDED)
     samples = _aiding(units, notes)
-    solution = _solution(messages, _first_fix(samples))
+    solution = believed(_solution(messages, _first_fix(samples)), imus, samples, notes)
     log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
         date=_date(units), remark=doubt(solution, samples),
@@ -107,7 +109,7 @@ def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], st
     from pymavlink import DFReader  # type: ignore[import-untyped]
 
     found: dict[str, list[dict[str, Any]]] = {}
-    wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES}
+    wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES, "PARM"}
     try:
         reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
         with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
@@ -236,20 +238,27 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
     """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
 
     Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
+    An EKF that does not run is logged as zeros; where it never did, the attitude that was flown by is all there is.
+    Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`).
     """
-    source = next((name for name in SOLUTIONS if name in messages), None)
-    if source is None:
+    parameters = {one["Name"]: one["Value"] for one in messages.get("PARM", []) if {"Name", "Value"} <= one.keys()}
+    trims = [math.degrees(parameters.get(name, 0.0)) for name in TRIMS]
+    for source in SOLUTIONS:
+        own = [one for one in messages.get(source, []) if one]
+        rows = _rows([one for one in own if one.get("C", 0) == 0] or own)
+        if {"Roll", "Pitch", "Yaw"} <= rows.keys():
+            t, kept = _times(source, rows, [])
+            angles = np.array([rows[key][kept] for key in ("Roll", "Pitch", "Yaw")])
+            runs = np.asarray(angles.any(axis=0))
+            if runs.any():
+                break
+    else:
         return None
-    own = [one for one in messages[source] if one]
-    rows = _rows([one for one in own if one.get("C", 0) == 0] or own)
-    if not {"Roll", "Pitch", "Yaw", "VN", "VE", "VD"} <= rows.keys():
-        return None
-    t, kept = _times(source, rows, [])
-    angles = [np.radians(rows[key][kept]) for key in ("Roll", "Pitch", "Yaw")]
-    columns = {
-        "q_nb": quaternions(*angles),
-        "v_n": np.column_stack([np.where(t >= since, rows[key][kept], np.nan) for key in ("VN", "VE", "VD")]),
-    }
+    of_unit = np.radians(angles + np.array([*trims, 0.0])[:, None])
+    columns = {"q_nb": np.where(runs[:, None], quaternions(*of_unit), np.nan)}
+    if {"VN", "VE", "VD"} <= rows.keys():
+        velocity = np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")])
+        columns["v_n"] = np.where((runs & (t >= since))[:, None], velocity, np.nan)
     for name in PLACES:
         if name not in messages:
             continue

@@ -29,6 +29,8 @@ NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its
 DIGITS = 3
 AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
 ROWS_HZ, RECORD_HZ = 100.0, 10.0
+# A place for a log that has none, so that its scenario runs: an AHRS needs gravity and declination.
+ASSUMED = {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 400.0}
 
 
 def sections(found: Survey) -> dict[str, dict[str, Any]]:
@@ -117,8 +119,10 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
     place = os.path.relpath(log.path.resolve(), out.resolve().parent)
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
+    if log.remark:
+        lines.append('reference = "gnss"  # its own solution is elsewhere')
     if not is_placed(log):
-        lines.append("# start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 400.0 }  # the log doesn't say where: give it")
+        lines.append(f"start = {_inline(ASSUMED)}  # assumed: the log doesn't say where: give it")
     if truth is not None and truth.columns:
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]
     for name, keys in own.items():

@@ -19,12 +19,11 @@ from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.feeds.log import Log
+from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
 
 MOVING = ("moving", "flying")  # the phases in which it does
-WINDOW_S = 1.0  # over which a vehicle is judged to be at rest
-REST_RATE, REST_FORCE = 0.02, 0.3  # deviation from the mean within a window [rad/s, m/s^2]
-REST_SPEED, FLYING_SPEED, FLYING_HEIGHT = 1.0, 6.0, 8.0  # of GNSS [m/s, m/s, m]
+FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
@@ -150,16 +149,13 @@ def _phases(log: Log) -> list[Phase]:
     count = max(int((imu.t[-1] - log.t0) / WINDOW_S), 1)
     edges = log.t0 + WINDOW_S * np.arange(count + 1)
     rows = np.searchsorted(imu.t, edges)
-    rates, forces = imu.dtheta / imu.dt[:, None], imu.dv / imu.dt[:, None]
+    resting = is_still(imu, edges)
     names = []
     receiver = log.receiver
     t, v_n, place = fixes(log.samples[receiver]) if receiver else (np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     speed = np.hypot(v_n[:, 0], v_n[:, 1])
     for k in range(count):
-        part = slice(rows[k], rows[k + 1])
-        still = rows[k + 1] - rows[k] > 1
-        still = still and bool((rates[part].std(axis=0) < REST_RATE).all())
-        still = still and bool((forces[part].std(axis=0) < REST_FORCE).all())
+        still = bool(resting[k])
         near = slice(*np.searchsorted(t, edges[k : k + 2]))
         fast = float(np.nanmax(speed[near], initial=0.0))
         high = float(np.max(place[near, 2] - np.median(place[:5, 2]), initial=0.0)) if len(place) else 0.0

@@ -131,6 +131,19 @@ def test_estimate_at_knows_its_limits():
         horizon.estimate_at(0.32)
 
 
+def test_increments_a_microsecond_after_the_times_asked_for_are_no_mistake():
+    """As of stamps in whole microseconds; half of these sums are rounded up, and half down."""
+    times = np.arange(1, 400) / 100
+    late = ImuSamples(times + 1e-6, np.full(399, 0.01), np.zeros((399, 3)), np.zeros((399, 3)))
+    log = Logbook()
+    log.update = lambda sample: []
+    horizon = FusionHorizon(log)
+    for k, t in enumerate(times.tolist()):
+        samples = [BarometerSample(t, t, 1e5, name) for name in ("first", "second")]
+        assert horizon.push(part(late, k, k + 1), samples) == []  # none is refused as too late
+        assert horizon.estimate_at(t).t == pytest.approx(t, abs=2e-6)
+
+
 def test_a_sample_without_a_time_waits_for_nobody():
     truth = flight(30)
     increments_, samples = everything(truth, np.random.default_rng(3))

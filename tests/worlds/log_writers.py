@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 # --- ArduPilot DataFlash: name, format by the letters of its FMT message, labels
-LETTERS = {"Q": "Q", "B": "B", "I": "I", "H": "H", "h": "h", "f": "f", "L": "i", "e": "i", "c": "h", "C": "H"}
+LETTERS = {one: one for one in "QBIHhf"} | {"L": "i", "e": "i", "c": "h", "C": "H", "N": "16s"}
 SCALED = {"L": 1e7, "e": 100.0, "c": 100.0, "C": 100.0}
 DATAFLASH = {
     "IMU": ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ"),
@@ -22,6 +22,8 @@ DATAFLASH = {
     "ARSP": ("QBf", "TimeUS,I,Airspeed"),
     "XKF1": ("QBffffff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD"),
     "POS": ("QLLf", "TimeUS,Lat,Lng,Alt"),
+    "ATT": ("Qfff", "TimeUS,Roll,Pitch,Yaw"),
+    "PARM": ("QNf", "TimeUS,Name,Value"),
 }
 
 
@@ -76,7 +78,7 @@ def dataflash_rows(dataset: Any) -> list[tuple[str, tuple[Any, ...]]]:
 
 def packed(letters: str, values: Sequence[Any]) -> bytes:
     given = [
-        float(v) if letter == "f" else round(float(v) * SCALED.get(letter, 1.0))
+        v if letter == "N" else float(v) if letter == "f" else round(float(v) * SCALED.get(letter, 1.0))
         for letter, v in zip(letters, values, strict=True)
     ]
     limited = [max(0, min(g, 65535)) if letter == "C" else g for letter, g in zip(letters, given, strict=True)]
