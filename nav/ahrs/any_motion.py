@@ -82,7 +82,8 @@ class AnyMotionLevelling:
 
     def half_noise(self, s: State) -> float:
         """Half of the variance that the turns of a period bring to each axis of the attitude."""
-        return 0.5 * self.told.gyro_share**2 * float(s.sums[1].sum())
+        share = max(self.told.gyro_share, self.config.imu.gyro_motion)
+        return 0.5 * share**2 * float(s.sums[1].sum())
 
     def level_measurement(
         self, H: Array, omega_b: Array, compensated: bool, acceleration: float, T: float

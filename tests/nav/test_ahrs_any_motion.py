@@ -239,6 +239,23 @@ def test_it_errs_as_it_claims_where_velocities_are_as_it_thinks():
     assert 0.3 < np.mean(found) < 1.5
 
 
+@pytest.mark.ci
+def test_a_part_whose_gyros_are_off_in_motion_is_taken_for_what_it_is():
+    """Scale and alignment of 2 %, each unit its own, told or not: NEES of tilt per degree of freedom, and the error."""
+    found = {0.0: [], 0.02: []}
+    for seed in range(8):
+        motion = in_hand(60.0)
+        motion.imu.dtheta[:] += 0.02 * motion.imu.dtheta @ np.random.default_rng(seed).normal(size=(3, 3))
+        for told, rows in found.items():
+            at, phi, covariance, *_ = track(motion, replace(BLIND, imu=replace(PART, gyro_motion=told)))
+            phi, covariance = phi[at > 20, :2], covariance[at > 20, :2, :2]
+            rows.append((np.einsum("ni,nij,nj->n", phi, np.linalg.inv(covariance), phi).mean() / 2, rms(phi)))
+    untold, told = (np.mean(rows, axis=0) for rows in found.values())
+    print(untold, told)
+    assert told[0] < 1.5 < 0.5 * untold[0]
+    assert told[1] < untold[1]
+
+
 @pytest.mark.parametrize("gap_s", [0.4, 3.0, 40.0])
 def test_after_a_gap_it_is_right_in_five_seconds(gap_s):
     """A short gap widens what is claimed; in a long one the tilt is lost, and found anew by what is felt after it."""
