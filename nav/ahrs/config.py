@@ -42,7 +42,7 @@ class AnyMotion:
     acceleration_memory_s: float = 4.0  # time over which accelerations are measured
     least_acceleration_density: float = 1e-3  # of horizontal accelerations, where none are seen [(m/s^2)^2 s]
     airspeed_error_s: float = 1.0  # how long ``airspeed_sigma`` has one sign
-    # Of the rate of turn that is an error, by misalignment and scale, over a second, where a part is not told to be worse.
+    # Of the rate of turn that is an error, by misalignment and scale, over a second; more where a part is told so.
     gyro_share: float = 3e-3
     unknown_speed: float = 15.0  # at which the body may be turning where airspeed does not tell [m/s]
     turn_memory_s: float = 8.0  # time over which a turn is told from a swing
