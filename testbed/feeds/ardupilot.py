@@ -14,7 +14,7 @@ import io
 import math
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -49,6 +49,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
 SOLUTIONS = ("XKF1", "NKF1", "EKF1", "ATT")  # the last is what it flew by, whoever found it
 PLACES = ("POS", "AHR2")
 TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in the vehicle [rad]
+RESOLUTION_DEG = 0.02  # of logged angles, and of what is added to them
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
 
@@ -238,24 +239,22 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
     """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
 
     Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
-    An EKF that does not run is logged as zeros; where it never did, the attitude that was flown by is all there is.
-    Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`).
+    Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`). An EKF that does not run says that
+    the unit's are zero; where it never ran, the attitude that was flown by is all there is.
     """
-    parameters = {one["Name"]: one["Value"] for one in messages.get("PARM", []) if {"Name", "Value"} <= one.keys()}
-    trims = [math.degrees(parameters.get(name, 0.0)) for name in TRIMS]
+    trims = _trims(messages.get("PARM", []))
     for source in SOLUTIONS:
         own = [one for one in messages.get(source, []) if one]
         rows = _rows([one for one in own if one.get("C", 0) == 0] or own)
         if {"Roll", "Pitch", "Yaw"} <= rows.keys():
             t, kept = _times(source, rows, [])
-            angles = np.array([rows[key][kept] for key in ("Roll", "Pitch", "Yaw")])
-            runs = np.asarray(angles.any(axis=0))
+            angles = np.array([rows[key][kept] for key in ("Roll", "Pitch", "Yaw")]) + trims[:, None]
+            runs = np.asarray((np.abs(angles) > RESOLUTION_DEG).any(axis=0))
             if runs.any():
                 break
     else:
         return None
-    of_unit = np.radians(angles + np.array([*trims, 0.0])[:, None])
-    columns = {"q_nb": np.where(runs[:, None], quaternions(*of_unit), np.nan)}
+    columns = {"q_nb": np.where(runs[:, None], quaternions(*np.radians(angles)), np.nan)}
     if {"VN", "VE", "VD"} <= rows.keys():
         velocity = np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")])
         columns["v_n"] = np.where((runs & (t >= since))[:, None], velocity, np.nan)
@@ -275,6 +274,16 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
             columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
             break
     return Reference(f"the autopilot's own solution ({source})", t, columns)
+
+
+def _trims(parameters: Sequence[Mapping[str, Any]]) -> Array:
+    """By how much the unit is rolled, pitched and turned in its vehicle (3,) [deg]: what was set last."""
+    found = np.zeros(3)
+    for one in parameters:
+        value = one.get("Value")
+        if one.get("Name") in TRIMS and isinstance(value, float) and abs(value) < math.pi:
+            found[TRIMS.index(one["Name"])] = math.degrees(value)
+    return found
 
 
 def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:

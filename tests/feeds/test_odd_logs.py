@@ -164,14 +164,15 @@ def lying(
         found.append(("IMU", (us(k / 50), 0, 0.4, -0.3, 0.0, *force)))  # gyros of 30 deg/s too much
         if k % 5 == 0:
             for name in names:
-                nothing = (0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0) if name == "XKF1" else ()
+                nothing = (0, -trim, 0.0, 0.0, 0.0, 0.0, 0.0) if name == "XKF1" else ()
                 found.append((name, (us(k / 50), *(nothing or (*thought, 90.0)))))
     return found
 
 
-def test_an_ekf_that_does_not_run_is_no_reference(tmp_path: Path) -> None:
-    """It is logged as zeros; the attitude that was flown by is logged beside it."""
-    log = read(lying((3.0, -2.0), (3.0, -2.0), ("XKF1", "ATT")), tmp_path)
+@pytest.mark.parametrize("trim", [0.0, 0.24])
+def test_an_ekf_that_does_not_run_is_no_reference(trim: float, tmp_path: Path) -> None:
+    """It is logged as zeros, less the trim; the attitude that was flown by is logged beside it."""
+    log = read(lying((3.0, -2.0), (3.0 - trim, -2.0), ("XKF1", "ATT"), trim), tmp_path)
     assert log.solution is not None
     assert "(ATT)" in log.solution.name
     assert set(log.solution.columns) == {"q_nb"}
