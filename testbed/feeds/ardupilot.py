@@ -239,8 +239,8 @@ def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Ref
     """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
 
     Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
-    Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`). The unit's are zero of an EKF that
-    does not run; where it never ran, the attitude that was flown by is all there is.
+    Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`). Where an EKF does not run, the
+    unit's are zero; where it never ran, the attitude that was flown by is all there is.
     """
     trims = _trims(messages.get("PARM", []))
     for source in SOLUTIONS:
