@@ -29,7 +29,7 @@ from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, q
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
 
-NEEDED = "IMU, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
+NEEDED = "IMU with GyrX to AccZ, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
 GAUSS = 1e-7  # of the milligauss that MAG is in [T]
 BINARY = b"\xa3\x95"  # how every message begins; text may begin with lines of the ground station
 GPS_EPOCH, WEEK_S = dt.datetime(1980, 1, 6), 604_800
