@@ -68,5 +68,5 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     if scenario is not None:
         write_file(scenario, draft.scenario(found, scenario, truth).encode())
         print(printable(f"scenario: {scenario}"))
-        if not draft.is_placed(found.log):
+        if (truth is None or truth.start is None) and not draft.is_placed(found.log):
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")

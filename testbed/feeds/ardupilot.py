@@ -24,7 +24,7 @@ from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
 from testbed.feeds.reference import doubt, is_flown
-from testbed.feeds.rest import believed
+from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
@@ -50,6 +50,7 @@ SOLUTIONS = ("XKF1", "NKF1", "EKF1", "ATT")  # the last is what it flew by, whoe
 PLACES = ("POS", "AHR2")
 TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in the vehicle [rad]
 RESOLUTION_DEG = 0.02  # of logged angles, and of what is added to them
+LEAST_RUNNING = 0.5  # of the log
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
 
@@ -68,7 +69,12 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     found = {name: len(rows) for name, rows in messages.items()}
     require_imu(path, imus, found, NEEDED)
     samples = _aiding(units, notes)
-    solution = believed(_solution(messages, _first_fix(samples)), imus, samples, notes)
+    solution = None
+    for solution in _solutions(messages, _first_fix(samples)):
+        if not (refused := refusal(solution, imus, samples)):
+            break
+        notes.append(refused)
+        solution = None
     log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
         date=_date(units), remark=doubt(solution, samples),
@@ -235,51 +241,57 @@ def _first_fix(samples: Mapping[str, Samples]) -> float:
     return min((one.t for one in fixes if one.has_fix), default=math.inf if fixes else -math.inf)
 
 
-def _solution(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Reference | None:
-    """What the autopilot itself thought: attitude and velocity of its EKF's first core, and its position.
+def _solutions(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Iterator[Reference]:
+    """What the autopilot itself thought, the best first: attitude and velocity of an EKF's first core, and position.
 
     Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
     Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`). Where an EKF does not run, the
-    unit's are zero; where it never ran, the attitude that was flown by is all there is.
+    unit's are zero; one that runs for less than `LEAST_RUNNING` of the log comes last.
     """
     trims = _trims(messages.get("PARM", []))
+    late = []
     for source in SOLUTIONS:
         own = [one for one in messages.get(source, []) if one]
         rows = _rows([one for one in own if one.get("C", 0) == 0] or own)
-        if {"Roll", "Pitch", "Yaw"} <= rows.keys():
-            t, kept = _times(source, rows, [])
-            angles = np.array([rows[key][kept] for key in ("Roll", "Pitch", "Yaw")]) + trims[:, None]
-            runs = np.asarray((np.abs(angles) > RESOLUTION_DEG).any(axis=0))
-            if runs.any():
-                break
-    else:
-        return None
-    columns = {"q_nb": np.where(runs[:, None], quaternions(*np.radians(angles)), np.nan)}
-    if {"VN", "VE", "VD"} <= rows.keys():
-        velocity = np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")])
-        columns["v_n"] = np.where((runs & (t >= since))[:, None], velocity, np.nan)
-    for name in PLACES:
-        if name not in messages:
+        if not {"Roll", "Pitch", "Yaw"} <= rows.keys():
             continue
-        place = _rows([one for one in messages[name] if one])
+        t, kept = _times(source, rows, [])
+        angles = np.array([rows[key][kept] for key in ("Roll", "Pitch", "Yaw")]) + trims[:, None]
+        columns = {"q_nb": quaternions(*np.radians(angles))}
+        running = np.ones(len(t), bool)
+        if {"VN", "VE", "VD"} <= rows.keys():
+            running = np.asarray((np.abs(angles) > RESOLUTION_DEG).any(axis=0))
+            velocity = np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")])
+            columns["q_nb"] = np.where(running[:, None], columns["q_nb"], np.nan)
+            columns["v_n"] = np.where((running & (t >= since))[:, None], velocity, np.nan)
+        found = Reference(f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since)})
+        if running.mean() >= LEAST_RUNNING:
+            yield found
+        elif running.any():
+            late.append(found)
+    yield from late
+
+
+def _places(messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float) -> dict[str, Array]:
+    """The positions that it had at the times ``t`` [s], by the first kind of message that has any from ``since`` on."""
+    for name in PLACES:
+        place = _rows([one for one in messages.get(name, []) if one])
         if not {"Lat", "Lng", "Alt"} <= place.keys():
             continue
-        at, kept_at = _times(name, place, [])
-        lat, lon = (np.radians(place[key][kept_at]) for key in ("Lat", "Lng"))
-        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, place["Alt"][kept_at])
+        at, kept = _times(name, place, [])
+        lat, lon, h = np.radians(place["Lat"][kept]), np.radians(place["Lng"][kept]), place["Alt"][kept]
+        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, h)
         if known.sum() > 1:
-            at, values = at[known], (lat[known], np.unwrap(lon[known]), place["Alt"][kept_at][known])
-            for key, column in zip(("lat", "lon", "h"), values, strict=True):
-                columns[key] = np.interp(t, at, column, left=np.nan, right=np.nan)
-            columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
-            break
-    return Reference(f"the autopilot's own solution ({source})", t, columns)
+            columns = zip(("lat", "lon", "h"), (lat[known], np.unwrap(lon[known]), h[known]), strict=True)
+            found = {key: np.interp(t, at[known], column, left=np.nan, right=np.nan) for key, column in columns}
+            return {**found, "lon": np.mod(found["lon"] + math.pi, 2 * math.pi) - math.pi}
+    return {}
 
 
 def _trims(parameters: Sequence[Mapping[str, Any]]) -> Array:
-    """By how much the unit is rolled, pitched and turned in its vehicle (3,) [deg]: what was set last."""
+    """By how much the unit is rolled, pitched and turned in its vehicle (3,) [deg]: as it was at first."""
     found = np.zeros(3)
-    for one in parameters:
+    for one in reversed(parameters):
         value = one.get("Value")
         if one.get("Name") in TRIMS and isinstance(value, float) and abs(value) < math.pi:
             found[TRIMS.index(one["Name"])] = math.degrees(value)

@@ -119,9 +119,13 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
     place = os.path.relpath(log.path.resolve(), out.resolve().parent)
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
-    if log.remark:
+    if truth is not None and "reference" in truth.model_fields_set:
+        lines.append(f"reference = {_inline(truth.reference)}")
+    elif log.remark:
         lines.append('reference = "gnss"  # its own solution is elsewhere')
-    if not is_placed(log):
+    if truth is not None and truth.start is not None:
+        lines.append(f"start = {_inline(truth.start.model_dump())}")
+    elif not is_placed(log):
         lines.append(f"start = {_inline(ASSUMED)}  # assumed: the log doesn't say where: give it")
     if truth is not None and truth.columns:
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]

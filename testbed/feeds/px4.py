@@ -25,7 +25,7 @@ from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
 from testbed.feeds.reference import doubt, is_flown
-from testbed.feeds.rest import believed
+from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, spread
 from testbed.feeds.stamps import integrated, ordered
 from testbed.motion.logged import Stream
@@ -61,7 +61,10 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             name = kind if number == 0 else f"{kind}{number + 1}"
             if own := chosen[2](name, rows, notes):
                 samples[name] = own
-    solution = believed(_solution(topics), imus, samples, notes)
+    solution = _solution(topics)
+    if solution is not None and (refused := refusal(solution, imus, samples)):
+        notes.append(refused)
+        solution = None
     start = beginning(imus, samples, solution)
     return Log(
         path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),

@@ -154,48 +154,87 @@ def with_solution(messages: Messages, off_deg: float = 0.0, garbage_until: float
 
 
 def lying(
-    felt: tuple[float, float], thought: tuple[float, float], names: tuple[str, ...] = ("XKF1",), trim: float = 0.0
+    thought: tuple[float, float] = (3.0, -2.0), ekf: tuple[float, ...] | None = None, trim: float = 0.0, g: float = 9.8
 ) -> Messages:
-    """A vehicle at rest for 10 s, rolled and pitched so [deg], and what it thinks, in messages ``names``."""
-    roll, pitch = np.radians(felt)
-    force = 9.8 * np.sin(pitch), -9.8 * np.sin(roll) * np.cos(pitch), -9.8 * np.cos(roll) * np.cos(pitch)
+    """A vehicle at rest for 10 s, rolled by 3 and pitched by -2 deg; what flies it, and an EKF, think so."""
+    roll, pitch = np.radians((3.0, -2.0))
+    force = g * np.sin(pitch), -g * np.sin(roll) * np.cos(pitch), -g * np.cos(roll) * np.cos(pitch)
     found: Messages = [("PARM", (0, b"AHRS_TRIM_X", np.radians(trim))), ("PARM", (0, b"AHRS_TRIM_Y", 0.0))]
     for k in range(1, 501):
         found.append(("IMU", (us(k / 50), 0, 0.4, -0.3, 0.0, *force)))  # gyros of 30 deg/s too much
         if k % 5 == 0:
-            for name in names:
-                nothing = (0, -trim, 0.0, 0.0, 0.0, 0.0, 0.0) if name == "XKF1" else ()
-                found.append((name, (us(k / 50), *(nothing or (*thought, 90.0)))))
+            found.append(("ATT", (us(k / 50), *thought, 90.0)))
+            found += [("XKF1", (us(k / 50), 0, *ekf, 0.0, 0.0, 0.0))] if ekf is not None else []
     return found
+
+
+def attitude(log: Log) -> Any:
+    """The last of a log's solution, roll, pitch and heading [deg]."""
+    assert log.solution is not None
+    return np.degrees(euler_from_quat(log.solution.columns["q_nb"][-1]))
 
 
 @pytest.mark.parametrize("trim", [0.0, 0.24])
 def test_an_ekf_that_does_not_run_is_no_reference(trim: float, tmp_path: Path) -> None:
     """It is logged as zeros, less the trim; the attitude that was flown by is logged beside it."""
-    log = read(lying((3.0, -2.0), (3.0 - trim, -2.0), ("XKF1", "ATT"), trim), tmp_path)
+    log = read(lying((3.0 - trim, -2.0), (-trim, 0.0, 0.0), trim), tmp_path)
     assert log.solution is not None
     assert "(ATT)" in log.solution.name
     assert set(log.solution.columns) == {"q_nb"}
-    found = np.degrees(euler_from_quat(log.solution.columns["q_nb"][-1]))
-    np.testing.assert_allclose(found, [3.0, -2.0, 90.0], atol=1e-3)
-    assert read(lying((0.0, 0.0), (0.0, 0.0)), tmp_path).solution is None
+    np.testing.assert_allclose(attitude(log), [3.0, -2.0, 90.0], atol=1e-3)
+
+
+def test_an_ekf_that_hardly_runs_is_not_either(tmp_path: Path) -> None:
+    messages = lying(ekf=(3.0, -2.0, 90.0))
+    found = [(name, (*v[:2], 0.0, 0.0, 0.0, *v[5:]) if name == "XKF1" and v[0] < us(6) else v) for name, v in messages]
+    log = read(found, tmp_path)
+    assert log.solution is not None
+    assert "(ATT)" in log.solution.name
 
 
 @pytest.mark.parametrize(("thought", "told"), [((8.0, -2.0), False), ((30.0, -2.0), True)])
 def test_an_attitude_that_is_not_how_it_lies_is_no_reference(
     thought: tuple[float, float], told: bool, tmp_path: Path
 ) -> None:
-    log = read(lying((3.0, -2.0), thought, ("ATT",)), tmp_path)
+    log = read(lying(thought), tmp_path)
     assert (log.solution is None) == told
-    assert any("tilted by 27 deg" in note for note in log.notes) == told
+    assert any("27 deg apart" in note for note in log.notes) == told
+
+
+def test_where_an_ekf_is_refused_what_was_flown_by_is_looked_at(tmp_path: Path) -> None:
+    log = read(lying(ekf=(30.0, -2.0, 90.0)), tmp_path)
+    assert any("27 deg apart" in note for note in log.notes)
+    np.testing.assert_allclose(attitude(log), [3.0, -2.0, 90.0], atol=1e-3)
+
+
+@pytest.mark.parametrize("g", [0.0, 6.0, 14.0])
+def test_no_rest_is_seen_where_gravity_is_not_felt(g: float, tmp_path: Path) -> None:
+    """Accelerometers that are dead, or of a fall or a turn."""
+    assert read(lying((30.0, -2.0), g=g), tmp_path).solution is not None
+
+
+def test_one_unit_that_agrees_is_enough(tmp_path: Path) -> None:
+    """The first has accelerometers that are stuck."""
+    messages = [(name, (*v[:1], 1, *v[2:]) if name == "IMU" else v) for name, v in lying()]
+    stuck = [("IMU", (v[0], 0, *v[2:5], 9.8, 0.0, 0.0)) for name, v in messages if name == "IMU"]
+    log = read(sorted([*messages, *stuck], key=lambda one: one[1][0]), tmp_path)
+    assert set(log.imus) == {"imu", "imu2"}
+    assert log.solution is not None
 
 
 def test_the_reference_is_the_inertial_units_attitude_whatever_the_trim(tmp_path: Path) -> None:
     """The vehicle's is logged: that of the unit, less the trim."""
-    log = read(lying((3.0, -2.0), (1.0, -2.0), ("ATT",), trim=2.0), tmp_path)
-    assert log.solution is not None
-    found = np.degrees(euler_from_quat(log.solution.columns["q_nb"][-1]))
-    np.testing.assert_allclose(found, [3.0, -2.0, 90.0], atol=1e-3)
+    np.testing.assert_allclose(attitude(read(lying((1.0, -2.0), trim=2.0), tmp_path)), [3.0, -2.0, 90.0], atol=1e-3)
+
+
+def test_a_place_that_is_given_is_kept(tmp_path: Path) -> None:
+    log = read(lying(), tmp_path)
+    given = {"source": "log", "file": "flight.bin", "reference": "none"}
+    truth = LogTruth.model_validate({**given, "start": {"lat_deg": -33.0, "lon_deg": 151.0, "alt_m": 5.0}})
+    (tmp_path / "flight.toml").write_text(draft.scenario(survey(log), tmp_path / "x", truth))
+    kept = Scenario.load(tmp_path / "flight.toml").truth
+    assert isinstance(kept, LogTruth)
+    assert (kept.start, kept.reference) == (truth.start, "none")
 
 
 def unfixed(messages: Messages, until: float) -> Messages:
