@@ -265,7 +265,7 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], since: float) -> It
             columns["q_nb"] = np.where(running[:, None], columns["q_nb"], np.nan)
             columns["v_n"] = np.where((running & (t >= since))[:, None], velocity, np.nan)
         found = Reference(f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since)})
-        if running.mean() >= LEAST_RUNNING:
+        if running.any() and running.mean() >= LEAST_RUNNING:
             yield found
         elif running.any():
             late.append(found)
