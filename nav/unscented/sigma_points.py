@@ -99,9 +99,10 @@ def factor_sized(P: Array, root: Array, columns: int, n: int) -> None:
 def scratch(n: int, m: int = USUAL_ROWS, curved: int = CURVED) -> Array:
     """Room to work in, again and again: n states, m rows of a measurement, points along ``curved`` columns of L.
 
-    The first n + `OWN` rows are for `predict`, and after it for `correct`; the others are for `innovate`.
+    The first n + `OWN` rows are for `predict`, and after it for `correct`; the others are for `innovate`. All are zero:
+    what stands beside m columns is computed with, though not used, and subnormal numbers take four times as long.
     """
-    return np.empty((2 * n + OWN + 5 * m + 4 * curved + 3, max(n, m, LANES) + 1))
+    return np.zeros((2 * n + OWN + 5 * m + 4 * curved + 3, max(n, m, LANES) + 1))
 
 
 @inlined
