@@ -200,22 +200,22 @@ def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[A
 @njit
 def _air(v_n: Array, x: Array, wind: int, gust: int, factor: float) -> tuple[Array, Array]:
     """The velocity through the mean wind (3,), and factor times that less the gust (3,)."""
-    steady_n, gust_n = v_n.copy(), np.zeros(3)
-    if wind >= 0:
-        steady_n[:2] -= x[wind : wind + 2]
-    if gust >= 0:
-        gust_n[:2] = x[gust : gust + 2]
-    return steady_n, factor * steady_n - gust_n
+    steady_n, air_n = np.empty(3), np.empty(3)
+    for i in range(3):
+        steady_n[i] = v_n[i] - x[wind + i] if wind >= 0 and i < 2 else v_n[i]
+        air_n[i] = factor * steady_n[i] - (x[gust + i] if gust >= 0 and i < 2 else 0.0)
+    return steady_n, air_n
 
 
 @njit
 def _jacobian(n: int, slope_n: Array, turned: Array, wind: int, gust: int, factor: float) -> Array:
     """Jacobian (1, n) of what has the gradient ``slope_n`` in factor (v - wind) - gust, and ``turned`` in phi."""
     H = np.zeros((1, n))
-    H[0, PHI : PHI + 3] = turned
-    H[0, VEL : VEL + 3] = factor * slope_n
-    if wind >= 0:
-        H[0, wind : wind + 2] = -factor * slope_n[:2]
-    if gust >= 0:
-        H[0, gust : gust + 2] = -slope_n[:2]
+    for i in range(3):
+        H[0, PHI + i], H[0, VEL + i] = turned[i], factor * slope_n[i]
+    for i in range(2):
+        if wind >= 0:
+            H[0, wind + i] = -factor * slope_n[i]
+        if gust >= 0:
+            H[0, gust + i] = -slope_n[i]
     return H

@@ -281,7 +281,8 @@ def range_to_ground(
     length, h = _sight(q_nb, lla, x, terrain, local, reach, heights, grid)
     gain = 1.0 + x[scale] if scale >= 0 else 1.0
     H = np.empty((1, len(x)))
-    H[0] = gain * h
+    for i in range(len(x)):
+        H[0, i] = gain * h[i]
     if scale >= 0:
         H[0, scale] = length
     return np.array([measured - gain * length]), H

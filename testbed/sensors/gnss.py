@@ -438,7 +438,8 @@ def _displaced(antenna: Array, d_n: Array) -> Array:
     """`displaced`, of each row of both (N, _)."""
     places = np.empty((len(antenna), 3))
     for k in range(len(antenna)):
-        places[k] = displaced(antenna[k, 0], antenna[k, 1], antenna[k, 2], d_n[k])
+        place = displaced(antenna[k, 0], antenna[k, 1], antenna[k, 2], d_n[k])
+        places[k, 0], places[k, 1], places[k, 2] = place
     return places
 
 
