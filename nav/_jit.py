@@ -10,7 +10,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
@@ -84,6 +84,17 @@ def _keep_for_now() -> None:
     )
 
 
+def _keep(index: Any, key: object, code: object) -> None:
+    """Keep what was compiled for a signature: the code in a file of its own, and only then the index that names it.
+
+    Numba does it the other way round, in numbered files. There an older version's code is found by who looks meanwhile,
+    and by everybody after an interrupt in between; and two processes may take one number for two signatures.
+    """
+    name = index._data_name(int(hashlib.sha256(repr(key).encode()).hexdigest()[:12], 16))
+    index._save_data(name, code)
+    index._save_index(index._load_index() | {key: name})
+
+
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     """Compile with an on-disk cache that is good while all that it may be made of is what it was.
 
@@ -97,6 +108,7 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
         compiled = numba.njit(cache=True, **options)(function)
     index = compiled._cache._cache_file
     index._source_stamp = index._source_stamp, _sources(function.__module__)
+    index.save = partial(_keep, index)
     return cast("Callable[P, R]", compiled)
 
 

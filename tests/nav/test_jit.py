@@ -69,6 +69,40 @@ def test_kernels_are_good_while_all_that_they_are_made_of_is_what_it_was(tmp_pat
     assert called() == ["9.0", "1", "0"]
 
 
+INTERRUPTED = """
+from numba.core.caching import IndexDataCacheFile
+written, write = [], IndexDataCacheFile._open_for_write
+def interrupted(self, path):
+    written.append(path)
+    if len(written) == 2:
+        raise KeyboardInterrupt
+    return write(self, path)
+IndexDataCacheFile._open_for_write = interrupted
+from mine.innermost import add
+add(1.0, 1.0)
+"""
+
+
+@pytest.mark.ci
+def test_interrupted_while_a_kernel_is_kept_nobody_takes_an_older_one_for_it(tmp_path):
+    """Between the two files that are written for it, what an older version compiled is still there."""
+    package = tmp_path / "mine"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(Path(nav.__file__).parents[1])])}
+    environment.pop("NUMBA_CACHE_DIR", None)
+
+    def run(script):
+        return subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+
+    call = "from mine.innermost import add\nprint(add(1.0, 1.0))"
+    (package / "innermost.py").write_text(KERNELS["innermost"])
+    assert run(call).stdout.split() == ["2.0"]
+    (package / "innermost.py").write_text(KERNELS["innermost"].replace("x + y", "x + y + 1"))
+    assert "KeyboardInterrupt" in run(INTERRUPTED).stderr
+    assert run(call).stdout.split() == ["3.0"]
+
+
 @pytest.mark.ci
 def test_nowhere_to_keep_kernels_is_said_once_and_they_are_compiled_all_the_same(tmp_path):
     """A read-only installation and no home, as in a container; also for the processes that such a one starts."""
