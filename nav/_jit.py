@@ -95,6 +95,12 @@ def _keep(index: Any, key: object, code: object) -> None:
     index._save_index(index._load_index() | {key: name})
 
 
+def is_kept(kernel: Callable[..., Any]) -> bool:
+    """Whether a kernel, as it is now, has been compiled before and can be loaded."""
+    compiled: Any = kernel
+    return bool(compiled._cache._cache_file._load_index())
+
+
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     """Compile with an on-disk cache that is good while all that it may be made of is what it was.
 

@@ -6,6 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from nav import _jit
+from nav.ahrs.steps import advance
+from nav.state import propagate
 from testbed import plugins
 from testbed.errors import UserError, choice, shown
 from testbed.estimators import ahrs, custom, federated, ins, outside
@@ -16,16 +19,20 @@ from testbed.estimators.section import EstimatorSection
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """The keys of an ``[[estimator]]`` of this kind, and what builds it from them."""
+    """The keys of an ``[[estimator]]`` of this kind, and what builds it from them.
+
+    ``kernel``, of one that has compiled kernels, is the largest of those that any of this kind needs.
+    """
 
     section: type[EstimatorSection]
     build: Callable[[Any, Rig], Lane]
+    kernel: Callable[..., object] | None = None
 
 
 BUILT_IN: Mapping[str, Kind] = {
-    "ins": Kind(ins.InsSection, ins.build),
-    "federated": Kind(federated.FederatedSection, federated.build),
-    "ahrs": Kind(ahrs.AhrsSection, ahrs.build),
+    "ins": Kind(ins.InsSection, ins.build, propagate),
+    "federated": Kind(federated.FederatedSection, federated.build, propagate),
+    "ahrs": Kind(ahrs.AhrsSection, ahrs.build, advance),
     "px4": Kind(outside.Px4Section, outside.build),
     "ardupilot": Kind(outside.ArduPilotSection, outside.build),
 }
@@ -45,6 +52,12 @@ def find(kind: str) -> Kind:
     known = [*BUILT_IN, *plugins.installed(custom.GROUP)]
     text = f"there is no kind {shown(kind)}: {choice(kind, known)}"
     raise UserError(f'{text}, or name a class of your own, such as "./filters.py:Mine" or "mypackage.filters:Mine"')
+
+
+def is_kept(sections: Sequence[EstimatorSection]) -> bool:
+    """Whether the largest kernel of each of these estimators has been compiled before."""
+    kernels = {find(section.kind).kernel for section in sections}
+    return all(_jit.is_kept(kernel) for kernel in kernels if kernel is not None)
 
 
 def build(sections: Sequence[EstimatorSection], rig: Rig) -> dict[str, Lane]:

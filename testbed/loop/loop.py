@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,9 +29,12 @@ from testbed.feeds.known import commanded, handed_over
 from testbed.loop.director import Director, Executor, Restarted
 from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
+from testbed.loop.rehearsal import Rehearsal
 from testbed.loop.requests import Recorded, Request
 from testbed.loop.settings import Parts
 from testbed.loop.showing import Arrivals, Backlog, Showing
+from testbed.motion.ahead import Ahead
+from testbed.motion.logged import LogTruth
 from testbed.motion.table import MotionSource
 from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
@@ -104,6 +108,12 @@ def run(
             raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
         shown = shown_estimator(_own(scenario, far_end), shown) if links or shown is not None else None
         setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
+        own, helper = _own(scenario, far_end), None
+        if source is None and far_end is None and _leaves_to_compile(scenario):
+            # From the other end: sensors, then the last estimator, while the run begins with the first.
+            others = ((), *((one,) for one in reversed(own) if registry.find(one.kind).kernel))
+            helper = Rehearsal([partial(_rehearse, scenario, some, Setup(seed, build=build)) for some in others])
+            ending.callback(helper.close)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
             require_own(setup.out, [RECORD, METRICS])
@@ -112,11 +122,9 @@ def run(
         director = Director(asking, replay, realtime, rate_hz, source is None and far_end is None)
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
-            own = _own(scenario, far_end)
-            rehearsal = scenario.model_copy(
-                update={"duration_s": min(REHEARSAL_S, scenario.duration_s), "estimator": own}
-            )
-            _fly(rehearsal, Setup(seed, build=build), Director((), (), None, rate_hz))
+            _rehearse(scenario, own, Setup(seed, build=build))
+            if helper is not None:
+                helper.close()
         flown = None
         while flown is None:
             with suppress(Restarted):
@@ -126,6 +134,17 @@ def run(
             metrics.save(results, setup.out / METRICS)
     told = (*flown.remarks, *remarks(flown.dataset, results))
     return RunResult(flown.dataset, results, setup.out, flown.failure, told)
+
+
+def _leaves_to_compile(scenario: Scenario) -> bool:
+    """Whether much of what a run needs is still to be compiled, and a second process may do a part of that."""
+    return Ahead.possible() and not isinstance(scenario.truth, LogTruth) and not registry.is_kept(scenario.estimator)
+
+
+def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], setup: Setup) -> None:
+    """Fly the beginning of a scenario with some of its estimators, and keep nothing."""
+    beginning = {"duration_s": min(REHEARSAL_S, scenario.duration_s), "estimator": tuple(estimators)}
+    _fly(scenario.model_copy(update=beginning), setup, Director((), (), None, scenario.truth.rate_hz))
 
 
 @dataclass(frozen=True, slots=True)
