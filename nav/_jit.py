@@ -91,8 +91,20 @@ def _keep(index: Any, key: object, code: object) -> None:
     and by everybody after an interrupt in between; and two processes may take one number for two signatures.
     """
     name = index._data_name(int(hashlib.sha256(repr(key).encode()).hexdigest()[:12], 16))
-    index._save_data(name, code)
+    index._save_data(name, (index._version, index._source_stamp, code))
     index._save_index(index._load_index() | {key: name})
+
+
+def _kept(index: Any, key: object) -> object:
+    """What was kept for a signature, None unless it is of this version: another one may just be writing its own."""
+    name = index._load_index().get(key)
+    if name is None:
+        return None
+    try:
+        version, stamp, code = index._load_data(name)
+    except OSError:
+        return None
+    return code if (version, stamp) == (index._version, index._source_stamp) else None
 
 
 def is_kept(kernel: Callable[..., Any]) -> bool:
@@ -114,7 +126,7 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
         compiled = numba.njit(cache=True, **options)(function)
     index = compiled._cache._cache_file
     index._source_stamp = index._source_stamp, _sources(function.__module__)
-    index.save = partial(_keep, index)
+    index.save, index.load = partial(_keep, index), partial(_kept, index)
     return cast("Callable[P, R]", compiled)
 
 

@@ -52,6 +52,13 @@ def _end(number: int, frame: object) -> None:
     os._exit(128 + number)
 
 
+def left_to_others() -> None:
+    """In a process that was forked: SIGINT is for who began it, SIGTERM ends this one alone, and nobody else hears."""
+    signal.set_wakeup_fd(-1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
 @contextmanager
 def heeded() -> Iterator[None]:
     """While the context lasts, the first of `SIGNALS` raises `Interrupted`, and the watch over the end begins.

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from nav.columns import Estimates
 from nav.samples import Sample, Status
+from testbed import interrupts
 from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
@@ -42,6 +43,7 @@ from testbed.scenario import Scenario
 from testbed.score import metrics
 from testbed.score.remarks import remarks
 from testbed.sensors.imu import ImuConfig
+from testbed.sensors.registry import BUILT_IN
 
 if TYPE_CHECKING:
     import xarray
@@ -109,11 +111,12 @@ def run(
         shown = shown_estimator(_own(scenario, far_end), shown) if links or shown is not None else None
         setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
         own, helper = _own(scenario, far_end), None
-        if source is None and far_end is None and _leaves_to_compile(scenario):
+        if _leaves_to_compile(scenario, setup):
             # From the other end: sensors, then the last estimator, while the run begins with the first.
             others = ((), *((one,) for one in reversed(own) if registry.find(one.kind).kernel))
-            helper = Rehearsal([partial(_rehearse, scenario, some, Setup(seed, build=build)) for some in others])
-            ending.callback(helper.close)
+            with interrupts.held():
+                helper = Rehearsal([partial(_rehearse, scenario, some, Setup(seed)) for some in others])
+                ending.callback(helper.close)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
             require_own(setup.out, [RECORD, METRICS])
@@ -136,9 +139,16 @@ def run(
     return RunResult(flown.dataset, results, setup.out, flown.failure, told)
 
 
-def _leaves_to_compile(scenario: Scenario) -> bool:
-    """Whether much of what a run needs is still to be compiled, and a second process may do a part of that."""
-    return Ahead.possible() and not isinstance(scenario.truth, LogTruth) and not registry.is_kept(scenario.estimator)
+def _leaves_to_compile(scenario: Scenario, setup: Setup) -> bool:
+    """Whether much of what a run needs is still to be compiled, and a second process may do a part of that.
+
+    That flies parts of the scenario once more: not where a filter steers, a log would be read, or anybody else's code
+    would be called.
+    """
+    ours = (setup.source, setup.far_end, setup.build) == (None, None, registry.build)
+    ours &= all(section.kind in BUILT_IN for section in scenario.sensors.values())
+    open_loop = not isinstance(scenario.truth, LogTruth) and not scenario.autopilot.feedback.estimators
+    return ours and open_loop and Ahead.possible() and not registry.is_kept(scenario.estimator)
 
 
 def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], setup: Setup) -> None:

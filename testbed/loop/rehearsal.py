@@ -10,31 +10,38 @@ import warnings
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout, suppress
 
+from testbed import interrupts
+
 PR_SET_PDEATHSIG = 1  # prctl(2); only where there is fork, which is on Linux (`testbed.motion.ahead.Ahead.possible`)
 
 
 class Rehearsal:
     """Flies ``flights`` one after the other in a process of its own; nobody hears what becomes of them.
 
-    What it has compiled by then is on disk for whoever needs it next. `close` ends it, wherever it is.
+    What it has compiled by then is on disk for whoever needs it next. `close` ends it, wherever it is. Where there can
+    be no further process, nothing is flown.
     """
 
     def __init__(self, flights: Sequence[Callable[[], object]]) -> None:
-        self._process = multiprocessing.get_context("fork").Process(target=_fly, args=(flights,), daemon=True)
-        with warnings.catch_warnings():
+        context = multiprocessing.get_context("fork")
+        self._process = context.Process(target=_fly, args=(flights, os.getpid()), daemon=True)
+        with warnings.catch_warnings(), suppress(OSError):
             warnings.simplefilter("ignore", DeprecationWarning)  # of forks beside threads: see `testbed.motion.ahead`
             self._process.start()
 
     def close(self) -> None:
         """End the process."""
-        self._process.kill()
-        self._process.join()
+        if self._process.pid is not None:
+            self._process.kill()
+            self._process.join()
 
 
-def _fly(flights: Sequence[Callable[[], object]]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who asked for the run decides what an interrupt means
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody needs it when who began it has been killed
+def _fly(flights: Sequence[Callable[[], object]], parent: int) -> None:
     try:
+        interrupts.left_to_others()
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # nobody needs it when who began it has been killed
+        if os.getppid() != parent:
+            return
         with open(os.devnull, "w", encoding="utf-8") as nobody, redirect_stdout(nobody), redirect_stderr(nobody):
             for stream in (1, 2):
                 os.dup2(nobody.fileno(), stream)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import mmap
 import multiprocessing
 import os
-import signal
 import threading
 import traceback
 import warnings
@@ -15,6 +14,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
+from testbed import interrupts
 from testbed.motion.table import COLUMNS, MotionSource, TruthBlock
 
 SLOTS = 3  # blocks flown ahead, so that neither side waits for the other
@@ -112,9 +112,9 @@ def _fly(
 
     Strewn over what was free in that of the process that forked, JSBSim's model takes a tenth longer for each step.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # who asked for the motion decides what an interrupt means
-    other_end.close()
     try:
+        interrupts.left_to_others()
+        other_end.close()
         thread = threading.Thread(target=_share, args=(make, shared, ticks, blocks), daemon=True)
         thread.start()
         thread.join()

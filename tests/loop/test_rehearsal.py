@@ -6,11 +6,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from testbed import Scenario, run
 from testbed.estimators import registry
+from testbed.loop.loop import Setup, _leaves_to_compile
 from testbed.loop.rehearsal import Rehearsal
 
 SCENARIO = """
@@ -104,6 +106,40 @@ def test_it_ends_with_who_began_it():
         time.sleep(0.05)
     assert killed.stdout
     assert not Path("/proc", killed.stdout.strip()).exists()
+
+
+def test_a_signal_to_it_ends_it_alone():
+    """Who heeds interrupts is told of them by a pipe, which a process that was forked has too."""
+    script = (
+        "import os, signal, time\nfrom testbed import interrupts\nfrom testbed.loop.rehearsal import Rehearsal\n"
+        "with interrupts.heeded():\n"
+        "    rehearsal = Rehearsal([lambda: time.sleep(60)])\n    time.sleep(1)\n"
+        "    os.kill(rehearsal._process.pid, signal.SIGTERM)\n    rehearsal._process.join()\n"
+        "    time.sleep(interrupts.GRACE_S + 0.5)\n    print('went on')"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "went on\n", "")
+
+
+def test_where_there_can_be_no_process_nothing_is_flown(monkeypatch):
+    def fails(process):
+        raise BlockingIOError
+
+    monkeypatch.setattr(multiprocessing.get_context("fork").Process, "start", fails)
+    Rehearsal([]).close()
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
+def test_neither_somebody_elses_code_is_rehearsed_nor_what_a_filter_steers_nor_a_log(monkeypatch):
+    monkeypatch.setattr(registry, "is_kept", lambda sections: False)
+    scenario = Scenario.parse(SCENARIO)
+    mine = {"mine": SimpleNamespace(kind="./mine.py:Mine")}
+    others = scenario.model_copy(update={"sensors": scenario.sensors | mine})
+    assert _leaves_to_compile(scenario, Setup(1))
+    assert not _leaves_to_compile(others, Setup(1))
+    assert not _leaves_to_compile(scenario, Setup(1, build=lambda sections, rig: {}))
+    assert not _leaves_to_compile(Scenario.load("closed_loop_spoofed"), Setup(1))
+    assert not _leaves_to_compile(Scenario.load("recorded_flight"), Setup(1))
 
 
 def test_an_estimator_of_somebody_elses_is_not_rehearsed():

@@ -84,8 +84,8 @@ add(1.0, 1.0)
 
 
 @pytest.mark.ci
-def test_interrupted_while_a_kernel_is_kept_nobody_takes_an_older_one_for_it(tmp_path):
-    """Between the two files that are written for it, what an older version compiled is still there."""
+def test_interrupted_while_a_kernel_is_kept_nobody_takes_another_version_for_it(tmp_path):
+    """Between the two files that are written for it, one of them is still of the version before."""
     package = tmp_path / "mine"
     package.mkdir()
     (package / "__init__.py").touch()
@@ -95,12 +95,22 @@ def test_interrupted_while_a_kernel_is_kept_nobody_takes_an_older_one_for_it(tmp
     def run(script):
         return subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
 
+    def install(factor, t):
+        """With the same bytecode whatever the factor: numba's own key is the same."""
+        file = package / "innermost.py"
+        file.write_text(f"from nav._jit import njit\n@njit\ndef add(x, y):\n    return x + y * {factor}\n")
+        os.utime(file, (t, t))
+
     call = "from mine.innermost import add\nprint(add(1.0, 1.0))"
-    (package / "innermost.py").write_text(KERNELS["innermost"])
+    install(1.0, 1e9)
     assert run(call).stdout.split() == ["2.0"]
-    (package / "innermost.py").write_text(KERNELS["innermost"].replace("x + y", "x + y + 1"))
+    install(2.0, 2e9)
     assert "KeyboardInterrupt" in run(INTERRUPTED).stderr
+    install(1.0, 1e9)
+    assert run(call).stdout.split() == ["2.0"]
+    install(2.0, 2e9)
     assert run(call).stdout.split() == ["3.0"]
+    assert run(call + "\nprint(sum(add.stats.cache_hits.values()))").stdout.split() == ["3.0", "1"]
 
 
 @pytest.mark.ci
