@@ -21,7 +21,7 @@ from testbed.estimators.section import EstimatorSection
 class Kind:
     """The keys of an ``[[estimator]]`` of this kind, and what builds it from them.
 
-    ``kernel``, of one that has compiled kernels, is the largest of those that any of this kind needs.
+    ``kernel``, of a kind that has any, is the largest that every one of this kind needs.
     """
 
     section: type[EstimatorSection]
