@@ -94,6 +94,7 @@ def test_what_fails_or_prints_in_it_is_not_heard_and_what_comes_after_is_flown(t
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.ci
 def test_it_ends_with_who_began_it():
     script = (
         "import os, signal, time\nfrom testbed.loop.rehearsal import Rehearsal\n"
@@ -108,6 +109,7 @@ def test_it_ends_with_who_began_it():
     assert not Path("/proc", killed.stdout.strip()).exists()
 
 
+@pytest.mark.ci
 def test_a_signal_to_it_ends_it_alone():
     """Who heeds interrupts is told of them by a pipe, which a process that was forked has too."""
     script = (
