@@ -123,12 +123,15 @@ def test_a_signal_to_it_ends_it_alone():
     assert (run.returncode, run.stdout, run.stderr) == (0, "went on\n", "")
 
 
-def test_where_there_can_be_no_process_nothing_is_flown(monkeypatch):
+def test_where_there_can_be_no_process_nothing_is_flown(tmp_path, monkeypatch):
     def fails(process):
         raise BlockingIOError
 
     monkeypatch.setattr(multiprocessing.get_context("fork").Process, "start", fails)
-    Rehearsal([]).close()
+    rehearsal = Rehearsal([(tmp_path / "flown").touch])
+    rehearsal.close()
+    assert rehearsal._process.pid is None
+    assert not (tmp_path / "flown").exists()
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
