@@ -255,7 +255,7 @@ class ErrorModel:
 def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
     """Sum the estimated inertial errors by kind: ``errors`` (4, 3), rows as `Drive`; ``x`` (size,) estimated values.
 
-    What crosses over from other axes is no error of one axis: `uncross` takes it off.
+    What crosses over from other axes is no error of one axis: `take_errors` takes it off too.
     """
     for kind in range(len(errors)):
         for axis in range(3):
@@ -268,7 +268,22 @@ def sensor_errors(errors: Array, x: Array, driven: Indices) -> None:
 
 
 @inlined
-def uncross(angle: Array, push: Array, imu: Array, driven: Indices) -> None:
+def take_errors(
+    angle: Array, push: Array, rates: Array, T: float, errors: Array, imu: Array, driven: Indices
+) -> None:  # fmt: skip
+    """Fill ``angle`` and ``push`` (3,) with an increment less the sensor errors that are estimated.
+
+    ``rates`` (2, 3) are angular rate and specific force as measured over its ``T`` seconds, ``errors`` those of
+    `sensor_errors`, ``imu`` the estimated values.
+    """
+    for i in range(3):
+        angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
+        push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
+    _uncross(angle, push, imu, driven)
+
+
+@inlined
+def _uncross(angle: Array, push: Array, imu: Array, driven: Indices) -> None:
     """Take off increments, in place, what crosses over from other axes by the estimates ``imu``, to first order."""
     for block in range(len(driven)):
         kind, start = driven[block, 0], driven[block, 1]

@@ -23,7 +23,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.alignment import usable
-from nav.error_model import MOTION, ErrorModel, Indices, sensor_errors, transition
+from nav.error_model import MOTION, ErrorModel, Indices, sensor_errors, take_errors, transition
 from nav.samples import Array, ImuSamples
 from nav.state import State, inject, integrate
 from nav.strapdown import step
@@ -76,7 +76,7 @@ class Smoother:
         model, common = self._model, len(state.imu)
         Phi = np.zeros((MOTION, common))
         T = _transition(
-            Phi, state.q_nb.copy(), state.v_n.copy(), state.lla.copy(), state.errors, model.driven,
+            Phi, state.q_nb.copy(), state.v_n.copy(), state.lla.copy(), state.errors, state.imu, model.driven,
             sound.dtheta, sound.dv, sound.dt,
         )  # fmt: skip
         M = self._nodes[-1].M
@@ -132,9 +132,9 @@ class Smoother:
         begun = now.t
         for k in range(first, last):
             until = min(float(imu.t[k]), t)
-            share = (until - begun) / imu.dt[k]
+            rates = np.array([imu.dtheta[k], imu.dv[k]]) / imu.dt[k]
             _advance(
-                state.q_nb, state.v_n, state.lla, state.errors, share * imu.dtheta[k], share * imu.dv[k], until - begun
+                state.q_nb, state.v_n, state.lla, state.errors, state.imu, self._model.driven, rates, until - begun
             )
             begun = until
         return Smoothed(t, state)
@@ -171,16 +171,17 @@ def _sound(imu: ImuSamples, rates: Array) -> ImuSamples:
 
 @njit
 def _transition(
-    Phi: Array, q_nb: Array, v_n: Array, lla: Array, errors: Array, driven: Indices, dtheta: Array, dv: Array, dt: Array
-) -> float:
+    Phi: Array, q_nb: Array, v_n: Array, lla: Array, errors: Array, estimated: Array, driven: Indices,
+    dtheta: Array, dv: Array, dt: Array,
+) -> float:  # fmt: skip
     """Fill ``Phi`` (9, common) as `error_model.transition` does, over N increments from a nominal state; their time."""
     sums, FT, T = np.zeros((3, 3, 3)), np.zeros_like(Phi), 0.0
-    angle, push = np.empty(3), np.empty(3)
+    angle, push, rates = np.empty(3), np.empty(3), np.empty((2, 3))
     for k in range(len(dt)):
         before = q_nb.copy()
         for i in range(3):
-            angle[i] = (dtheta[k, i] - errors[0, i] * dt[k]) / (1.0 + errors[2, i])
-            push[i] = (dv[k, i] - errors[1, i] * dt[k]) / (1.0 + errors[3, i])
+            rates[0, i], rates[1, i] = dtheta[k, i] / dt[k], dv[k, i] / dt[k]
+        take_errors(angle, push, rates, dt[k], errors, estimated, driven)
         step(q_nb, v_n, lla, angle, push, dt[k])
         integrate(sums, before, q_nb, angle, push, dt[k])
         T += dt[k]
@@ -189,10 +190,10 @@ def _transition(
 
 
 @njit
-def _advance(q_nb: Array, v_n: Array, lla: Array, errors: Array, dtheta: Array, dv: Array, dt: float) -> None:
-    """One increment of the strapdown with known sensor errors, in place."""
+def _advance(
+    q_nb: Array, v_n: Array, lla: Array, errors: Array, estimated: Array, driven: Indices, rates: Array, dt: float
+) -> None:
+    """``dt`` seconds of the strapdown at the measured ``rates`` (2, 3), with known sensor errors, in place."""
     angle, push = np.empty(3), np.empty(3)
-    for i in range(3):
-        angle[i] = (dtheta[i] - errors[0, i] * dt) / (1.0 + errors[2, i])
-        push[i] = (dv[i] - errors[1, i] * dt) / (1.0 + errors[3, i])
+    take_errors(angle, push, rates, dt, errors, estimated, driven)
     step(q_nb, v_n, lla, angle, push, dt)

@@ -13,7 +13,7 @@ import numpy as np
 from nav._jit import inlined, lean, njit
 from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, radii, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, transition, uncross
+from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, take_errors, transition
 from nav.kalman import predict, update_in
 from nav.rotation import turn
 from nav.samples import Array
@@ -315,10 +315,7 @@ def propagate(
                     for i in range(3):
                         P[f, PHI + i, PHI + i] += in_motion[f, 3] * turned
                         P[f, VEL + i, VEL + i] += in_motion[f, 3] * pushed
-            for i in range(3):
-                angle[i] = (rates[0, i] - errors[0, i]) * T / (1.0 + errors[2, i])
-                push[i] = (rates[1, i] - errors[1, i]) * T / (1.0 + errors[3, i])
-            uncross(angle, push, imu, driven)
+            take_errors(angle, push, rates, T, errors, imu, driven)
             for i in range(4):
                 before[i] = q_nb[i]
             step(q_nb, v_n, lla, angle, push, T)

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from worlds.ins import CONSUMER, FIELD_N, airspeed, barometer, error, flight, gnss, imu, magnetometer
+from worlds.motion import DT
 
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
-from nav.error_model import MOTION, ErrorModel, ImuModel
+from nav.error_model import CROSS, MOTION, ErrorModel, ImuModel, sensor_errors
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import ImuSamples
-from nav.smoother import Smoother
+from nav.smoother import Smoothed, Smoother
 from nav.state import State
 from nav.unscented import Scaling
 
@@ -73,6 +74,38 @@ def test_it_is_the_least_squares_solution():
             node.state.P[0], whole[own, own], rtol=1e-6, atol=1e-9 * np.abs(whole[own, own]).max()
         )
         np.testing.assert_allclose(node.state.imu[MOTION:], at_once[own][MOTION:], rtol=1e-5, atol=1e-9)
+
+
+def as_told(truth, k, model):
+    """A state of a ``model`` that is the truth of row ``k``."""
+    state = State(model.mixing, 1, model.size)
+    state.q_nb[:], state.v_n[:] = truth.q_nb[k], truth.v_n[k]
+    state.lla[:] = truth.lat[k], truth.lon[k], truth.h[k]
+    return state
+
+
+def test_what_axes_feel_of_each_other_is_taken_off_between_nodes():
+    """Known to the filter, it changes neither where a second of increments leads nor what errors become in it."""
+    truth, rows = flight(DURATION), slice(5001, 5091)
+    model = ErrorModel(ImuModel(1e-3, 1e-2, 1e-3, 0.05, 1e-4, 1e-3, gyro_misalignment=0.017, accel_misalignment=0.017))
+    felt = np.random.default_rng(2).normal(0.0, 0.017, (2, 6))
+    turn, push = np.eye(3), np.eye(3)
+    for axes, of_gyros, of_accels in zip(CROSS, *felt, strict=True):
+        turn[axes], push[axes] = of_gyros, of_accels
+    clean = ImuSamples(truth.t[rows], np.full(90, DT), truth.dtheta[rows], truth.dv[rows])
+    crossed = ImuSamples(clean.t, clean.dt, clean.dtheta @ turn.T, clean.dv @ push.T)
+    exact, known = as_told(truth, 5000, model), as_told(truth, 5000, model)
+    known.imu[model.slices["gyro_cross"]], known.imu[model.slices["accel_cross"]] = felt
+    sensor_errors(known.errors, known.imu, model.driven)
+    maps = []
+    for state, measured in ((exact, clean), (known, crossed)):
+        smoother = Smoother(model)
+        smoother.pause(truth.t[5000], state)
+        smoother.carry(state, measured)
+        maps.append(smoother._nodes[0].M[:, :MOTION])
+        last = smoother._carried(Smoothed(truth.t[5000], state), float(clean.t[-1]), measured).state
+        np.testing.assert_allclose(last.v_n, truth.v_n[5090], atol=0.02)  # to the second order in 17 mrad
+    np.testing.assert_allclose(maps[1], maps[0], rtol=2e-3, atol=0.01)
 
 
 def flown(seed, smooth=True):
