@@ -393,7 +393,7 @@ class LocalFilter:
     ) -> Ruling:
         """Correct with the ``used`` axes as far as the policy lets them; what was used teaches ``noise``.
 
-        The weight is the mean factor on the information.
+        The weight is the mean factor on the information, one of an axis without noise.
         """
         H, R, at_points = measurement.H, measurement.R, measurement.at_points
         whole = bool(used.all())
@@ -418,7 +418,7 @@ class LocalFilter:
             at_points = None if at_points is None else at_points[:, used]
             self.absorb(reference, state, nu[used], H[used], R[used], math.inf, at_points)
         reported = measurement.R if measurement.reported is None else measurement.reported
-        weight = float((reported / R).sum()) / len(R)
+        weight = float(np.divide(reported, R, out=np.ones(len(R)), where=R > 0.0).sum()) / len(R)
         return Ruling(Outcome.FUSED if weight >= 1.0 else Outcome.WEAKENED, weight=weight)
 
 

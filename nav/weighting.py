@@ -224,9 +224,9 @@ class SageHusa:
     def learn(self, nu: Array, HPH: Array, used: Array) -> None:
         """Take the sample just adapted: innovation (m,), H P H' (m, m) before the update, the variances of that (m,).
 
-        An axis whose variance is infinite teaches nothing, nor does one whose residual is no number. A residual whose
-        variance was made k times larger by other policies counts as one k^-1/2 times as large, so that an outlier
-        teaches no more than the limit that it was inflated to.
+        An axis whose variance is infinite or none at all teaches nothing, nor does one whose residual is no number. A
+        residual whose variance was made k times larger by other policies counts as one k^-1/2 times as large, so that
+        an outlier teaches no more than the limit that it was inflated to.
         """
         if self.ratio is None or not np.isfinite(used).any():
             return
@@ -238,7 +238,7 @@ class SageHusa:
 def _teach(ratio: Array, taken: Array, left: Array, after: Array, R: Array, used: Array, b: float) -> None:
     """Put a `residual` into what is learned, ``ratio`` (m,) and ``taken`` (m,), in place: see `SageHusa.learn`."""
     for i in range(len(ratio)):
-        if math.isfinite(left[i]):
+        if math.isfinite(left[i]) and R[i] > 0.0:
             taken[i] += 1.0
             d = (1.0 - b) / (1.0 - b ** (taken[i] + 1.0))
             latest = left[i] ** 2 * (ratio[i] * R[i] / used[i]) + after[i, i]

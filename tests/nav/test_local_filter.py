@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from worlds.ins import CONSUMER, FIELD_N, error, feed, flight, gnss, imu
+from worlds.ins import CONSUMER, FIELD_N, barometer, error, feed, flight, gnss, imu
 
 from nav.aids import AirspeedAid, BarometerAid, Course, GnssAid
 from nav.aids.base import aid_blocks
@@ -17,6 +17,7 @@ from nav.local_filter import LocalFilter
 from nav.monitor import Change, Monitor, Patience
 from nav.samples import Outcome
 from nav.unscented import Scaling
+from nav.weighting import MahalanobisInflation, SageHusa
 
 
 class Scripted:
@@ -118,12 +119,15 @@ class Times:
         return R * self.factors
 
 
-def run(policies, scale=1.0, seconds=20):
+def run(policies, scale=1.0, seconds=20, perfect=False):
     truth = flight(60)
     rng = np.random.default_rng(1)
     increments, *_ = imu(truth, CONSUMER, rng)
     fixes = [dataclasses.replace(f, sigma_position_n=scale * f.sigma_position_n) for f in gnss(truth, rng, 5.0)]
-    ins = Ins(InsConfig(CONSUMER, (GnssAid(),), false_rejection=1e-12), lambda *_: FIELD_N, policies)
+    if perfect:
+        fixes += barometer(truth, rng, sigma=0.0)
+    aids = (GnssAid(), BarometerAid(sigma=0.0, bias_sigma=1e-3)) if perfect else (GnssAid(),)
+    ins = Ins(InsConfig(CONSUMER, aids, false_rejection=1e-12), lambda *_: FIELD_N, policies)
     covariance = np.diag(np.repeat([1e-3, 0.1, 1.0], 3) ** 2)
     ins.start(InitialState(0.0, truth.lat[0], truth.lon[0], truth.h[0], truth.v_n[0], truth.q_nb[0], covariance))
     estimates, reports = feed(FusionHorizon(ins), increments, [f for f in fixes if f.t < seconds])
@@ -156,6 +160,15 @@ def test_an_infinite_variance_leaves_the_axis_out():
     }
     assert {r.weight for r in reports if r.aid == "gnss_velocity"} == {0.0}  # a position not used withholds it
     assert np.isfinite(error(nothing, flight(60))).all()
+
+
+@pytest.mark.parametrize("policy", [SageHusa(), MahalanobisInflation(), Times(4.0)])
+def test_a_sensor_without_noise_keeps_its_weight(policy):
+    """There is no variance to learn or to inflate: the same to the last bit as without a policy."""
+    estimate, reports = run({"barometer": policy}, perfect=True)
+    expected, _ = run({}, perfect=True)
+    assert {r.weight for r in reports if r.aid == "barometer"} == {1.0}
+    np.testing.assert_array_equal(estimate.covariance, expected.covariance)
 
 
 def test_names_of_the_states():

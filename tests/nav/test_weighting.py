@@ -171,6 +171,15 @@ def test_sage_husa_ignores_an_axis_without_residual():
         SageHusa(b=1.0)
 
 
+def test_sage_husa_learns_nothing_of_an_axis_without_noise():
+    policy, alone = SageHusa(), SageHusa()
+    policy.adapt(np.zeros(2), np.eye(2), np.array([0.0, 1.0]), 0.0)
+    policy.learn(np.array([3.0, 3.0]), np.eye(2), np.array([0.0, 1.0]))
+    alone.adapt(np.zeros(1), np.eye(1), np.ones(1), 0.0)
+    alone.learn(np.array([3.0]), np.eye(1), np.ones(1))
+    np.testing.assert_array_equal(policy.ratio, [1.0, *alone.ratio])
+
+
 def test_sage_husa_first_weight_is_finite():
     """The nominal is the first member of the mean: after one look R is near (1 + e^2) / 2."""
     policy = SageHusa(b=0.98)
