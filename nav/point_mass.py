@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from nav._jit import njit
-from nav.earth import radii
+from nav.earth import radii, wrap_longitude
 from nav.samples import Array
 from nav.terrain import Terrain, ground
 
@@ -110,7 +110,7 @@ class PointMass:
         Mardia's kurtosis, and the share that lies on the edge of the grid.
         """
         R_M, R_N = radii(self.lat)
-        off = np.array([(self.lat - lat) * R_M, (self.lon - lon) * R_N * math.cos(self.lat)])
+        off = np.array([(self.lat - lat) * R_M, wrap_longitude(self.lon - lon) * R_N * math.cos(self.lat)])
         north, east = (off[i] + self.axis * self.step[i] for i in range(2))
         places = np.stack(np.meshgrid(north, east, indexing="ij"), axis=-1)
         log_w = self.log_w - 0.5 * np.einsum("ijk,kl,ijl->ij", places, np.linalg.inv(P), places)
@@ -142,7 +142,7 @@ class PointMass:
         R = np.linalg.inv(information)
         z = R @ np.linalg.solve(C, mean)
         R_M, R_N = radii(lat)
-        return Fix(lat + z[0] / R_M, lon + z[1] / (R_N * math.cos(lat)), R)
+        return Fix(lat + z[0] / R_M, wrap_longitude(lon + z[1] / (R_N * math.cos(lat))), R)
 
 
 @njit

@@ -40,6 +40,8 @@ def ground(lat: float, lon: float, heights: Array, grid: Array) -> tuple[float, 
     if rows == 1 or columns == 1:
         return heights[0, 0], 0.0, 0.0
     row, column = (lat - grid[0]) / grid[1], (lon - grid[2]) / grid[3]
+    around = 2.0 * math.pi / grid[3]  # columns; the map may lie across the date line
+    column -= around * math.floor((column - 0.5 * (columns - 1)) / around + 0.5)
     inside_n, inside_e = 0.0 <= row <= rows - 1, 0.0 <= column <= columns - 1
     row, column = min(max(row, 0.0), rows - 1.0), min(max(column, 0.0), columns - 1.0)
     i, j = min(int(row), rows - 2), min(int(column), columns - 2)

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from nav.earth import isa_pressure, radii
+from nav.earth import isa_pressure, radii, wrap_longitude
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
@@ -291,7 +291,7 @@ def _solution(topics: Topics) -> Reference | None:
         h0 = there("ref_alt", "z_global")
         R_M, R_N = radii(lat0)
         columns["lat"] = lat0 + there("x", "xy_valid") / (R_M + h0)
-        columns["lon"] = lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0))
+        columns["lon"] = wrap_longitude(lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0)))
         columns["h"] = h0 - there("z", "z_valid")
         somewhere = is_flown(columns["lat"], columns["h"])
         columns |= {name: np.where(somewhere, columns[name], np.nan) for name in ("lat", "lon", "h")}

@@ -404,3 +404,18 @@ def test_raw_units_are_taken_where_the_corrected_ones_are_slow(tmp_path: Path) -
     raw = [one for one in autopilot_of(200.0, 2.0) if one[0] != "vehicle_magnetometer"]
     alone = formats.read(ulog(raw, tmp_path / "raw.ulg"), {})
     assert list(alone.samples) == ["magnetometer", "magnetometer2"]
+
+
+def test_a_solution_in_metres_across_the_date_line_has_longitudes_as_they_are(tmp_path: Path) -> None:
+    """Told from a point west of it: eastward, on to the other side."""
+    told = autopilot_of(49.0, 50.0)
+    for k in range(200):
+        t = 0.1 * (k + 1)
+        place, v = (-17.0, 179.9999, 100.0, 0.0, 20.0 * t, 0.0), (0.0, 20.0, 0.0)
+        told.append(("vehicle_attitude", (us(t), 1.0, 0.0, 0.0, 0.0)))
+        told.append(("vehicle_local_position", (us(t), *place, *v)))
+    log = formats.read(ulog(told, tmp_path / "flight.ulg"), {})
+    assert log.solution is not None
+    east = np.degrees(log.solution.columns["lon"])
+    assert -180.0 < east[-1] < -179.99
+    np.testing.assert_allclose(np.mod(east, 360.0)[5:], 179.9999 + 20.0 * log.solution.t[5:] / 106447.0, atol=2e-5)

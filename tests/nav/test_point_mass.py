@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from nav.earth import radii
+from nav.earth import radii, wrap_longitude
 from nav.point_mass import POINTS, PointMass
 from nav.terrain import Terrain, ground
 from testbed import Scenario, run
@@ -78,6 +78,28 @@ def test_weights_are_the_likelihood_of_all_heights_at_once() -> None:
     for off in (150.0, -150.0):
         places.weigh(np.array([30.0, -20.0, H_M - 1.5 * count - measured[-1] - off]))
     assert not places.fits  # no two places side by side are 300 m apart in height
+
+
+def test_a_place_across_the_date_line_is_as_near_as_any() -> None:
+    """As the same search over the same hills elsewhere has it."""
+    rng, found = np.random.default_rng(3), []
+    heights = rng.uniform(700.0, 900.0, 20)
+    for lon_deg in (10.0, 180.0):
+        west = math.radians(lon_deg) - 600 * HILLS.grid[3]
+        places = PointMass(Terrain(HILLS.heights, np.array([*HILLS.grid[:2], west, HILLS.grid[3]])), 5.0, 4.0, 8.0)
+        here = np.array([math.radians(36.6), math.radians(lon_deg) - 1e-5, H_M])
+        P = np.eye(2) * 300.0**2
+        places.begin(0.0, here, P, 10.0)
+        for k in range(1, 20):
+            places.move(float(k), np.array([0.0, SPEED, 0.0]), np.array([0.5, 0.1]))
+            places.weigh(np.array([0.0, 0.0, heights[k]]))
+        own = float(wrap_longitude(places.lon))
+        assert (own < 0.0) == (lon_deg == 180.0)
+        found.append(places.posterior(places.lat, own, P))
+        if (fix := places.fix(places.lat, own, P)) is not None:
+            assert abs(fix.lon) <= math.pi
+    for before, across in zip(*found, strict=True):
+        np.testing.assert_allclose(across, before, rtol=1e-5, atol=1e-5)
 
 
 def flown(seed: int, sigma: float, sigma_v: float = 0.5, local: float = 4.0) -> tuple[float, float, list[float]]:

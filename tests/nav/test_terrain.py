@@ -11,7 +11,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from nav.aids.terrain import optical_flow, range_to_ground
-from nav.earth import OMEGA_IE, radii
+from nav.earth import OMEGA_IE, radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL
 from nav.rotation import quat_from_rotvec, quat_multiply
 from nav.terrain import Terrain, ground, slant_range
@@ -50,6 +50,26 @@ def test_slopes_are_the_differences_of_heights() -> None:
 def test_beyond_the_edge_it_is_as_at_the_edge() -> None:
     corner = ground(LAT - 1.0, LON + 1.0, HILLS.heights, HILLS.grid)
     assert corner == (HILLS.heights[0, -1], 0.0, 0.0)
+
+
+@pytest.mark.parametrize("first", [179.98, -180.02, 180.0 - 49 * 3 / 3600])
+def test_a_map_across_the_date_line_is_one_map(first: float) -> None:
+    """The same hills elsewhere are the oracle; beyond an edge it is that edge, however longitude is counted."""
+    west = math.radians(first)
+    moved = Terrain(HILLS.heights, np.array([LAT, STEP, west, STEP]))
+    rng = np.random.default_rng(4)
+    for row, column in rng.uniform([0, -40], [39, 89], (200, 2)):
+        expected = ground(LAT + STEP * row, LON + STEP * column, HILLS.heights, HILLS.grid)
+        for lon in (west + STEP * column, float(wrap_longitude(west + STEP * column))):
+            found = ground(LAT + STEP * row, lon, moved.heights, moved.grid)
+            np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-9)
+
+
+def test_a_map_of_the_whole_earth_has_its_own_longitudes() -> None:
+    heights = np.tile(np.arange(361.0), (2, 1))
+    for lon_deg in (-180.0, -179.5, -0.25, 0.0, 100.5, 179.75):
+        at = ground(0.0, math.radians(lon_deg), heights, np.radians([-1.0, 2.0, -180.0, 1.0]))[0]
+        assert at == pytest.approx(lon_deg + 180.0, abs=1e-9)
 
 
 @TERRAINS
