@@ -26,7 +26,7 @@ from testbed.sensors import SensorConfig
 from testbed.sensors.faults import Faults
 from testbed.sensors.gnss import REPORTED_AT_LEAST, GnssConfig, Reception, without_fix
 from testbed.sensors.imu import ImuConfig
-from testbed.sensors.timing import InterruptedTiming, Interruptions
+from testbed.sensors.timing import InterruptedTiming, outside
 
 EDGE_S = 1e-6  # a sample this close to a row comes with it
 DIGITS = 3  # of a rate that is found
@@ -106,7 +106,7 @@ class Recorded:
         self.rate_hz = truth.rate_hz
         self.motion_s = 0.0
         self.failure = ""
-        self.notes = log.notes
+        self.notes = [*log.notes, *_in_it_already(scenario, log)]
         self._start = log.t0 + truth.start_s
         self._imus = _increments(scenario, log, self._start)
         self._samples = {
@@ -126,9 +126,7 @@ class Recorded:
         }
         sections = scenario.sensors
         self.receptions = {name: Reception(one) for name, one in sections.items() if isinstance(one, GnssConfig)}
-        self._interruptions = {
-            name: Interruptions(name, one, seed) for name, one in sections.items() if isinstance(one, InterruptedTiming)
-        }
+        self._denied = {name: one.denied for name, one in sections.items() if isinstance(one, InterruptedTiming)}
         self.faults = Faults(scenario.fault, sections, seed)
         self._told = False
         self._remark = log.remark if truth.reference == "solution" else ""
@@ -190,8 +188,8 @@ class Recorded:
         own = self._samples[name][first : bisect_right(times, until + EDGE_S)]
         if name in self.receptions:
             return [self._received(self.receptions[name], one) for one in own]
-        if name in self._interruptions and own:
-            kept = self._interruptions[name].kept(np.array([one.t for one in own]))
+        if name in self._denied and own:
+            kept = outside(self._denied[name], np.array([one.t for one in own]))
             return [one for one, keep in zip(own, kept, strict=True) if keep]
         return own
 
@@ -200,6 +198,25 @@ class Recorded:
         if reception.has_fix(sample.t, sample.lat, sample.lon):
             return sample  # type: ignore[no-any-return]
         return without_fix(sample.t, sample.t_arrival, sample.sensor)
+
+
+def _in_it_already(scenario: Scenario, log: Log) -> list[str]:
+    """What was given for the way from a sensor to the estimators: of a log it is over, and acts on nothing.
+
+    Not what a grade presets, nor of the testbed's own record, whose samples came to be as its scenario says.
+    """
+    if formats.known(log.path).module == "rerun":
+        return []
+    told = []
+    for name, section in scenario.sensors.items():
+        if section.kind in ("imu", *SAMPLES):
+            preset: Any = type(section).model_validate({"grade": getattr(section, "grade", None)})
+            told += [
+                f"sensors.{name}.{key} acts on none of its samples, which are as they came to the log"
+                for key in ("dropout_percent", "jitter_s")
+                if getattr(section, key) not in (0.0, getattr(preset, key))
+            ]
+    return told
 
 
 def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:

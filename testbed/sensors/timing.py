@@ -112,6 +112,14 @@ class InterruptedTiming(AidingTiming):
     denied: Windows = Field((), description="windows of simulated time without samples")
 
 
+def outside(windows: Windows, t: Array) -> npt.NDArray[np.bool_]:
+    """Which of the times (n,) [s] are in none of the windows."""
+    free = np.full(len(t), True)
+    for start, end in windows:
+        free &= (t < start) | (t >= end)
+    return free
+
+
 class Interruptions:
     """Which samples of one sensor come through. ``kept`` is asked about every scheduled sample, once and in order."""
 
@@ -124,6 +132,4 @@ class Interruptions:
     def kept(self, t: Array) -> npt.NDArray[np.bool_]:
         """Whether the samples at ``t`` (n,) [s] are delivered."""
         kept: npt.NDArray[np.bool_] = self._luck.take(len(t))[:, 0] >= self._lost_below
-        for start, end in self._denied:
-            kept &= (t < start) | (t >= end)
-        return kept
+        return kept & outside(self._denied, t)

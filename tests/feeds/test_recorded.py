@@ -95,6 +95,68 @@ def test_denial_and_faults_act_on_a_log_as_on_a_simulation(
     assert same(simulated.dataset["sensors"], recorded.dataset["sensors"])
 
 
+LOSSY = """
+title = "lossy"
+duration_s = 12
+date = 2026-06-01
+[truth]
+source = "kinematic"
+motion = "segments"
+rate_hz = 100
+start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 300, speed_mps = 40 }
+[[truth.segments]]
+leg = "straight"
+duration_s = 12
+[sensors.imu]
+rate_hz = 100
+[sensors.gnss]
+dropout_percent = 20
+[sensors.barometer]
+dropout_percent = 20
+[sensors.rangefinder]
+dropout_percent = 30
+[sensors.body_velocity]
+dropout_percent = 30
+[record]
+imu = true
+"""
+
+
+def test_what_was_lost_on_the_way_is_lost_once(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The samples of a record are all there, and those in windows of denial are taken away, no more."""
+    first = fly(LOSSY, {}, tmp_path)
+    second = again(first, LOSSY, {"duration_s": 12}, tmp_path_factory.mktemp("again"))
+    assert same(first.dataset["sensors"], second.dataset["sensors"])
+    assert not any("acts on none" in one for one in events(second))
+    denied = again(
+        first, LOSSY, {"duration_s": 12, "sensors.rangefinder.denied": [[3, 5]]}, tmp_path_factory.mktemp("denied")
+    )
+    t = column(first.dataset, "sensors/rangefinder/time")
+    assert 0.5 < len(t) / 120 < 0.9
+    np.testing.assert_array_equal(
+        column(denied.dataset, "sensors/rangefinder/time"), t[(t < 3 - 1e-9) | (t >= 5 - 1e-9)]
+    )
+
+
+def events(result: RunResult) -> list[str]:
+    return [str(one) for one in result.dataset["events"].dataset["text"].values]
+
+
+def test_losses_that_are_asked_of_a_log_are_told() -> None:
+    """Of what was given, and not of what a grade says."""
+    changes = {
+        "duration_s": 5,
+        "sensors.gnss.denied": [],
+        "sensors.gnss.grade": "u-blox-m8",
+        "sensors.barometer.jitter_s": 0.01,
+        "sensors.imu.dropout_percent": 3.0,
+    }
+    told = [one for one in events(run(Scenario.load("recorded_flight", changes))) if "acts on none" in one]
+    assert len(told) == 2
+    assert "sensors.imu.dropout_percent" in told[0]
+    assert "sensors.barometer.jitter_s" in told[1]
+
+
 def written(name: str, dataset: Any, folder: Path) -> Path:
     match name:
         case "bin":
