@@ -179,7 +179,12 @@ class Recorded:
             found = _when_felt(found, section, log, receiver)
             if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
                 found = _with_attitude(found, solution, self._start)
-        return with_rates(found, next(iter(self._imus.values()))) if self._imus else found
+        if not self._imus:
+            return found
+        name, imu = next(iter(self._imus.items()))
+        unit = sections[name]
+        assert isinstance(unit, ImuConfig)
+        return with_rates(found, imu, unit.errors().C_sb)
 
     def _heard(self, name: str, after: float, until: float) -> Sequence[Sample]:
         """The samples of one sensor in (``after``, ``until``] [s], as denial leaves them."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from nav.alignment import usable
 from nav.earth import position_difference_n, radii, wrap_longitude
 from nav.samples import Array, GnssSample, ImuSamples
 from testbed.feeds.log import Reference, Samples
@@ -161,13 +163,14 @@ def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:
     return Reference(f"{name} of the log, kept back where it is denied", rows("t"), columns, position, velocity)
 
 
-def with_rates(reference: Reference, imu: ImuSamples) -> Reference:
-    """The same with the angular rates of an IMU, body axes, where it has none of its own: levers swing by them."""
-    if "omega_b" in reference.columns or not len(reference.t):
+def with_rates(reference: Reference, imu: ImuSamples, C_sb: Array) -> Reference:
+    """The same with angular rates, body axes, where it has none of its own: levers swing by them.
+
+    They are those of an IMU mounted by ``C_sb``; where its increments are none, of the next one that is.
+    """
+    sound = np.flatnonzero(usable(imu.dtheta, imu.dv, imu.dt))
+    if "omega_b" in reference.columns or not len(reference.t) or not len(sound):
         return reference
-    at = np.clip(np.searchsorted(imu.t, reference.t), 0, len(imu) - 1)
-    rates = imu.dtheta[at] / imu.dt[at, None]
-    columns = {**reference.columns, "omega_b": rates}
-    return Reference(
-        reference.name, reference.t, columns, reference.sigma_position_n, reference.sigma_velocity_n
-    )  # fmt: skip
+    at = sound[np.clip(np.searchsorted(imu.t[sound], reference.t), 0, len(sound) - 1)]
+    rates = imu.dtheta[at] / imu.dt[at, None] @ C_sb
+    return replace(reference, columns={**reference.columns, "omega_b": rates})

@@ -8,14 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from worlds import log_writers, real_flights
 from worlds.loop import same
 from worlds.recordings import log_of
 
+from nav.samples import ImuSamples
 from testbed import Scenario, run
+from testbed.feeds.log import Reference
+from testbed.feeds.reference import with_rates
 from testbed.loop.loop import RunResult
 from testbed.score import metrics
 from testbed.score.accuracy import column
+from testbed.sensors.imu import ImuConfig
 
 FLIGHT = {
     "duration_s": 30,
@@ -204,3 +209,15 @@ def test_real_flights_run(name: str, tmp_path: Path) -> None:
     assert result.metrics["ins.aligned_s"] < {"thor": 156, "swiss": 10, "quad": 10}[name]
     assert all(np.isfinite(value) for value in result.metrics.values())
     assert result.failure == ""
+
+
+def test_a_reference_has_the_rates_of_the_body_whatever_the_unit_lies_like() -> None:
+    """Rates as the motion has them: of a unit that lies turned, and whose increments are lost now and then."""
+    t, omega_b = 0.01 * np.arange(1, 301), np.array([0.2, -0.1, 0.4])
+    turned = Rotation.from_euler("ZYX", [90.0, 10.0, 180.0], degrees=True)  # from its axes to the body's
+    dtheta = np.tile(0.01 * turned.inv().apply(omega_b), (300, 1))
+    dtheta[100], dtheta[250:] = np.nan, np.nan
+    imu = ImuSamples(t, np.full(300, 0.01), dtheta, np.tile([0.0, 0.0, -0.098], (300, 1)))
+    config = ImuConfig.model_validate({"mounting_deg": (180.0, 10.0, 90.0)})
+    found = with_rates(Reference("a receiver", np.array([0.5, 1.01, 2.9]), {}), imu, config.errors().C_sb)
+    np.testing.assert_allclose(found.columns["omega_b"], np.tile(omega_b, (3, 1)), atol=1e-12)
