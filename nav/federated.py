@@ -420,7 +420,7 @@ class Federated:
             values[row] = values[n + row] = values[2 * n + row]
 
     def _cross_check(self, state: State, t: float) -> None:
-        """Isolate the sensor behind a contradiction between filters, which are held against each other in velocity.
+        """Isolate the sensor behind a contradiction between filters, held against each other in velocity and position.
 
         It is the one whose own filter suspected it most of late: by its velocities, where it has some, for slow errors
         of positions make suspicions of their own.

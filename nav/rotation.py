@@ -2,7 +2,8 @@
 
 A quaternion ``q_ab`` (scalar first, unit) and a matrix ``C_ab`` take components in b to components in a:
 ``x_a = C_ab @ x_b``; they compose as ``C_ac = C_ab @ C_bc``, ``q_ac = q_ab * q_bc``. ``q`` and ``-q`` are the same
-rotation. Every function takes one rotation, allocates its result, and can be called from a kernel.
+rotation. Every function takes one rotation and can be called from a kernel. Most allocate their result; those named
+`..._components` give numbers instead, for long loops, and `turn` changes what it is given.
 
 Source of the formulae: Titterton and Weston, Strapdown Inertial Navigation Technology, 2nd ed., section 3.6;
 the Jacobian of the rotation vector: Barfoot, State Estimation for Robotics, section 7.1.5.

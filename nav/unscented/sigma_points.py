@@ -25,7 +25,11 @@ GUARD = 1e-14  # of a variance, what rounding may have left of it at least
 
 
 class Scaling(NamedTuple):
-    """How far out the points lie: ``alpha`` from 0.1 to 1; ``beta`` = 2 for a normal error."""
+    """How far out the points lie: ``alpha`` from 0.1 to 1; ``beta`` for how the square of a normal error spreads.
+
+    Of a quadratic along one direction the variance is exact with ``beta`` = 2 - 2 ``alpha``^2, which is 2 for small
+    ``alpha``; with 2 it is claimed larger by 2 ``alpha``^2 times the square of the mean's shift.
+    """
 
     alpha: float = 1.0
     beta: float = 2.0

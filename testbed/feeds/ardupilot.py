@@ -30,7 +30,7 @@ from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
 
 NEEDED = "IMU with GyrX to AccZ, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
-GAUSS = 1e-7  # of the milligauss that MAG is in [T]
+MILLIGAUSS = 1e-7  # that MAG is in [T]
 BINARY = b"\xa3\x95"  # how every message begins; text may begin with lines of the ground station
 GPS_EPOCH, WEEK_S = dt.datetime(1980, 1, 6), 604_800
 ACCURACY_WITHIN_S = 0.3  # GPA comes right after the GPS that it belongs to
@@ -205,7 +205,7 @@ def _aiding(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[s
         samples[name] = _fixes(name, rows, units.get("accuracy", {}).get(name), notes)
     for name, rows in units.get("magnetometer", {}).items():
         t, kept = _times(name, rows, notes)
-        samples[name] = magnetometers(name, t, _vector(rows, "Mag", kept) * GAUSS, notes)
+        samples[name] = magnetometers(name, t, _vector(rows, "Mag", kept) * MILLIGAUSS, notes)
     for kind, key, made in (("barometer", "Press", barometers), ("airspeed", "Airspeed", airspeeds)):
         for name, rows in units.get(kind, {}).items():
             if key in rows:

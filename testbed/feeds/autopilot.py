@@ -28,7 +28,7 @@ never reach the aircraft: for `HOLD_S` it flies on the last good ones, then the 
 
 Frames. A sample held for T is T / 2 old on average, and a rate averaged over T is T / 2 older. Fed with truth that
 late, the inner loops oscillate from a further delay of 0.15 s on at 25 m/s and 0.07 s at 34 m/s, near the fastest that
-is flown (`tests/testbed/test_autopilot.py`). 50 Hz takes a fifth of what there is then and cannot be told from 200 Hz;
+is flown (`tests/feeds/test_autopilot.py`). 50 Hz takes a fifth of what there is then and cannot be told from 200 Hz;
 25 Hz would take nearly half. Guidance keeps its own 10 Hz. Frames are counted in ticks from the start of the run, so
 the result depends on nothing else.
 """

@@ -4,8 +4,9 @@ Written for `testbed.score.bound` alone, and without the filters' models (`nav.e
 mistake in those would not show beside itself. Errors have the signs of `nav`; they are of motion (attitude phi,
 velocity, position), of sensors, and of the air. What is drawn for a run is a state with the spread it was drawn with,
 or white noise. What is left out, for it changes nothing or because it has no statistics, is taken as known, which makes
-the bound lower and never wrong: vibration, resolution, range, asymmetry, self-heating, faults; in the air, updrafts and
-a mean wind that changes by a front, with place, or with height.
+the bound lower and never wrong: vibration, resolution, range, asymmetry, self-heating, faults; the stray field of
+motors; a receiver's latency and its jumps; what the air about it does to a static port; in the air, updrafts and a mean
+wind that changes by a front, with place, or with height.
 """
 
 from __future__ import annotations
