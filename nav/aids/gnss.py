@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from nav.unscented import Points
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+AT_REST = 1e-12  # square of a speed below which there is no direction [m^2/s^2]
 CONTRADICTION_S, REMEMBERED_S = 2.0, 6.0  # over which positions are held against velocities, faults remembered
 
 
@@ -359,7 +360,7 @@ def gnss_course(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int, antenna
         for start in (wind, gust):
             if start >= 0:
                 air_n, air_e = air_n - x[start], air_e - x[start + 1]
-        ground2, air2 = v_n[0] * v_n[0] + v_n[1] * v_n[1], air_n * air_n + air_e * air_e
+        ground2, air2 = max(v_n[0] * v_n[0] + v_n[1] * v_n[1], AT_REST), max(air_n * air_n + air_e * air_e, AT_REST)
         predicted += math.atan2(v_n[1], v_n[0]) - math.atan2(air_e, air_n)
         H[0, VEL], H[0, VEL + 1] = air_e / air2 - v_n[1] / ground2, v_n[0] / ground2 - air_n / air2
         for start in (wind, gust):

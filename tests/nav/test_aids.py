@@ -300,6 +300,15 @@ def test_course_is_heading_and_drift():
     assert backwards == pytest.approx(math.atan2(-0.9, -1.0) - heading + 2 * math.pi, abs=1e-12)
 
 
+def test_course_of_what_does_not_move_is_of_no_direction():
+    """No velocity and no wind: a number, and nothing that either of them would change."""
+    nu, H = aids.gnss.gnss_course(
+        np.array([1.0, 0, 0, 0]), np.zeros(3), np.zeros(MODEL.size), MODEL.start("wind"), -1, np.array([3.0, 3.0, 0.0])
+    )
+    assert nu[0] == pytest.approx(math.radians(45))
+    assert np.flatnonzero(H).tolist() == [PHI + 2]
+
+
 def test_axes_that_a_sample_has():
     sample = BodyVelocitySample(1.0, 1.0, np.array([3.0, NAN, 0.0]))
     assert aids.body_velocity.measures(sample, np.array([0, 2]))
