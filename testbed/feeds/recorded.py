@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from testbed.feeds import formats
 from testbed.feeds.feed import Turn
 from testbed.feeds.log import SAMPLES, Log, Reference
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, with_rates
-from testbed.feeds.stamps import at_times, begun, bridged
+from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
@@ -129,7 +129,8 @@ class Recorded:
         self._denied = {name: one.denied for name, one in sections.items() if isinstance(one, InterruptedTiming)}
         self.faults = Faults(scenario.fault, sections, seed)
         self._told = False
-        self._remark = log.remark if truth.reference == "solution" else ""
+        doubt = [log.remark] if log.remark and truth.reference == "solution" else []
+        self._remark = "; ".join([*doubt, *_losses(log, [*scenario.sensors, "reference"])])
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
         """The next rows, and what came with them."""
@@ -152,7 +153,7 @@ class Recorded:
         return [] if told else [(0.0, "info", f"log: {note}") for note in self.notes]
 
     def remark(self) -> str:
-        """Whether what errors are against contradicts the receiver."""
+        """Whether what errors are against contradicts the receiver, and what much of the log was left out for."""
         return self._remark
 
     def close(self) -> None:
@@ -222,6 +223,12 @@ def _in_it_already(scenario: Scenario, log: Log) -> list[str]:
                 if getattr(section, key) not in (0.0, getattr(preset, key))
             ]
     return told
+
+
+def _losses(log: Log, names: Iterable[str]) -> list[str]:
+    """What is told of rows that were left out of streams that a run makes use of, where they are many."""
+    used = tuple(f"{name}: " for name in names)
+    return [note for note in log.notes if isinstance(note, Loss) and note.startswith(used)]
 
 
 def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:

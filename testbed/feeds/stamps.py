@@ -1,11 +1,13 @@
 """Times as logs have them: jittered, repeated, out of order, wrapped, with gaps. What is done about each is told.
 
-A counter that wraps goes on; a time that comes twice, or is no number, is left out; out of order is put in order. Where
-time goes back for good, the clock was set or the vehicle started again: the longer part is kept.
+A counter that wraps goes on; a time that comes twice, is no number, or is far off those before and after is left out;
+out of order is put in order. Where time goes back for good, or on by more than any gap, the clock was set or the
+vehicle started again: the longer part is kept.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TypeAlias
 
@@ -19,14 +21,27 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 # After which counters begin anew [s]: 32 bits of microseconds, of milliseconds; 16 of milliseconds; a GPS week.
 WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0)
-WRAP_SHARE = 0.02  # of it, by which a jump may miss it
-STRAY = 8  # rows by which times may be out of order
+WRAP_SHARE = 0.005  # of it, that may be lost where it begins anew
+STRAY, STRAY_SHARE = 8, 0.01  # rows by which times may be out of order, or that may be far off; of all rows
+LONGEST_GAP_S = 3600.0  # beyond which a gap that is longer than all else is none: the clock was set
+MUCH = 0.01  # of a stream's rows: who runs the log is told when more are left out
 EDGE_S = 1e-6  # times closer than this are one
 GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
 PIECE = 1.5  # usual increments: the longest that there may be
 # A clock that is off by more than any quartz is by temperature runs by a wrong frequency. By how much must be alike in
 # half of what is seen, over as long as jitter of 0.1 s is small beside it.
 CLOCK_OFF, CLOCK_ALIKE, CLOCK_S = 0.005, 0.2, 30.0
+
+
+class Loss(str):
+    """A note of rows that are left out: more than `MUCH` of a stream."""
+
+    __slots__ = ()
+
+
+def left_out(text: str, lost: int, rows: int) -> str:
+    """A note of ``lost`` of some ``rows`` that are left out."""
+    return Loss(text) if lost > MUCH * rows else text
 
 
 def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, Rows]:
@@ -36,10 +51,16 @@ def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, 
     """
     t = np.array(stamps, float)
     rows: Rows = np.arange(len(t))
-    sound = np.isfinite(t)
-    if not sound.all():
-        notes.append(f"{name}: {np.sum(~sound)} times are no numbers, and left out")
-        t, rows = t[sound], rows[sound]
+
+    def keep(kept: Mask, why: str) -> None:
+        nonlocal t, rows
+        lost = int(np.sum(~kept))
+        if lost:
+            notes.append(left_out(f"{name}: {lost} {why}", lost, len(kept)))
+            t, rows = t[kept], rows[kept]
+
+    keep(np.isfinite(t), "times are no numbers, and left out")
+    keep(~_astray(t), "times are far off those before and after, and left out")
     t = _unwrapped(name, t, notes)
     t, rows = _longest_part(name, t, rows, notes)
     order = np.argsort(t, kind="stable")
@@ -47,24 +68,71 @@ def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, 
     if moved:
         notes.append(f"{name}: {moved} times are out of order, and put in order")
     t, rows = t[order], rows[order]
-    new = np.diff(t, prepend=-np.inf) > 0
-    if not new.all():
-        notes.append(f"{name}: {np.sum(~new)} times come again, and are left out")
-    t, rows = t[new], rows[new]
+    keep(np.diff(t, prepend=-np.inf) > 0, "times come again, and are left out")
+    keep(_of_one_clock(t), f"times are {LONGEST_GAP_S:g} s and more from all others, a clock that was set: left out")
     _note_gaps(name, t, notes)
     return t, rows
 
 
-def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
-    """The same with counters that began anew going on."""
+def _usual(t: Array) -> float:
+    """The usual step of times in the order of their rows [s]."""
     steps = np.diff(t)
+    return float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+
+
+def _late(usual: float) -> float:
+    """By how much a time may be out of order, where steps are usually so long [s]."""
+    return max(STRAY * usual, GAP_S)
+
+
+def _astray(t: Array) -> Mask:
+    """Which of times (N,) in the order of their rows are a few that are far off, where those about them go on.
+
+    Pieces that do not go on from each other are few, but for a clock that says nonsense again and again.
+    """
+    off: Mask = np.zeros(len(t), bool)
+    usual = _usual(t)
+    late, few = _late(usual), max(STRAY, int(STRAY_SHARE * len(t)))
+    steps = np.diff(t)
+    cuts = np.flatnonzero((steps < -late) | (steps > _gap(usual))) + 1
+    if not (steps < -late).any():
+        return off
+    edges = [0, *cuts.tolist(), len(t)]
+    before = -math.inf  # the newest that is not off
+    for first, stop in itertools.pairwise(edges):
+        after = float(t[stop]) if stop < len(t) else math.inf
+        alone = stop - first <= few and before - late <= after
+        if alone and (t[first] < before - late or t[stop - 1] > after + late):
+            off[first:stop] = first > 0 or not _wrap(float(t[stop - 1]), after, usual)
+        if not off[first]:
+            before = float(t[stop - 1])
+    return off
+
+
+def _wrap(before: float, after: float, usual: float) -> float:
+    """After how long [s] the counter began anew that stands just below that first and just above zero then, or 0."""
     for wrap in WRAPS:
-        back = np.abs(steps + wrap) < WRAP_SHARE * wrap
-        if back.any():
-            notes.append(f"{name}: the clock began anew after {wrap:g} s, {np.sum(back)} times, and goes on")
-            t = t + wrap * np.concatenate([[0.0], np.cumsum(back)])
-            steps = np.diff(t)
-    return t
+        near = max(WRAP_SHARE * wrap, _gap(usual))
+        if wrap - near < before <= wrap + EDGE_S and 0 <= after < near:
+            return wrap
+    return 0.0
+
+
+def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
+    """The same with counters that began anew going on; one that comes back to where it was did not begin anew."""
+    usual, whole = _usual(t), np.zeros(len(t))
+    edges = [*(np.flatnonzero(np.diff(t) < -_late(usual)) + 1).tolist(), len(t)]
+    count: dict[float, int] = {}
+    for first, stop in itertools.pairwise(edges):
+        before = float(t[first - 1])
+        wrap = _wrap(before, float(t[first]), usual)
+        comes_back = (np.diff(t[first:stop]) > wrap / 2) & (t[first + 1 : stop] >= before)
+        if wrap and not comes_back.any():
+            whole[first:] += wrap
+            count[wrap] = count.get(wrap, 0) + 1
+    for wrap, times in count.items():
+        notes.append(f"{name}: the clock began anew after {wrap:g} s, {times} times, and goes on")
+    return t + whole if count else t
 
 
 def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Array, Rows]:
@@ -73,6 +141,7 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
         return t, rows
     newest = np.maximum.accumulate(t)
     behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
+    behind &= t < newest - GAP_S  # not a burst that came late
     begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
     if not len(begins):
         return t, rows
@@ -80,8 +149,24 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     longest = max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
     part = slice(edges[longest], edges[longest + 1])
     left = len(t) - (part.stop - part.start)
-    notes.append(f"{name}: time goes back {len(begins)} times: the longest part is kept, {left} rows are left out")
+    told = f"{name}: time goes back {len(begins)} times: the longest part is kept, {left} rows are left out"
+    notes.append(left_out(told, left, len(t)))
     return t[part], rows[part]
+
+
+def _of_one_clock(t: Array) -> Mask:
+    """Which of ascending times (N,) are left where gaps are none: longer than `LONGEST_GAP_S` and than all else."""
+    first, stop = 0, len(t)
+    while stop - first > 1:
+        steps = np.diff(t[first:stop])
+        worst = int(np.argmax(steps))
+        if steps[worst] <= max(LONGEST_GAP_S, float(t[stop - 1] - t[first]) / 2):
+            break
+        cut = first + worst + 1
+        first, stop = (first, cut) if cut - first > stop - cut else (cut, stop)
+    kept: Mask = np.zeros(len(t), bool)
+    kept[first:stop] = True
+    return kept
 
 
 def pace(t: Array, told: Array) -> float | None:

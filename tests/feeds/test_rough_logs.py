@@ -127,6 +127,23 @@ def test_bad_times_cost_little_and_are_told(log: Log, tmp_path: Path, mangle: An
     assert note in told(result)
 
 
+def test_who_runs_a_log_is_told_when_much_of_it_is_left_out(log: Log, tmp_path: Path) -> None:
+    """Of what is used; a few rows are an event alone."""
+    short = {"duration_s": 5, "truth.reference": "solution"}
+    table = arrays(log)
+    table["imu_t"][[500, 1500]] = 0.0
+    few = fly(table, tmp_path, ALL, short)
+    assert "imu: 2 times are far off" in told(few)
+    assert not any("left out" in remark for remark in few.remarks)
+    table["imu_t"] = np.where(table["imu_t"] > 60e6, table["imu_t"] - 60e6, table["imu_t"])
+    table["baro_t"][::10] = np.nan
+    many = fly(table, tmp_path, ALL, short)
+    said = [remark for remark in many.remarks if "left out" in remark]
+    assert len(said) == 1
+    assert "imu: time goes back 1 times" in said[0]
+    assert "barometer: 71 times are no numbers" in said[0]
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize("gap_s", [0.3, 3.0])
 def test_a_gap_of_the_imu_is_told_and_flown_over(log: Log, tmp_path: Path, gap_s: float) -> None:

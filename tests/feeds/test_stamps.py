@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nav.samples import ImuSamples
-from testbed.feeds.stamps import at_times, begun, bridged, integrated, ordered
+from testbed.feeds.stamps import Loss, at_times, begun, bridged, integrated, ordered
 
 T = np.arange(1, 401) / 50
 
@@ -52,6 +52,68 @@ def test_after_a_restart_the_longer_part_is_kept() -> None:
     assert np.array_equal(t, T)
     assert rows[0] == 100
     assert any("100 rows are left out" in note for note in notes)
+
+
+LONG = np.arange(1, 24_001) / 200  # two minutes, through where a counter of 16 bits of milliseconds begins anew
+
+
+@pytest.mark.parametrize("rows", [[13_090], [0], [23_999], [*range(999, 23_000, 1000)], [*range(13_080, 13_086)]])
+@pytest.mark.parametrize("value", [0.0, 1e6, 1.7e9])
+def test_a_few_stray_stamps_cost_their_own_rows_alone(rows: list[int], value: float) -> None:
+    stamps = LONG.copy()
+    stamps[rows] = value
+    notes: list[str] = []
+    t, kept = ordered("imu", stamps, notes)
+    others = np.delete(np.arange(len(LONG)), rows)
+    if value == 0.0 and rows == [0]:
+        others = np.arange(len(LONG))  # a row at zero is as good as any
+    assert np.array_equal(kept, others)
+    assert np.array_equal(t, stamps[others])
+    assert len(notes) == (len(others) < len(LONG))
+    assert not any(isinstance(note, Loss) for note in notes)
+
+
+@pytest.mark.parametrize("late", [9, 15, 100])
+def test_a_row_that_comes_late_does_not_cut_the_stream(late: int) -> None:
+    """By less than a gap it is put where it belongs, by more it is left out."""
+    order = np.insert(np.delete(np.arange(len(LONG)), 5000), 5000 + late, 5000)
+    notes: list[str] = []
+    t, rows = ordered("imu", LONG[order], notes)
+    assert len(t) == len(LONG) - (late > 20)
+    assert np.array_equal(LONG[order][rows], t)
+    assert len(notes) == 1
+
+
+@pytest.mark.parametrize("begins", [0.0, 0.3])
+def test_a_clock_that_is_set_back_is_not_one_that_began_anew(begins: float) -> None:
+    """By the size of a counter, but from where none begins anew, or with a return to where it was."""
+    notes: list[str] = []
+    t, _ = ordered("imu", np.where(LONG > 66.0, LONG - 65.536 + begins, LONG), notes)
+    assert t[-1] < 70
+    assert isinstance(notes[0], Loss)
+    assert "goes back 1 times" in notes[0]
+    back = LONG.copy()
+    back[13_100:13_500] -= 65.5
+    notes = []
+    t, _ = ordered("imu", back, notes)
+    assert t[-1] <= LONG[-1]
+    assert not any("began anew" in note for note in notes)
+
+
+def test_a_clock_that_is_set_leaves_the_longer_part() -> None:
+    notes: list[str] = []
+    stamps = np.concatenate([LONG[:500], 1.7e9 + LONG[500:]])
+    _, rows = ordered("gnss", stamps, notes)
+    assert np.array_equal(rows, np.arange(500, len(LONG)))
+    assert notes == ["gnss: 500 times are 3600 s and more from all others, a clock that was set: left out"]
+    assert isinstance(notes[0], Loss)
+
+
+@pytest.mark.parametrize(("before", "gap"), [(4000.0, 3000.0), (8000.0, 7000.0)])
+def test_a_gap_may_be_as_long_as_all_else(before: float, gap: float) -> None:
+    stamps = np.concatenate([np.arange(before), before + gap + np.arange(10.0)])
+    assert len(ordered("gnss", stamps, [])[0]) == len(stamps)
+    assert len(ordered("gnss", stamps + np.where(stamps > before, before, 0.0), [])[0]) == before
 
 
 def test_gaps_are_told() -> None:
