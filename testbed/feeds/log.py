@@ -45,6 +45,8 @@ SAMPLES: Mapping[str, type[Sample]] = {
     "wind_report": WindSample,
 }
 
+LONGEST_WAIT_S = 600.0  # for an inertial unit, of a log whose other sensors are heard before it
+
 Samples: TypeAlias = Sequence[Sample]
 
 
@@ -68,7 +70,7 @@ class Log:
     """What a log has: increments by IMU and samples by sensor, ascending in time, SI and body axes; times its own [s].
 
     Without ``valid_times`` the times of samples are those at which they were told, and the sensor's latency is yet to
-    be taken off. Accuracies and velocities that a receiver does not report are NaN. ``t0`` is the first time of all,
+    be taken off. Accuracies and velocities that a receiver does not report are NaN. ``t0`` is when it begins,
     ``start`` where the log itself says that it begins; ``messages`` the number of each kind that the file holds;
     ``notes`` what was odd with it, a sentence each; ``remark`` what whoever is judged by its solution should know.
     """
@@ -101,12 +103,17 @@ class Log:
 
 
 def beginning(imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None) -> float:
-    """The first time [s] of a log: of its samples, of the reference, or one increment's length before the first."""
+    """When a log begins [s]: with its inertial units, or `LONGEST_WAIT_S` before at most, with what else is heard.
+
+    What was heard longer before says nothing of a flight of which nothing is known up to there.
+    """
     times = [float(imu.t[0]) for imu in imus.values() if len(imu)]
+    moves = min(times)
     times += [own[0].t for own in samples.values() if own]
     if reference is not None and len(reference.t):
         times.append(float(reference.t[0]))
-    return min(times)
+    earliest = min(times)
+    return earliest if moves - earliest <= LONGEST_WAIT_S else moves
 
 
 def at_pace(log: Log, pace: float) -> Log:
@@ -136,3 +143,22 @@ def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, 
     if not any(len(imu) > 1 for imu in imus.values()):
         there = ", ".join(f"{name} ({count})" for name, count in sorted(found.items())) or "nothing at all"
         raise UserError(f"{path}: has no inertial data: needed are {needed}; it has {there}")
+
+
+def require_one_clock(
+    path: Path, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None
+) -> None:
+    """Raise UserError when what a table has of a sensor was never heard while its first inertial unit was."""
+    spans = {name: (float(imu.t[0]), float(imu.t[-1])) for name, imu in imus.items() if len(imu)}
+    unit = next(iter(spans))
+    spans |= {name: (own[0].t, own[-1].t) for name, own in samples.items() if own}
+    if reference is not None and len(reference.t):
+        spans["reference"] = (float(reference.t[0]), float(reference.t[-1]))
+    begins, ends = spans[unit]
+    apart = [name for name, (first, last) in spans.items() if first > ends or last < begins]
+    if apart:
+        told = ", ".join(f"{name} from {spans[name][0]:.10g} to {spans[name][1]:.10g} s" for name in (unit, *apart))
+        raise UserError(
+            f"{path}: no time in common with {unit} has {', '.join(apart)} ({told}): clocks differ, or units: "
+            "give truth.columns.<sensor>.time a unit, or an offset, which is added to it"
+        )

@@ -13,7 +13,7 @@ import numpy as np
 from nav.earth import isa_pressure
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError, choice, unknown
-from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
+from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, quaternions
 from testbed.feeds.stamps import integrated, ordered
 from testbed.motion.logged import Column, Stream
@@ -87,6 +87,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         else:
             samples[name] = _samples(name, kind, t, values, notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
+    require_one_clock(path, imus, samples, reference)
     return Log(path, "table", imus, samples, reference, beginning(imus, samples, reference), found, notes)
 
 
