@@ -220,13 +220,20 @@ def integrated(t: Array, gyro: Array, accel: Array, form: str) -> ImuSamples:
 
 
 def begun(imu: ImuSamples, t: float) -> ImuSamples:
-    """The same from ``t`` [s] on: before its first increment nothing is known: NaN in steps of the usual length."""
+    """The same from ``t`` [s] on: before its first increment nothing is known: NaN in steps of the usual length.
+
+    Of a first over a gap in which ``t`` is, the part since then is left.
+    """
     if not len(imu):
         return imu
-    first = float(imu.t[0] - imu.dt[0])
+    first, usual = float(imu.t[0] - imu.dt[0]), float(np.median(imu.dt))
+    if first < t - EDGE_S and imu.dt[0] > _gap(usual):
+        part = np.ones(len(imu))
+        part[0] = (imu.t[0] - t) / imu.dt[0]
+        return ImuSamples(imu.t, imu.dt * part, imu.dtheta * part[:, None], imu.dv * part[:, None])
     if first - t < EDGE_S:
         return imu
-    count = math.ceil((first - t) / float(np.median(imu.dt)))
+    count = math.ceil((first - t) / usual)
     dt = np.full(count, (first - t) / count)
     unknown = np.full((count, 3), np.nan)
     return ImuSamples(
@@ -245,9 +252,9 @@ def bridged(imu: ImuSamples) -> ImuSamples:
         return imu
     usual = float(np.median(imu.dt))
     most = PIECE * usual
-    if float(imu.dt.max()) <= float(imu.dt[0]):
-        return imu
     gap: Mask = np.asarray(imu.dt > _gap(usual))
+    if float(imu.dt.max()) <= float(imu.dt[0]) and not gap[0]:
+        return imu
     pieces = np.where(imu.dt > most, np.ceil(imu.dt / most), 1.0).astype(int)
     row = np.repeat(np.arange(len(imu)), pieces)
     number = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces) + 1

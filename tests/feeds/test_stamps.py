@@ -146,6 +146,20 @@ def test_before_the_first_increment_nothing_is_known(before: float) -> None:
     assert begun(imu, 0.0) is imu
 
 
+@pytest.mark.parametrize("start", [0.0, 3.0, 5.985])
+def test_over_a_gap_before_the_first_increment_nothing_is_known(start: float) -> None:
+    """A single row before it, or a start in it: the first step is longer than all others, and no motion."""
+    later = steady(T[T > 6.0])
+    long = np.insert(later.dt[1:], 0, later.t[0])  # since a row at zero, which is no part of what is flown
+    whole = begun(ImuSamples(later.t, long, np.full((len(long), 3), 0.1) * long[:, None], later.dv), start)
+    ready = bridged(whole)
+    assert ready.t[0] - ready.dt[0] >= start - 0.03  # the first is as long as any
+    assert ready.dt.max() <= 0.035 + 1e-9
+    lost = np.isnan(ready.dtheta).all(axis=1)
+    assert ready.dt[lost].sum() == pytest.approx(later.t[0] - start - 0.02 if start < 5 else 0.0, abs=0.02)
+    assert np.allclose(ready.dtheta[~lost] / ready.dt[~lost, None], 0.1)
+
+
 def test_over_a_gap_nothing_is_known() -> None:
     ready = bridged(steady(np.delete(T, np.s_[100:150])))
     lost = np.isnan(ready.dtheta).all(axis=1)
