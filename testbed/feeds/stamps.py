@@ -219,6 +219,70 @@ def integrated(t: Array, gyro: Array, accel: Array, form: str) -> ImuSamples:
     return ImuSamples(t, dt, gyro * dt[:, None], accel * dt[:, None])
 
 
+def spaced(name: str, stamps: Array, notes: list[str]) -> Array:
+    """The stamps (N,) of increments with those that are shared put apart, where the time up to the next has room.
+
+    A row of increments is what was integrated since the row before: where two differ in nothing but their clock's
+    resolution, or one has the stamp of the row before, both happened. Without room the row was only told again.
+    """
+    begins = np.flatnonzero(np.diff(stamps, prepend=np.nan) != 0)
+    counts = np.diff(begins, append=len(stamps))
+    steps = np.diff(stamps[begins], append=np.nan)
+    each = steps / counts
+    if not (each > 0).any():
+        return stamps
+    usual = float(np.median(each[each > 0]))
+    roomy = (counts > 1) & (steps >= (counts - 0.5) * usual)
+    if not roomy.any():
+        return stamps
+    notes.append(f"{name}: {np.sum(counts[roomy] - 1)} rows share the time of the one before, and are put after it")
+    number = np.arange(len(stamps)) - np.repeat(begins, counts)
+    return np.asarray(stamps + number * np.repeat(np.where(roomy, np.minimum(each, usual), 0.0), counts))
+
+
+def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
+    """Increments as a table has them, with others where rows are missing: of a step they are its last part alone.
+
+    A step is too long if no others, before it or after it, are as much shorter: times of rows may come early or late.
+    Up to `GAP_PERIODS` rows are as those about them, as no filter aligns on what has holes all the time; more are NaN.
+    """
+    unknown = int(np.sum(~np.isfinite(np.hstack([imu.dtheta, imu.dv])).all(axis=1)))
+    if unknown:
+        notes.append(left_out(f"{name}: increments of {unknown} rows are no numbers, and unknown", unknown, len(imu)))
+    if len(imu) < 2:
+        return imu
+    period = _period(imu.dt)
+    rows = 1 + np.flatnonzero(imu.dt[1:] > PIECE * period)
+    even = imu.t - period * np.arange(len(imu))
+    near = np.arange(STRAY + 1)[:, None]
+    later, earlier = even[np.minimum(rows + near, len(imu) - 1)], even[np.maximum(rows - 1 - near, 0)]
+    missing = later.min(axis=0, initial=np.inf) - earlier.max(axis=0, initial=-np.inf)
+    rows, missing = rows[missing > period / 2], missing[missing > period / 2]
+    if not len(rows):
+        return imu
+    long = missing > GAP_PERIODS * period
+    lost = (
+        f"{name}: rows are missing in {len(rows)} places, {missing.sum():.3g} s in all: increments are unknown where "
+    )
+    lost += f"they are more than {GAP_PERIODS:g}, {long.sum()} times, and as those about them elsewhere"
+    notes.append(left_out(lost, round(float(missing.sum()) / period), len(imu)))
+    dt = imu.dt.copy()
+    dt[rows] -= missing
+    rates = [imu.dtheta / dt[:, None], imu.dv / dt[:, None]]
+    between = [np.where(long, np.nan, missing / 2)[:, None] * (rate[rows - 1] + rate[rows]) for rate in rates]
+    return ImuSamples(
+        np.insert(imu.t, rows, imu.t[rows] - dt[rows]), np.insert(dt, rows, missing),
+        np.insert(imu.dtheta, rows, between[0], axis=0), np.insert(imu.dv, rows, between[1], axis=0),
+    )  # fmt: skip
+
+
+def _period(dt: Array) -> float:
+    """Of rows of which some may be missing, or that come in bursts, how long one is [s]."""
+    usual = float(np.median(dt))
+    ordinary, all_but_gaps = dt[dt <= PIECE * usual], dt[dt <= _gap(usual)]
+    return float(np.mean(ordinary if 2 * ordinary.sum() > all_but_gaps.sum() else all_but_gaps))
+
+
 def begun(imu: ImuSamples, t: float) -> ImuSamples:
     """The same from ``t`` [s] on: before its first increment nothing is known: NaN in steps of the usual length.
 

@@ -15,7 +15,7 @@ from nav.samples import Array, ImuSamples
 from testbed.errors import UserError, choice, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, quaternions
-from testbed.feeds.stamps import integrated, ordered
+from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
@@ -81,7 +81,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         kind = stream.kind or name
         t, values = _stream(table, name, kind, stream, notes)
         if kind == "imu":
-            imus[name] = integrated(t, values["gyro"], values["accel"], stream.form)
+            imu = integrated(t, values["gyro"], values["accel"], stream.form)
+            imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
         elif kind == "reference":
             reference = _reference(t, values)
         else:
@@ -164,7 +165,8 @@ def _stream(
             raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")
     blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
-    t, kept = ordered(name, stamps[rows], notes)
+    apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]
+    t, kept = ordered(name, apart, notes)
     return t, {key: array[rows[kept]] for key, array in values.items()}
 
 

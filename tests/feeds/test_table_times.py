@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nav.samples import ImuSamples
 from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.log import Log
+from testbed.feeds.stamps import Loss, bridged
 from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
 
@@ -81,3 +83,85 @@ def test_a_log_begins_with_its_inertial_unit_when_others_were_heard_long_before(
     made["gt"] = np.concatenate([[-early], made["gt"][1:]])
     made["rt"] = made["rt"] + 1
     assert read(made, tmp_path).t0 == pytest.approx(begins)
+
+
+INCREMENTS = {"imu": {"form": "increments"}}
+TURN = 0.1  # [rad/s], of each increment, and of nothing else
+
+
+def increments(kept: Any = slice(None)) -> dict[str, Any]:
+    made = table()
+    return made | {"t": T[kept].copy(), "w": made["w"][kept] / IMU_HZ, "f": made["f"][kept] / IMU_HZ}
+
+
+def unit(made: Mapping[str, Any], folder: Path) -> tuple[ImuSamples, list[str]]:
+    """The unit's increments, and what was told of it."""
+    log = read(made, folder, INCREMENTS)
+    return log.imus["imu"], [note for note in log.notes if note.startswith("imu: ")]
+
+
+@pytest.mark.parametrize(("rows", "known"), [(1, True), (4, True), (8, False), (15, False), (400, False)])
+@pytest.mark.parametrize("blank", [False, True])
+def test_missing_increments_are_no_rest(rows: int, known: bool, blank: bool, tmp_path: Path) -> None:
+    """A few are like their neighbours, more are unknown; each row that there is has its own step."""
+    lost = np.isin(np.arange(len(T)), [at + k for at in (2000, 7000) for k in range(rows)])
+    made = increments(slice(None) if blank else ~lost)
+    if blank:
+        made["w"][lost], made["f"][lost] = np.nan, np.nan
+    imu, notes = unit(made, tmp_path)
+    assert np.allclose(imu.t - imu.dt, np.concatenate([[0.0], imu.t[:-1]]), rtol=0, atol=1e-9)
+    imu = bridged(imu)
+    unknown = np.isnan(imu.dtheta).any(axis=1)
+    assert imu.dt[unknown].sum() == pytest.approx(0.0 if known else 2 * rows / IMU_HZ)
+    assert np.allclose(imu.dtheta[~unknown, 0], TURN * imu.dt[~unknown])
+    assert any("rows are missing in 2 places" in note for note in notes)
+    assert any(isinstance(note, Loss) for note in notes) == (rows > 60)
+
+
+def test_increments_that_are_often_missing_are_told_aloud(tmp_path: Path) -> None:
+    imu, notes = unit(increments(np.random.default_rng(1).random(len(T)) > 0.1), tmp_path)
+    assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * imu.t[-1])
+    assert [type(note) for note in notes] == [Loss]
+
+
+def test_increments_with_a_part_that_is_no_number_are_unknown_and_told(tmp_path: Path) -> None:
+    made = increments()
+    made["w"][[500, 900], 1] = np.nan
+    imu, notes = unit(made, tmp_path)
+    assert np.flatnonzero(np.isnan(imu.dtheta).any(axis=1)).tolist() == [500, 900]
+    assert notes == ["imu: increments of 2 rows are no numbers, and unknown"]
+
+
+@pytest.mark.parametrize("every", [2, 3, 20, 500])
+def test_increments_that_share_a_time_happened_one_after_the_other(every: int, tmp_path: Path) -> None:
+    """A clock too coarse for them, or a stamp that was not read anew."""
+    made = increments()
+    k = np.arange(1, len(T) - 1, every)
+    made["t"][k] = made["t"][k - 1]
+    imu, notes = unit(made, tmp_path)
+    assert len(imu) == len(T)
+    assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * T[-1])
+    assert np.allclose(imu.t, T, rtol=0, atol=1.01 / IMU_HZ)
+    assert len(notes) == 1
+    assert notes[0].endswith("share the time of the one before, and are put after it")
+
+
+def test_increments_that_are_told_again_happened_once(tmp_path: Path) -> None:
+    made = increments(np.sort(np.concatenate([np.arange(len(T)), np.arange(100, len(T), 50)])))
+    imu, notes = unit(made, tmp_path)
+    assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * T[-1])
+    assert len(imu) == len(T)
+    assert "come again, and are left out" in notes[0]
+
+
+@pytest.mark.parametrize("burst", [1, 2, 3, 4])
+def test_times_that_come_early_or_late_are_no_sign_of_missing_increments(burst: int, tmp_path: Path) -> None:
+    """Stamps of a computer that hears of several rows at once, or of one that is sometimes busy."""
+    made = increments()
+    rng = np.random.default_rng(burst)
+    late = np.ceil(np.arange(1, len(T) + 1) / burst) * burst / IMU_HZ
+    made["t"] = late + np.arange(len(T)) % burst * 1e-4 + rng.uniform(0, 0.2 / IMU_HZ, len(T)) * (burst == 1)
+    made["t"][::97] += 0.6 / IMU_HZ * (burst == 1)
+    imu, notes = unit(made, tmp_path)
+    assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * T[-1])
+    assert notes == []
