@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +15,15 @@ from nav.samples import (
     BarometerSample,
     FixType,
     GnssSample,
+    ImuSamples,
     MagnetometerSample,
     Sample,
 )
+from testbed.feeds.stamps import left_out
 from testbed.sensors.gnss import NO_FIX_DOP, without_fix
 
 UNKNOWN = np.full(3, np.nan)
+HELD_SHARE = 0.9  # of a sensor's rows that are at the times of an inertial unit, if it is told with that
 
 
 class Fixes:
@@ -58,6 +62,27 @@ def _positive(sigma: Array) -> Array:
     return sigma.copy() if (sigma > 0).all() else UNKNOWN
 
 
+def newly(
+    name: str, t: Array, values: Mapping[str, Array], imus: Mapping[str, ImuSamples], notes: list[str]
+) -> tuple[Array, dict[str, Array]]:
+    """Times (N,) and quantities of a sensor without the rows that repeat the one before, of one that is only held.
+
+    A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
+    it, to the last bit, usually comes more than once, at the unit's own times: by a receiver that stands still at its
+    own rate nothing is held, nor by a sensor of the unit's rate that sometimes says the same.
+    """
+    if len(t) < 2 or not any(np.isin(t, imu.t).mean() > HELD_SHARE for imu in imus.values()):
+        return t, dict(values)
+    rows = np.column_stack([np.nan_to_num(one.reshape(len(t), -1), nan=np.inf) for one in values.values()])
+    first = np.concatenate([[0], 1 + np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))])
+    if np.median(np.diff(first, append=len(t))) < 2:
+        return t, dict(values)
+    held = len(t) - len(first)
+    told = f"{name}: {held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
+    notes.append(left_out(told, held, len(t)))
+    return t[first], {key: one[first] for key, one in values.items()}
+
+
 def barometers(name: str, t: Array, pressure: Array) -> list[Sample]:
     """Static pressures [Pa]."""
     return [BarometerSample(s, s, p, name) for s, p in zip(t.tolist(), pressure.tolist(), strict=True)]
@@ -68,7 +93,7 @@ def magnetometers(name: str, t: Array, field_b: Array, notes: list[str]) -> list
     there = field_b.any(axis=1)
     if not there.all():
         said = f"{np.sum(~there)} samples have no field at all" if there.any() else "it never has a field"
-        notes.append(f"{name}: {said}: left out")
+        notes.append(left_out(f"{name}: {said}: left out", int(np.sum(~there)), len(t)))
     rows = np.flatnonzero(there)
     return [MagnetometerSample(s, s, field_b[k].copy(), name) for k, s in zip(rows, t[rows].tolist(), strict=True)]
 

@@ -14,7 +14,7 @@ from nav.earth import isa_pressure
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError, choice, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, quaternions
+from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
@@ -77,7 +77,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     imus: dict[str, ImuSamples] = {}
     samples: dict[str, Samples] = {}
     reference = None
-    for name, stream in columns.items():
+    # Inertial units first: what is held on at their times is known by them.
+    for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         t, values = _stream(table, name, kind, stream, notes)
         if kind == "imu":
@@ -86,7 +87,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         elif kind == "reference":
             reference = _reference(t, values)
         else:
-            samples[name] = _samples(name, kind, t, values, notes)
+            samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
     require_one_clock(path, imus, samples, reference)
     return Log(path, "table", imus, samples, reference, beginning(imus, samples, reference), found, notes)

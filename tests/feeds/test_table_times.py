@@ -165,3 +165,41 @@ def test_times_that_come_early_or_late_are_no_sign_of_missing_increments(burst: 
     imu, notes = unit(made, tmp_path)
     assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * T[-1])
     assert notes == []
+
+
+def held(t: np.ndarray) -> dict[str, Any]:
+    """The table with the receiver's newest row at each of the times ``t``."""
+    made = table()
+    rows = np.searchsorted(made["gt"], t, side="right") - 1
+    told = {name: made[name][rows] for name in ("lat", "lon", "h", "v")}
+    return made | told | {"gt": t, "rt": t}
+
+
+def test_fixes_that_are_held_on_are_no_new_ones(tmp_path: Path) -> None:
+    """Nor is the last one before a receiver fell silent."""
+    made = held(T)
+    silent = (T > 20) & (T < 40)
+    for name in ("lat", "lon", "h", "v"):
+        made[name][silent] = made[name][np.flatnonzero(silent)[0]]
+    log = read(made, tmp_path)
+    t = np.array([one.t for one in log.samples["gnss"]])
+    assert len(t) == pytest.approx((SECONDS - 20) * GNSS_HZ, abs=3)
+    assert not ((t > 20.3) & (t < 39.7)).any()
+    assert np.median(np.diff(t)) == pytest.approx(1 / GNSS_HZ)
+    notes = [note for note in log.notes if "hold what the one before had" in note]
+    assert [type(note) for note in notes] == [Loss]
+    assert notes[0].startswith("gnss: ")
+
+
+@pytest.mark.parametrize("hz", [1, 5, 20])
+def test_a_receiver_that_stands_still_is_heard_at_its_own_rate(hz: int, tmp_path: Path) -> None:
+    own = np.arange(1, SECONDS * hz) / hz + 0.0013
+    log = read({**held(own), "h": np.full(len(own), 500.0), "v": np.zeros((len(own), 3))}, tmp_path)
+    assert len(log.samples["gnss"]) == len(own)
+
+
+def test_a_sensor_of_the_units_rate_may_say_the_same_again(tmp_path: Path) -> None:
+    made = held(T)
+    made["h"] = 500.0 + np.maximum(np.arange(len(T)) - 4000, 0) * 0.01  # it stands for twenty seconds
+    made["v"][:4000], made["lat"][:4000] = 0.0, 0.8
+    assert len(read(made, tmp_path).samples["gnss"]) == len(T)
