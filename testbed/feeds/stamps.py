@@ -21,7 +21,7 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 # After which counters begin anew [s]: 32 bits of microseconds, of milliseconds; 16 of milliseconds; a GPS week.
 WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0)
-WRAP_SHARE = 0.005  # of it, that may be lost where it begins anew
+WRAP_SHARE = 0.02  # of it, that may be lost where it begins anew
 STRAY, STRAY_SHARE = 8, 0.01  # rows by which times may be out of order, or that may be far off; of all rows
 LONGEST_GAP_S = 3600.0  # beyond which a gap that is longer than all else is none: the clock was set
 MUCH = 0.01  # of a stream's rows: who runs the log is told when more are left out

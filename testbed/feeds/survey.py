@@ -212,10 +212,11 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     from scipy import signal  # takes long to load, and a run has no need of it; the same of the one below
 
     part = between(log, imu, longest)
-    if part.stop - part.start < 2:
+    force = imu.dv[part] / imu.dt[part, None]
+    force = force[np.isfinite(force).all(axis=1)]  # of increments that a table lacks nothing is known
+    if len(force) < 2:
         return None
     rate_hz = 1 / float(np.median(imu.dt[part]))
-    force = imu.dv[part] / imu.dt[part, None]
     frequency, density = signal.welch(force, rate_hz, nperseg=min(1024, len(force)), axis=0)
     total = density.sum(axis=1)
     fast = frequency >= 5.0

@@ -118,6 +118,14 @@ def test_missing_increments_are_no_rest(rows: int, known: bool, blank: bool, tmp
     assert any(isinstance(note, Loss) for note in notes) == (rows > 60)
 
 
+def test_what_is_measured_of_a_log_is_of_the_increments_that_it_has(tmp_path: Path) -> None:
+    found = survey(read(increments(~np.isin(np.arange(len(T)), np.arange(7000, 7200))), tmp_path, INCREMENTS))
+    assert [phase.name for phase in found.phases] == ["flying"]
+    assert np.isfinite(found.vibration["imu"].rms)
+    assert found.rates["imu"].rate_hz == pytest.approx(IMU_HZ)
+    assert found.rates["imu"].gaps == 1
+
+
 def test_increments_that_are_often_missing_are_told_aloud(tmp_path: Path) -> None:
     imu, notes = unit(increments(np.random.default_rng(1).random(len(T)) > 0.1), tmp_path)
     assert imu.dtheta[:, 0].sum() == pytest.approx(TURN * imu.t[-1])
