@@ -48,6 +48,13 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "airspeed": SPEED,
     "attitude": ANGLE,
 }
+STEEPEST = math.radians(91)  # a pitch; one that is in degrees and said to be in radians is soon more
+GARBAGE = 0.01  # share of rows that may be what no such quantity is
+ANGLES_ALIKE = 'offset would be added to roll, pitch and heading alike: of angles to other axes say frame = "flu-enu"'
+QUATERNION = (
+    "a quaternion has no unit, offset or axes: name its columns in the order w, x, y, z, such as"
+    ' column = ["q:3", "q:0", "q:1", "q:2"] of one that has w last, and say with frame what it turns between'
+)
 VECTORS = frozenset({"gyro", "accel", "velocity", "sigma_position", "sigma_velocity", "field"})
 # What each kind needs, one of each tuple, and what it may have.
 NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
@@ -186,15 +193,29 @@ def _quantity(table: Table, where: str, key: str, column: Column) -> Array:
     wanted = (3, 4) if key == "attitude" else (3,) if key in VECTORS else (1,)
     if width not in wanted:
         raise UserError(f"{where}: has {width} columns: {' or '.join(map(str, wanted))} are needed")
-    if width == 4:
-        return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
+    if key == "attitude" and (column.offset or (width == 4 and (column.unit or column.axes != ("x", "y", "z")))):
+        raise UserError(f"{where}: {ANGLES_ALIKE if width == 3 else QUATERNION}")
     values = (values * column.scale) * units[unit] + column.offset * units[unit]
+    if width == 4:
+        return _turned(values / np.linalg.norm(values, axis=1, keepdims=True), column.frame)
     if key == "attitude":
-        return quaternions(*values.T)
+        order, signs = column.order
+        roll, pitch, heading = (values[:, order] * signs).T
+        if np.mean(np.abs(pitch) > STEEPEST) > GARBAGE:
+            raise UserError(f'{where}: has a pitch of {np.nanmax(np.abs(pitch)):.3g} rad: unit = "deg"?')
+        return _turned(quaternions(roll, pitch, heading), column.frame)
     if width == 3:
         order, signs = column.order
         return np.ascontiguousarray(values[:, order] * (np.abs(signs) if key.startswith("sigma") else signs))
     return values.reshape(len(values))
+
+
+def _turned(q: Array, frame: str) -> Array:
+    """Quaternions (N, 4) of body axes and axes of the Earth of a ``frame`` as those of house axes, q_nb."""
+    if frame == "frd-ned":
+        return q
+    w, x, y, z = q.T  # half a turn about the line between north and east before it, and one about forward after it
+    return np.asarray(np.column_stack([w + z, x + y, x - y, w - z]) * math.sqrt(0.5))
 
 
 def _column(table: Table, where: str, name: str) -> Array:

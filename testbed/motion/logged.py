@@ -32,7 +32,14 @@ class Column(Section):
     )
     unit: str | None = Field(default=None, description="what it is in; none: the SI unit")
     axes: tuple[Component, Component, Component] = Field(
-        default=("x", "y", "z"), description="of a vector, which column is forward, right, down, or north, east, down"
+        default=("x", "y", "z"),
+        description="of a vector, which column is forward, right, down, or north, east, down; of angles, which is "
+        "roll, pitch, heading",
+    )
+    frame: Literal["frd-ned", "flu-enu"] = Field(
+        default="frd-ned",
+        description="of an attitude, from which body axes to which of the Earth it turns: forward, right, down to "
+        "north, east, down, or, as ROS has it, forward, left, up to east, north, up",
     )
     scale: float = Field(default=1.0, description="what it is multiplied by, before the unit")
     offset: float = Field(default=0.0, description="what is added then, in the unit")
@@ -86,6 +93,14 @@ class Stream(Section):
     field: Column | None = Field(default=None, description="magnetic flux density, body axes")
     airspeed: Column | None = Field(default=None, description="equivalent (indicated)")
     attitude: Column | None = Field(default=None, description="roll, pitch, heading; or four of a quaternion, w first")
+
+    @model_validator(mode="after")
+    def _frames_are_of_attitudes(self) -> Stream:
+        for name in type(self).model_fields:
+            column = getattr(self, name)
+            if name != "attitude" and isinstance(column, Column) and column.frame != "frd-ned":
+                raise ValueError(f"{name}.frame: is nothing but an attitude's: say it with axes")
+        return self
 
 
 class LogTruth(Section):

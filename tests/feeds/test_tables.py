@@ -1,0 +1,118 @@
+"""Tables that are not quite what their scenario says: what has a clear meaning is done, and the rest is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nav.rotation import quat_from_euler, quat_multiply
+from testbed.errors import UserError
+from testbed.feeds import formats
+from testbed.feeds.log import Log
+from testbed.feeds.samples import quaternions
+from testbed.motion.logged import LogTruth
+
+SECONDS, RATE_HZ = 30, 50
+LYING = np.radians((3.0, -20.0, 60.0))  # roll, pitch, heading of a vehicle that stands there
+HALF = np.sqrt(0.5)
+ENU, FLU = np.array([0.0, HALF, HALF, 0.0]), np.array([0.0, 1.0, 0.0, 0.0])  # as turns of ours
+
+
+def standing() -> dict[str, Any]:
+    """A vehicle that stands on a slope at 47 N 8 E, its inertial unit, its receiver and what is known of it."""
+    t = np.arange(1, SECONDS * RATE_HZ + 1) / RATE_HZ
+    roll, pitch, _ = LYING
+    force = -9.81 * np.array([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    once = np.ones(len(t))
+    return {
+        "t": t, "w": np.zeros((len(t), 3)), "f": np.tile(force, (len(t), 1)),
+        "lat": 47 * once, "lon": 8 * once, "h": 500 * once, "v": np.zeros((len(t), 3)),
+        "angles": np.tile(LYING, (len(t), 1)), "q": np.tile(quat_from_euler(*LYING), (len(t), 1)),
+    }  # fmt: skip
+
+
+IMU: dict[str, Any] = {"time": "t", "gyro": "w", "accel": "f"}
+DEG = {"lat": {"column": "lat", "unit": "deg"}, "lon": {"column": "lon", "unit": "deg"}}
+PLACE: dict[str, Any] = {"time": "t", **DEG, "height": "h", "velocity": "v"}
+
+
+def read(folder: Path, table: Mapping[str, Any], **columns: Any) -> Log:
+    """A table as a log; that of the inertial unit need not be said."""
+    np.savez(folder / "flight.npz", **table)
+    given = {"source": "log", "file": "flight.npz", "columns": {"imu": IMU, **columns}}
+    return formats.read(folder / "flight.npz", LogTruth.model_validate(given).columns)
+
+
+# --- attitudes
+
+
+def attitudes(folder: Path, table: Mapping[str, Any], column: Any) -> Any:
+    """What a reference's attitude is read as, (N, 4)."""
+    log = read(folder, table, reference={"time": "t", "attitude": column})
+    assert log.solution is not None
+    return log.solution.columns["q_nb"]
+
+
+def same(found: Any, roll: float, pitch: float, heading: float) -> bool:
+    """Whether all of some quaternions are one attitude."""
+    return bool(np.allclose(np.abs(found @ quaternions([roll], [pitch], [heading])[0]), 1.0, rtol=0, atol=1e-12))
+
+
+def test_axes_of_angles_say_which_is_roll_pitch_and_heading(tmp_path: Path) -> None:
+    """As PSINS has them: pitch, roll, and yaw, counter-clockwise from north."""
+    table = standing()
+    table["avp"] = np.degrees(table["angles"][:, [1, 0, 2]] * [1, 1, -1])
+    column = {"column": ["avp:0", "avp:1", "avp:2"], "unit": "deg", "axes": ["y", "x", "-z"]}
+    assert same(attitudes(tmp_path, table, column), *LYING)
+    table["avp"] = table["avp"] * 100
+    assert same(attitudes(tmp_path, table, {**column, "scale": 0.01}), *LYING)
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_a_quaternion_may_be_as_ros_has_it(last: bool, tmp_path: Path) -> None:
+    """Of every attitude: forward, left, up to east, north, up; w first or, by the columns' names, last."""
+    table = standing()
+    rng = np.random.default_rng(1)
+    table["q"] = np.array([quat_from_euler(*rng.uniform(-1.5, 1.5, 3)) for _ in table["t"]])
+    theirs = np.array([quat_multiply(quat_multiply(ENU, q), FLU) for q in table["q"]])
+    column: dict[str, Any] = {"column": "theirs", "frame": "flu-enu"}
+    if last:
+        theirs = theirs[:, [1, 2, 3, 0]]
+        column["column"] = ["theirs:3", "theirs:0", "theirs:1", "theirs:2"]
+    found = attitudes(tmp_path, {**table, "theirs": 2 * theirs}, column)
+    np.testing.assert_allclose(np.abs(np.sum(found * table["q"], axis=1)), 1.0, rtol=0, atol=1e-12)
+
+
+def test_angles_may_be_as_ros_has_them(tmp_path: Path) -> None:
+    """Pitch is of the nose down, and yaw counter-clockwise from east."""
+    table = standing()
+    table["angles"] = np.degrees(table["angles"]) * [1, -1, -1] + [0, 0, 90]
+    column = {"column": "angles", "unit": "deg", "frame": "flu-enu"}
+    assert same(attitudes(tmp_path, table, column), *LYING)
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ({"column": "q", "axes": ["y", "x", "-z"]}, r"order w, x, y, z, such as column = .*, and say with frame"),
+        ({"column": "q", "unit": "deg"}, "a quaternion has no unit"),
+        ({"column": "q", "offset": 1.0}, "a quaternion has no unit, offset"),
+        ({"column": "angles", "offset": 1.57}, "added to roll, pitch and heading alike"),
+        ({"column": "degrees"}, r'has a pitch of 20 rad: unit = "deg"\?'),
+    ],
+)
+def test_what_an_attitude_can_not_have_is_refused(column: Any, said: str, tmp_path: Path) -> None:
+    table = standing()
+    table["degrees"] = np.degrees(table["angles"])
+    with pytest.raises(UserError, match=rf"^truth\.columns\.reference\.attitude: .*{said}"):
+        attitudes(tmp_path, table, column)
+
+
+def test_only_an_attitude_has_a_frame() -> None:
+    columns = {"imu": {**IMU, "gyro": {"column": "w", "frame": "flu-enu"}}}
+    with pytest.raises(ValueError, match=r"gyro\.frame: is nothing but an attitude's"):
+        LogTruth.model_validate({"source": "log", "file": "-", "columns": columns})
