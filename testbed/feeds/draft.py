@@ -16,6 +16,7 @@ from nav.samples import AirspeedSample, BarometerSample, GnssSample, Magnetomete
 from testbed.errors import UserError
 from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
+from testbed.feeds.reference import doubt
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
@@ -121,7 +122,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
     if truth is not None and "reference" in truth.model_fields_set:
         lines.append(f"reference = {_inline(truth.reference)}")
-    elif log.remark:
+    elif doubt(log.solution, log.samples):
         lines.append('reference = "gnss"  # its own solution is elsewhere')
     if truth is not None and truth.start is not None:
         lines.append(f"start = {_inline(truth.start.model_dump())}")

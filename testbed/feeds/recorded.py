@@ -16,7 +16,7 @@ from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
 from testbed.feeds.log import SAMPLES, Log, Reference
-from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, with_rates
+from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth, Place
@@ -129,8 +129,11 @@ class Recorded:
         self._denied = {name: one.denied for name, one in sections.items() if isinstance(one, InterruptedTiming)}
         self.faults = Faults(scenario.fault, sections, seed)
         self._told = False
-        doubt = [log.remark] if log.remark and truth.reference == "solution" else []
-        self._remark = "; ".join([*doubt, *_losses(log, [*scenario.sensors, "reference"])])
+        doubt = log.remark if truth.reference == "solution" else ""
+        if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
+            doubt = f"{apart} of the run: nothing is judged by it"
+        told = [doubt, *_losses(log, [*scenario.sensors, "reference"])]
+        self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
         """The next rows, and what came with them."""

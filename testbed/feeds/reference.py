@@ -139,6 +139,8 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
             there = np.array([(one.lat, one.lon, one.h) for one in fixes]).T
             off = np.hypot(*position_difference_n(at.lat, at.lon, at.h, *there)[:, :2].T)
             off = off[np.isfinite(off)]
+            if apart := silence(solution, fixes[0].t, fixes[-1].t):
+                return f'{apart} of {name}: truth.reference = "gnss" judges by the receiver'
             rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
             speed = float(np.nan_to_num(np.nanmedian([math.hypot(*one.v_n[:2]) for one in fixes])))
             if rms <= DOUBTED_M + LATE_S * speed:
@@ -148,6 +150,14 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
                 ' truth.reference = "gnss" judges by the receiver'
             )
     return ""
+
+
+def silence(reference: Reference, first: float, last: float) -> str:
+    """That a reference has rows, but none from ``first`` to ``last`` [s], which the caller says of what they are."""
+    t = reference.t
+    if not len(t) or (t[0] <= last and t[-1] >= first):
+        return ""
+    return f"{reference.name} is of {t[0]:.10g} to {t[-1]:.10g} s, outside of the {first:.10g} to {last:.10g} s"
 
 
 def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:

@@ -47,13 +47,18 @@ def tilt_off(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mappi
     return min((float(np.median(off)) for off in found if len(off) >= LEAST_RESTS), default=0.0)
 
 
-def refusal(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> str:
-    """Why nothing may be judged by a solution, a sentence; empty where it lies as its accelerometers feel, at rest."""
+def tilted(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> str:
+    """That a solution does not lie as its accelerometers feel, at rest; empty where it does."""
     off = tilt_off(solution, imus, samples)
     if off <= MOST_TILT_OFF:
         return ""
-    tilted = f"{solution.name} and what the accelerometers feel at rest are {math.degrees(off):.0f} deg apart (median)"
-    return f"{tilted}: nothing is judged by it"
+    return f"{solution.name} and what the accelerometers feel at rest are {math.degrees(off):.0f} deg apart (median)"
+
+
+def refusal(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> str:
+    """Why nothing may be judged by a solution, a sentence; empty where it lies as its accelerometers feel, at rest."""
+    off = tilted(solution, imus, samples)
+    return f"{off}: nothing is judged by it" if off else ""
 
 
 def _tilt_off(solution: Reference, imu: ImuSamples, samples: Mapping[str, Samples]) -> list[float]:

@@ -14,6 +14,8 @@ from nav.earth import isa_pressure
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError, choice, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
+from testbed.feeds.reference import doubt, silence
+from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
 from testbed.motion.logged import Column, Stream
@@ -97,7 +99,29 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
     require_one_clock(path, imus, samples, reference)
-    return Log(path, "table", imus, samples, reference, beginning(imus, samples, reference), found, notes)
+    start = beginning(imus, samples, reference)
+    return Log(
+        path, "table", imus, samples, reference, start, found, notes, remark=_contradicted(reference, imus, samples)
+    )
+
+
+def _contradicted(
+    reference: Reference | None, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]
+) -> str:  # fmt: skip
+    """What speaks against the reference of a table.
+
+    It is judged by all the same, unlike an autopilot's own: the user named it, and it may be the truth, and what is
+    said of the axes of the inertial unit or of the receiver's clock wrong.
+    """
+    if reference is None:
+        return ""
+    said = [doubt(reference, samples)]
+    name, main = next((name, imu) for name, imu in imus.items() if len(imu))
+    if not said[0] and (apart := silence(reference, float(main.t[0]), float(main.t[-1]))):
+        said.append(f"{apart} of {name}")
+    if lies := tilted(reference, imus, samples):
+        said.append(f"{lies}: unit, order or frame of its attitude, or axes of accel, are not as truth.columns says")
+    return "; ".join(one for one in said if one)
 
 
 def load(path: Path) -> dict[str, Array]:

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from nav.rotation import quat_from_euler, quat_multiply
+from testbed import Scenario, run
 from testbed.errors import UserError
-from testbed.feeds import formats
+from testbed.feeds import draft, formats
 from testbed.feeds.log import Log
 from testbed.feeds.samples import quaternions
+from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
 
 SECONDS, RATE_HZ = 30, 50
@@ -116,3 +118,89 @@ def test_only_an_attitude_has_a_frame() -> None:
     columns = {"imu": {**IMU, "gyro": {"column": "w", "frame": "flu-enu"}}}
     with pytest.raises(ValueError, match=r"gyro\.frame: is nothing but an attitude's"):
         LogTruth.model_validate({"source": "log", "file": "-", "columns": columns})
+
+
+# --- a reference that is contradicted
+
+
+def judged(folder: Path, log_of: Mapping[str, Any], changes: Mapping[str, Any] | None = None) -> Any:
+    """The run of a table with a place and an attitude as the reference."""
+    np.savez(folder / "flight.npz", **log_of)
+    (folder / "flight.toml").write_text(SCENARIO)
+    return run(Scenario.load(folder / "flight.toml", changes or {}))
+
+
+SCENARIO = """
+title = "standing"
+duration_s = 20
+[truth]
+source = "log"
+file = "flight.npz"
+rate_hz = 50
+columns.imu = { time = "t", gyro = "w", accel = "f" }
+columns.gnss = { time = "t", lat = "lat", lon = "lon", height = "h", velocity = "v" }
+columns.reference = { time = "rt", lat = "rlat", lon = "rlon", height = "h", velocity = "v", attitude = "q" }
+[sensors.imu]
+[sensors.gnss]
+latency_s = 0.0
+[[estimator]]
+name = "ins"
+aids = ["gnss"]
+"""
+
+
+def known() -> dict[str, Any]:
+    """The same with columns of its own for the reference, in SI units."""
+    table = standing()
+    table["lat"], table["lon"] = np.radians(table["lat"]), np.radians(table["lon"])
+    return {**table, "rt": table["t"], "rlat": table["lat"], "rlon": table["lon"]}
+
+
+def test_a_reference_that_agrees_is_not_remarked_upon(tmp_path: Path) -> None:
+    assert not [one for one in judged(tmp_path, known()).remarks if "reference of the log is" in one or "rest" in one]
+
+
+def test_a_reference_that_is_not_where_its_receiver_was_is_told(tmp_path: Path) -> None:
+    """It was named by the user: errors are against it all the same."""
+    table = known()
+    table["rlat"] = table["rlat"] + 405 / 6.367e6
+    result = judged(tmp_path, table)
+    (said,) = [one for one in result.remarks if "from gnss" in one]
+    assert said.startswith("reference of the log is 405 m (RMS) from gnss, 405 m at most")
+    np.testing.assert_allclose(result.dataset["truth/lat"].values[1:], table["rlat"][0], rtol=0, atol=1e-12)
+    assert not [one for one in judged(tmp_path, table, {"truth.reference": "gnss"}).remarks if "from gnss" in one]
+
+
+def test_a_reference_that_does_not_lie_as_the_accelerometers_feel_is_told(tmp_path: Path) -> None:
+    table = known()
+    table["q"] = table["q"][:, [1, 2, 3, 0]]  # w last, untold
+    (said,) = [one for one in judged(tmp_path, table).remarks if "accelerometers" in one]
+    assert "deg apart (median): unit, order or frame of its attitude, or axes of accel, are not as" in said
+
+
+@pytest.mark.parametrize("receiver", [True, False])
+def test_a_reference_of_another_time_is_told(receiver: bool, tmp_path: Path) -> None:
+    table = known()
+    table["rt"] = table["rt"] + 1.7e9
+    if not receiver:
+        table["lat"] = np.full(len(table["t"]), np.nan)
+    (said,) = [one for one in judged(tmp_path, table).remarks if "outside of" in one]
+    assert said.startswith("reference of the log is of 1700000000 to 1700000030 s, outside of the 0 to 20 s of the run")
+    log = formats.open_log(Scenario.load(tmp_path / "flight.toml").truth)  # type: ignore[arg-type]
+    assert f"outside of the 0.02 to 30 s of {'gnss' if receiver else 'imu'}" in log.remark
+    assert ("judges by the receiver" in log.remark) == receiver
+    text = draft.scenario(survey(log), tmp_path / "x", None)
+    assert ('reference = "gnss"' in text) == receiver
+
+
+def test_a_run_of_which_its_reference_knows_nothing_says_so(tmp_path: Path) -> None:
+    table = known()
+    late = table["t"] > 25.0
+    for name in ("rt", "rlat", "rlon", "q"):
+        table[f"{name}"] = table[name][late]
+    table |= {"rh": table["h"][late], "rv": table["v"][late]}
+    text = SCENARIO.replace('height = "h", velocity = "v", att', 'height = "rh", velocity = "rv", att')
+    np.savez(tmp_path / "flight.npz", **table)
+    (tmp_path / "flight.toml").write_text(text)
+    (said,) = [one for one in run(Scenario.load(tmp_path / "flight.toml")).remarks if "outside of" in one]
+    assert "is of 25 to 29.98 s, outside of the 0 to 20 s of the run: nothing is judged by it" in said
