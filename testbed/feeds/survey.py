@@ -21,12 +21,14 @@ from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, Magnetome
 from testbed.feeds.log import Log
 from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
+from testbed.sensors.gnss import GRADES
 
 MOVING = ("moving", "flying")  # the phases in which it does
 FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
+USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
@@ -245,7 +247,10 @@ def _gained(dtheta: Array, dv: Array) -> Array:
 
 
 def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
-    """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it."""
+    """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
+
+    0 is said where that is clearly nearer than what a grade has, which is taken off where nothing is known.
+    """
     t, v_n, place = fixes(own)
     if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
         return None
@@ -266,9 +271,15 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
         apart = ((felt - told) / step)[steady]
         apart = np.abs(apart - np.median(apart))
         costs.append(float(np.sqrt(np.mean(np.minimum(apart, OUTLYING * np.median(apart)) ** 2))))
+
+    def clearer(one: int, other: int) -> bool:
+        found = 2 * steady.sum() * math.log(costs[other] / costs[one]) if costs[one] else math.inf
+        return bool(found > CLEARER)
+
     best = int(np.argmin(costs))
-    clearer = 2 * steady.sum() * math.log(costs[0] / costs[best]) if costs[best] else math.inf
-    return float(LAGS[best]) if clearer > CLEARER and 0 < best < len(LAGS) - 1 else None
+    if 0 < best < len(LAGS) - 1 and clearer(best, 0):
+        return float(LAGS[best])
+    return 0.0 if clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
 
 
 def _sphere(field: Array) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ ROUNDING = 1e-9
 BANDS_HZ = (0.5, 2.0, 8.0, 32.0, 128.0)
 RECORD = "run.nc"
 LEAST_INNOVATIONS = 30
+LAG_SLACK_S = 0.015  # a step of the lags that are tried, and as much as rounds to it
 
 
 class Row(NamedTuple):
@@ -46,7 +47,9 @@ class Row(NamedTuple):
         first, second = abs(self.flight), abs(self.simulation)
         if abs(first - second) <= self.slack:
             return 1.0
-        return second / first if first else math.inf
+        if first:
+            return second / first
+        return math.nan if math.isnan(second) else math.inf
 
     @property
     def opposite(self) -> bool:
@@ -88,15 +91,16 @@ def _sensor(name: str, *both: Survey) -> Iterator[Row]:
     yield row("gaps in a thousand", "", [1e3 * one.gaps / one.count for one in rates], slack=0.1)
     if name in both[0].log.imus:
         yield from _inertial(name, *both)
-    for what, unit, tables, scale in (
-        ("velocity is told of later by", "s", [one.latency_s for one in both], 1.0),
-        ("true airspeed over the sensor's", "", [one.airspeed_scale for one in both], 1.0),
+    for what, unit, tables, scale, slack in (
+        ("velocity is told of later by", "s", [one.latency_s for one in both], 1.0, LAG_SLACK_S),
+        ("true airspeed over the sensor's", "", [one.airspeed_scale for one in both], 1.0, 0.0),
         (
             "rms from the sphere that fits", "µT",
             [{key: fit[0] for key, fit in one.field_residual.items()} for one in both], MICROTESLA,
+            0.0,
         ),
     ):  # fmt: skip
-        yield row(what, unit, [table.get(name, math.nan) for table in tables], scale)
+        yield row(what, unit, [table.get(name, math.nan) for table in tables], scale, slack)
 
 
 def _inertial(name: str, *both: Survey) -> Iterator[Row]:

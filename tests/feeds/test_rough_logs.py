@@ -20,6 +20,7 @@ from testbed.feeds import draft, formats
 from testbed.feeds.log import Log
 from testbed.feeds.survey import survey
 from testbed.loop.loop import RunResult
+from testbed.motion.logged import LogTruth
 from testbed.score import accuracy, metrics
 
 BIN = data_dir("scenarios") / "recorded_flight.bin"
@@ -239,6 +240,21 @@ def test_a_survey_finds_latency_noise_and_phases(tmp_path: Path) -> None:
     assert np.rad2deg(np.abs(noise.gyro_bias)).max() * 3600 == pytest.approx(40, rel=0.6)
     assert draft.imu_keys(noise)["grade"] == "mems-consumer"
     assert result.path is not None
+
+
+@pytest.mark.parametrize("stamps", [0.0, -0.1])
+def test_a_draft_says_how_late_a_receiver_is_and_that_it_is_not(stamps: float, log: Log, tmp_path: Path) -> None:
+    """The log's is told of 0.1 s late; where stamps are of when fixes were valid, nothing is taken off."""
+    table = arrays(log)
+    table["gnss_t"] = table["gnss_t"] + stamps
+    np.savez(tmp_path / "rough.npz", **table)
+    (tmp_path / "rough.toml").write_text(SCENARIO.replace("GNSS", ALL))
+    truth = Scenario.load(tmp_path / "rough.toml").truth
+    assert isinstance(truth, LogTruth)
+    (tmp_path / "draft.toml").write_text(draft.scenario(survey(formats.open_log(truth)), tmp_path / "x", truth))
+    drafted = Scenario.load(tmp_path / "draft.toml").sensors["gnss"]
+    assert drafted.latency_s == pytest.approx(0.1 + stamps, abs=0.021)  # type: ignore[attr-defined]
+    assert "latency_s" in drafted.model_fields_set
 
 
 def test_log_shows_a_table_and_writes_a_scenario_that_runs(

@@ -78,6 +78,16 @@ def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None
     assert not [one for one in likeness.compare(flight, flight) if one.what == row.what]
 
 
+@pytest.mark.parametrize(("lag", "alike"), [(0.01, True), (0.2, False)])
+def test_a_receiver_that_is_not_late_is_compared_like_any(lag: float, alike: bool) -> None:
+    flight = replace(survey(toy(2.0)), latency_s={"gnss": 0.0})
+    row = found(likeness.compare(flight, replace(flight, latency_s={"gnss": lag})), "velocity is told of later by")
+    assert row.alike == alike
+    only = found(likeness.compare(flight, replace(flight, latency_s={})), row.what)
+    assert not only.alike
+    assert math.isnan(only.ratio)
+
+
 @pytest.mark.parametrize(
     ("flight", "simulation", "said"),
     [
