@@ -11,10 +11,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from nav.earth import isa_pressure
-from nav.samples import Array, ImuSamples
+from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.reference import doubt, silence
+from testbed.feeds.reference import doubt, is_flown, silence
 from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
@@ -51,12 +51,15 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "attitude": ANGLE,
 }
 STEEPEST = math.radians(91)  # a pitch; one that is in degrees and said to be in radians is soon more
+LARGEST = {"lat": math.pi / 2, "lon": 2 * math.pi}  # that there may be of these
 GARBAGE = 0.01  # share of rows that may be what no such quantity is
 ANGLES_ALIKE = 'offset would be added to roll, pitch and heading alike: of angles to other axes say frame = "flu-enu"'
 QUATERNION = (
     "a quaternion has no unit, offset or axes: name its columns in the order w, x, y, z, such as"
     ' column = ["q:3", "q:0", "q:1", "q:2"] of one that has w last, and say with frame what it turns between'
 )
+CODES = "and are taken to be without a fix: leave fix out where it is another code, as RTKLIB's Q or NMEA's quality"
+NOWHERE = "are without height, at latitude and longitude 0, or where no aircraft is"
 VECTORS = frozenset({"gyro", "accel", "velocity", "sigma_position", "sigma_velocity", "field"})
 # What each kind needs, one of each tuple, and what it may have.
 NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
@@ -94,7 +97,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
         elif kind == "reference":
-            reference = _reference(t, values)
+            reference = _reference(t, values, notes)
         else:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
@@ -190,8 +193,8 @@ def _stream(
     for keys in NEEDED[kind]:
         if not any(key in given for key in keys):
             raise UserError(f"{where}.{keys[0]}: is missing: a sensor of kind {kind} needs {' or '.join(keys)}")
-    values = {key: _quantity(table, f"{where}.{key}", key, column) for key, column in given.items()}
-    stamps = _quantity(table, f"{where}.time", "time", stream.time)
+    values = {key: _quantity(table, f"{where}.{key}", key, column, notes) for key, column in given.items()}
+    stamps = _quantity(table, f"{where}.time", "time", stream.time, notes)
     for key, array in values.items():
         if len(array) != len(stamps):
             raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")
@@ -202,7 +205,7 @@ def _stream(
     return t, {key: array[rows[kept]] for key, array in values.items()}
 
 
-def _quantity(table: Table, where: str, key: str, column: Column) -> Array:
+def _quantity(table: Table, where: str, key: str, column: Column, notes: list[str]) -> Array:
     """One quantity in SI units and house axes: (N,), or (N, 3), of an attitude (N, 4)."""
     units = UNITS[key]
     unit = next(iter(units)) if column.unit is None else column.unit
@@ -217,21 +220,43 @@ def _quantity(table: Table, where: str, key: str, column: Column) -> Array:
     wanted = (3, 4) if key == "attitude" else (3,) if key in VECTORS else (1,)
     if width not in wanted:
         raise UserError(f"{where}: has {width} columns: {' or '.join(map(str, wanted))} are needed")
-    if key == "attitude" and (column.offset or (width == 4 and (column.unit or column.axes != ("x", "y", "z")))):
-        raise UserError(f"{where}: {ANGLES_ALIKE if width == 3 else QUATERNION}")
-    values = (values * column.scale) * units[unit] + column.offset * units[unit]
-    if width == 4:
-        return _turned(values / np.linalg.norm(values, axis=1, keepdims=True), column.frame)
     if key == "attitude":
-        order, signs = column.order
-        roll, pitch, heading = (values[:, order] * signs).T
-        if np.mean(np.abs(pitch) > STEEPEST) > GARBAGE:
-            raise UserError(f'{where}: has a pitch of {np.nanmax(np.abs(pitch)):.3g} rad: unit = "deg"?')
-        return _turned(quaternions(roll, pitch, heading), column.frame)
+        return _attitude(where, values, column, notes)
+    values = (values * column.scale) * units[unit] + column.offset * units[unit]
     if width == 3:
         order, signs = column.order
         return np.ascontiguousarray(values[:, order] * (np.abs(signs) if key.startswith("sigma") else signs))
-    return values.reshape(len(values))
+    values = values.reshape(len(values))
+    if key in LARGEST:
+        _require_unit(where, values / units[unit], unit, LARGEST[key])
+    return values
+
+
+def _require_unit(where: str, values: Array, unit: str, largest: float) -> None:
+    """Raise UserError when angles in a ``unit`` are mostly larger than the ``largest`` [rad]: it is another one."""
+    known = np.abs(values[np.isfinite(values) & (values != 0)])
+    usual = float(np.median(known)) if len(known) else 0.0
+    if usual * ANGLE[unit] > largest:
+        meant = "deg" if usual * DEG <= largest else "1e-7deg"
+        raise UserError(f'{where}: is {usual:.6g} {unit}: unit = "{meant}"?')
+
+
+def _attitude(where: str, values: Array, column: Column, notes: list[str]) -> Array:
+    """Attitudes q_nb (N, 4) of angles (N, 3) or quaternions (N, 4) as the table has them."""
+    if values.shape[1] == 4:
+        if column.unit or column.offset or column.axes != ("x", "y", "z"):
+            raise UserError(f"{where}: {QUATERNION}")
+        length = np.linalg.norm(column.scale * values, axis=1, keepdims=True)
+        if none := int(np.sum(length == 0)):
+            notes.append(f"{where.removeprefix('truth.columns.')}: {none} quaternions are of no length, and unknown")
+        return _turned(column.scale * values / np.where(length > 0, length, np.nan), column.frame)
+    if column.offset:
+        raise UserError(f"{where}: {ANGLES_ALIKE}")
+    order, signs = column.order
+    roll, pitch, heading = (values[:, order] * signs * column.scale * ANGLE[column.unit or "rad"]).T
+    if np.mean(np.abs(pitch) > STEEPEST) > GARBAGE:
+        raise UserError(f'{where}: has a pitch of {np.nanmax(np.abs(pitch)):.3g} rad: unit = "deg"?')
+    return _turned(quaternions(roll, pitch, heading), column.frame)
 
 
 def _turned(q: Array, frame: str) -> Array:
@@ -263,7 +288,15 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
         case "airspeed":
             eas = values.get("airspeed")
             return airspeeds(name, t, eas_of(values["pressure"]) if eas is None else eas)
-    fixes = Fixes(t, values["lat"], values["lon"], values["height"])
+    lat, lon, height = values["lat"], values["lon"], values["height"]
+    if (fix := values.get("fix")) is None:
+        nowhere = (lat == 0) & (lon == 0)
+        if nowhere.any():
+            notes.append(f"{name}: {np.sum(nowhere)} rows are at latitude and longitude 0: taken to be without a fix")
+            lat = np.where(nowhere, np.nan, lat)
+    elif 2 * (refused := int(np.sum(np.isfinite(lat) & ~(fix >= FixType.FIX_3D)))) > len(t):
+        notes.append(f"{name}: {refused} of {len(t)} rows have fix < 3, {CODES}")
+    fixes = Fixes(t, lat, lon, height)
     for key, own in (
         ("velocity", "v_n"),
         ("sigma_position", "sigma_position_n"),
@@ -277,13 +310,19 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
     return fixes.samples(name)
 
 
-def _reference(t: Array, values: Mapping[str, Array]) -> Reference:
-    """What the table says of the motion."""
+def _reference(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:
+    """What the table says of the motion: where there is no whole place, or one of nobody, it is unknown."""
     named = {"height": "h", "velocity": "v_n", "attitude": "q_nb"}
     columns = {named.get(key, key): array for key, array in values.items()}
-    if not {"lat", "lon", "h"} <= columns.keys():
-        for key in ("lat", "lon", "h"):
-            columns.pop(key, None)
-    if "lon" in columns:
-        columns["lon"] = np.mod(columns["lon"] + math.pi, 2 * math.pi) - math.pi
+    place = {key: columns.pop(key) for key in ("lat", "lon", "h") if key in columns}
+    if len(place) == 3:
+        lat, lon, h = place.values()
+        known = is_flown(lat, h) & np.isfinite(lon) & ((lat != 0) | (lon != 0))
+        if strange := int(np.sum(~known & np.isfinite(lat))):
+            notes.append(f"reference: {strange} of {len(t)} rows {NOWHERE}: its place is unknown there")
+        if known.any():
+            place["lon"] = np.mod(lon + math.pi, 2 * math.pi) - math.pi
+            columns |= {key: np.where(known, array, np.nan) for key, array in place.items()}
+    elif place:
+        notes.append("reference: not all of lat, lon and height are said: nothing is judged by its place")
     return Reference("reference of the log", t, columns)

@@ -14,6 +14,7 @@ from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import draft, formats
 from testbed.feeds.log import Log
+from testbed.feeds.recorded import first_place
 from testbed.feeds.samples import quaternions
 from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
@@ -118,6 +119,98 @@ def test_only_an_attitude_has_a_frame() -> None:
     columns = {"imu": {**IMU, "gyro": {"column": "w", "frame": "flu-enu"}}}
     with pytest.raises(ValueError, match=r"gyro\.frame: is nothing but an attitude's"):
         LogTruth.model_validate({"source": "log", "file": "-", "columns": columns})
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_quaternion_of_no_length_is_unknown(tmp_path: Path) -> None:
+    table = standing()
+    table["q"][::50] = 0
+    log = read(tmp_path, table, reference={"time": "t", "attitude": "q"})
+    assert "reference.attitude: 30 quaternions are of no length, and unknown" in log.notes
+    assert log.solution is not None
+    known = np.isfinite(log.solution.columns["q_nb"]).all(axis=1)
+    assert known.sum() == len(table["t"]) - 30
+    assert same(log.solution.columns["q_nb"][known], *LYING)
+
+
+# --- places
+
+
+@pytest.mark.parametrize("name", ["gnss", "reference"])
+@pytest.mark.parametrize(
+    ("units", "factor", "said"),
+    [
+        ({}, 1.0, r'lat: is 47 rad: unit = "deg"\?'),
+        ({"unit": "deg"}, 1e7, r'lat: is 4\.7e\+08 deg: unit = "1e-7deg"\?'),
+        ({}, 1e7, r'lat: is 4\.7e\+08 rad: unit = "1e-7deg"\?'),
+    ],
+)
+def test_a_latitude_that_can_be_none_is_of_another_unit(
+    name: str, units: Any, factor: float, said: str, tmp_path: Path
+) -> None:
+    table = standing()
+    table["lat"] = table["lat"] * factor
+    table["lat"][:100] = 0  # not heard yet
+    place = {**PLACE, "lat": {"column": "lat", **units}}
+    with pytest.raises(UserError, match=rf"truth\.columns\.{name}\.{said}"):
+        read(tmp_path, table, **{name: place})
+
+
+def test_a_longitude_may_be_of_a_whole_turn_and_not_of_more(tmp_path: Path) -> None:
+    table = standing()
+    table["lon"] = table["lon"] * 0 + 351.0
+    log = read(tmp_path, table, reference=PLACE)
+    assert log.solution is not None
+    np.testing.assert_allclose(log.solution.columns["lon"], np.radians(-9.0))
+    with pytest.raises(UserError, match=r'lon: is 351 rad: unit = "deg"\?'):
+        read(tmp_path, table, reference={**PLACE, "lon": "lon"})
+
+
+def test_where_a_receiver_is_nowhere_it_has_no_fix(tmp_path: Path) -> None:
+    """At 0 N 0 E, as loggers have it before the first fix; unless the table says itself what is a fix."""
+    table = standing()
+    for name in ("lat", "lon", "h"):
+        table[name][:200] = 0
+    log = read(tmp_path, table, gnss=PLACE)
+    assert [one.has_fix for one in log.samples["gnss"]] == [False] * 200 + [True] * 1300  # type: ignore[union-attr]
+    assert "gnss: 200 rows are at latitude and longitude 0: taken to be without a fix" in log.notes
+    assert first_place(log, 0.0).lat_deg == pytest.approx(47)
+    told = read(tmp_path, {**table, "fix": np.full(1500, 3)}, gnss={**PLACE, "fix": "fix"})
+    assert all(one.has_fix for one in told.samples["gnss"])  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("bad", "told"), [(700, False), (800, True)])
+def test_fixes_that_are_mostly_refused_for_their_code_are_told(bad: int, told: bool, tmp_path: Path) -> None:
+    """As where 1 is the best of fixes."""
+    table = standing()
+    table["fix"] = np.where(np.arange(1500) < bad, 1, 3)
+    log = read(tmp_path, table, gnss={**PLACE, "fix": "fix"})
+    assert any(f"gnss: {bad} of 1500 rows have fix < 3, and are taken" in note for note in log.notes) == told
+
+
+def test_where_a_reference_is_nowhere_it_is_unknown(tmp_path: Path) -> None:
+    table = standing()
+    for name in ("lat", "lon"):
+        table[name][::3] = 0
+    table["h"][1::3] = np.nan
+    log = read(tmp_path, table, reference=PLACE)
+    assert any("reference: 1000 of 1500 rows are without height, at latitude" in note for note in log.notes)
+    assert log.solution is not None
+    assert np.array_equal(np.isfinite(log.solution.columns["lat"]), np.arange(1500) % 3 == 2)
+    assert np.isfinite(log.solution.columns["v_n"]).all()
+
+
+def test_of_a_reference_without_height_no_place_is_left(tmp_path: Path) -> None:
+    """A run begins where its receiver is then, and is judged by that."""
+    table = known()
+    table["rh"] = np.full(1500, np.nan)
+    np.savez(tmp_path / "flight.npz", **table)
+    (tmp_path / "flight.toml").write_text(SCENARIO.replace('height = "h", velocity = "v", att', 'height = "rh", att'))
+    result = run(Scenario.load(tmp_path / "flight.toml"))
+    assert any(one.startswith("errors are against gnss of the log") for one in result.remarks)
+    del table["rh"]
+    log = read(tmp_path, table, reference={"time": "t", "lat": "lat", "lon": "lon", "velocity": "v"})
+    assert "reference: not all of lat, lon and height are said: nothing is judged by its place" in log.notes
 
 
 # --- a reference that is contradicted
