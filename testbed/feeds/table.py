@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from nav.earth import isa_pressure
 from nav.samples import Array, FixType, ImuSamples
-from testbed.errors import UserError, choice, unknown
+from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.reference import doubt, is_flown, silence
 from testbed.feeds.rest import tilted
@@ -22,7 +24,7 @@ from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
 PARQUET = b"PAR1"
-Table: TypeAlias = Mapping[str, Array]
+LONGEST_SHOWN = 20  # of what is no number
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": 1e-7 * DEG}
@@ -76,12 +78,20 @@ OPTIONAL: Mapping[str, tuple[str, ...]] = {
 }
 
 
+class Table(NamedTuple):
+    """A file: its columns of ``numbers``, each (N,) or (N, k), by name, and what the ``others`` hold, a few words."""
+
+    path: Path
+    numbers: Mapping[str, Array]
+    others: Mapping[str, str]
+
+
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a table by the ``columns`` of its sensors. Raises UserError when it, or what is said of it, is wrong."""
     table = load(path)
-    found = {name: len(values) for name, values in table.items()}
+    found = {name: len(values) for name, values in table.numbers.items()}
     if not columns:
-        there = ", ".join(f"{name} {values.shape}" for name, values in table.items())
+        there = ", ".join(f"{name} {values.shape}" for name, values in table.numbers.items())
         raise UserError(
             f"{path}: is a table: say in [truth.columns.<sensor>] what its columns are. It has {there or 'none'}"
         )
@@ -127,25 +137,30 @@ def _contradicted(
     return "; ".join(one for one in said if one)
 
 
-def load(path: Path) -> dict[str, Array]:
-    """The columns of a file by name, each (N,) or (N, k) of numbers. Raises UserError when it can't be read."""
+def load(path: Path) -> Table:
+    """The columns of a file. Raises UserError when it can't be read."""
     with path.open("rb") as file:
         head = file.read(16)
     try:
         if head.startswith(b"PK"):
             with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
-                return dict(_numbers(arrays.items()))
+                return _sorted(path, arrays.items())
         if head.startswith(b"MATLAB"):
             from scipy.io import loadmat
 
-            return dict(_numbers(_flat(loadmat(path, simplify_cells=True))))
+            return _sorted(path, _flat(loadmat(path, simplify_cells=True)))
         import pandas
 
         if head.startswith(PARQUET):
             frame = pandas.read_parquet(path, engine="pyarrow")
-            return dict(_numbers((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
-        frame = pandas.read_csv(path, skipinitialspace=True)
-        return dict(_numbers((str(name), frame[name].to_numpy()) for name in frame.columns))
+            return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
+        _require_fields(path, len(pandas.read_csv(path, skipinitialspace=True, index_col=False, nrows=0).columns))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
+            frame = pandas.read_csv(path, skipinitialspace=True, index_col=False, low_memory=False)
+        return _sorted(path, ((str(name), frame[name].to_numpy()) for name in frame.columns))
+    except UserError:
+        raise
     except ImportError:
         raise UserError(f"{path}: is Parquet, for which pyarrow is needed: pip install pyarrow") from None
     except (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
@@ -155,18 +170,55 @@ def load(path: Path) -> dict[str, Array]:
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
 
 
+def _require_fields(path: Path, most: int) -> None:
+    """Raise UserError when a row of a CSV has something after its last column: no telling which is which."""
+    with path.open("rb") as file:
+        for number, line in enumerate(file, 1):
+            if line.count(b",") >= most:
+                fields = next(csv.reader([line.decode(errors="replace")], skipinitialspace=True))
+                if any(one.strip() for one in fields[most:]):
+                    raise UserError(
+                        f"{path}: line {number} has {len(fields)} fields, and the first, which names them, {most}"
+                    )
+
+
 def _stacked(values: Any) -> Any:
     """A column of lists that are equally long as (N, k), any other as it is."""
     lists = values.dtype == object and all(isinstance(one, np.ndarray) for one in values)
     return np.stack(values) if lists and len({len(one) for one in values}) == 1 else values
 
 
-def _numbers(columns: Any) -> Iterator[tuple[str, Array]]:
-    """Those that hold numbers, as floats."""
+def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
+    """Those that hold numbers, as floats, and the others."""
+    numbers, others = {}, {}
     for name, values in columns:
         array = np.asarray(values)
-        if array.dtype.kind in "fiub" and array.ndim in (1, 2):
-            yield name, array.astype(float)
+        if array.ndim in (1, 2) and array.dtype.kind in "fiub":
+            numbers[name] = array.astype(float)
+        elif array.ndim:
+            others[name] = _instead(array)
+    return Table(path, numbers, others)
+
+
+def _instead(array: Any) -> str:
+    """What a column holds that are no numbers."""
+    if array.dtype.kind in "mM":
+        return f"holds {array.dtype}: give seconds as numbers"
+    if array.ndim > 1 or array.dtype.kind not in "OUST":
+        return f"holds {array.dtype} of shape {array.shape}"
+    for k, one in enumerate(array):
+        if not _is_number(one):
+            return f"holds text, first {shown(str(one)[:LONGEST_SHOWN])} in row {k + 1}"
+    return "holds numbers as text"
+
+
+def _is_number(value: Any) -> bool:
+    """Whether it is one, or nothing at all."""
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return value is None
+    return True
 
 
 def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
@@ -269,12 +321,15 @@ def _turned(q: Array, frame: str) -> Array:
 
 def _column(table: Table, where: str, name: str) -> Array:
     """A column by its name, or one of an array's by ``name:number``."""
-    if name in table:
-        return table[name]
+    found = table.numbers
+    if name in found:
+        return found[name]
+    if name in table.others:
+        raise UserError(f"{where}: {name} {table.others[name]} of {table.path}")
     whole, _, number = name.rpartition(":")
-    if whole in table and number.isdecimal() and table[whole].ndim == 2 and int(number) < table[whole].shape[1]:
-        return table[whole][:, int(number)]
-    raise UserError(f"{where}: {unknown('column', name, list(table))}")
+    if whole in found and number.isdecimal() and found[whole].ndim == 2 and int(number) < found[whole].shape[1]:
+        return found[whole][:, int(number)]
+    raise UserError(f"{where}: {unknown('column', name, list(found))}")
 
 
 def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes: list[str]) -> Samples:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from testbed.feeds.draft import sections
 from testbed.feeds.survey import Survey
@@ -13,6 +13,8 @@ from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from testbed.feeds.table import Table as Columns
 
 MESSAGES_SHOWN = 60
 PHASES_SHOWN = 20
@@ -25,12 +27,12 @@ def tables(found: Survey) -> Iterator[Table]:
     lasts = max(float(own.t[-1]) for own in log.imus.values()) - log.t0
     head.add_row("lasts", f"{lasts:.1f} s")
     head.add_row("date", str(log.date or "not said"))
-    head.add_row("reference", log.solution.name if log.solution is not None else "its GNSS alone")
+    _add(head, "reference", log.solution.name if log.solution is not None else "its GNSS alone")
     listed = [f"{name} {count}" for name, count in sorted(log.messages.items())]
     more = " …" if len(listed) > MESSAGES_SHOWN else ""
-    head.add_row("holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
+    _add(head, "holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
     for note in [*log.notes, *([log.remark] if log.remark else [])]:
-        head.add_row("note", note)
+        _add(head, "note", note)
     yield head
     reports = _table("sensors", "sensor", "samples", "rate [Hz]", "jitter [ms]", "gaps", "longest step [s]", "proposed")
     proposed = sections(found)
@@ -38,7 +40,7 @@ def tables(found: Survey) -> Iterator[Table]:
         keys = {key: value for key, value in proposed.get(name, {}).items() if key not in ("kind", "rate_hz")}
         said = ", ".join(f"{key} = {value}" if key != "grade" else str(value) for key, value in keys.items())
         numbers = (f"{one.rate_hz:.4g}", f"{1e3 * one.jitter_s:.3g}", f"{one.gaps}", f"{one.longest_s:.3g}")
-        reports.add_row(name, str(one.count), *numbers, said)
+        _add(reports, name, str(one.count), *numbers, said)
     yield reports
     flight = _table("flight", "phase", "from [s]", "to [s]")
     longest = sorted(found.phases, key=lambda p: p.start - p.end)[:PHASES_SHOWN]
@@ -47,7 +49,7 @@ def tables(found: Survey) -> Iterator[Table]:
     yield flight
     quality = _table("measured", "sensor", "what", "value")
     for row in _measured(found):
-        quality.add_row(*row)
+        _add(quality, *row)
     yield quality
 
 
@@ -113,16 +115,25 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def columns(table: Any, title: str) -> Table:
+def _add(table: Table, *cells: str) -> None:
+    """A row of words of the user's, in which brackets are brackets."""
+    from rich.markup import escape
+
+    table.add_row(*map(escape, cells))
+
+
+def columns(table: Columns, title: str) -> Table:
     """What the columns of a table are, for whoever has to say which is which."""
     import numpy as np
 
     shown = _table(title, "column", "rows", "least", "largest", "median step")
-    for name, values in table.items():
+    for name, values in table.numbers.items():
         known = values[np.isfinite(values)]
         steps = np.diff(values) if values.ndim == 1 and len(values) > 1 else np.empty(0)
         ascends = len(steps) and bool((steps >= 0).all())
         ends = (f"{known.min():.6g}", f"{known.max():.6g}") if len(known) else ("", "")
         shape = " × ".join(map(str, values.shape))
-        shown.add_row(name, shape, *ends, f"{np.median(steps):.4g}" if ascends else "")
+        _add(shown, name, shape, *ends, f"{np.median(steps):.4g}" if ascends else "")
+    for name, held in table.others.items():
+        _add(shown, name, held)
     return shown

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from nav.rotation import quat_from_euler, quat_multiply
 from testbed import Scenario, run
@@ -17,7 +20,9 @@ from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place
 from testbed.feeds.samples import quaternions
 from testbed.feeds.survey import survey
+from testbed.feeds.table import load
 from testbed.motion.logged import LogTruth
+from testbed.report.log import columns, tables
 
 SECONDS, RATE_HZ = 30, 50
 LYING = np.radians((3.0, -20.0, 60.0))  # roll, pitch, heading of a vehicle that stands there
@@ -211,6 +216,106 @@ def test_of_a_reference_without_height_no_place_is_left(tmp_path: Path) -> None:
     del table["rh"]
     log = read(tmp_path, table, reference={"time": "t", "lat": "lat", "lon": "lon", "velocity": "v"})
     assert "reference: not all of lat, lon and height are said: nothing is judged by its place" in log.notes
+
+
+# --- columns
+
+
+HEADER = "t,gx,gy,gz,ax,ay,az"
+OF_TEXT = {"imu": {"time": "t", "gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
+
+
+def of_text(folder: Path, lines: Sequence[str], columns: Any = OF_TEXT) -> Log:
+    """A CSV as a log."""
+    (folder / "flight.csv").write_text("\n".join(lines) + "\n")
+    given = {"source": "log", "file": "flight.csv", "columns": columns}
+    return formats.read(folder / "flight.csv", LogTruth.model_validate(given).columns)
+
+
+def numbers(count: int = 20) -> list[str]:
+    return [f"{k / 50},0.1,0.2,0.3,0,0,-9.8" for k in range(count)]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("header", [HEADER, HEADER + ","])
+@pytest.mark.parametrize("ends", ["", ",", ", ,"])
+def test_commas_at_the_ends_of_rows_shift_nothing(header: str, ends: str, tmp_path: Path) -> None:
+    log = of_text(tmp_path, [header, *(line + ends for line in numbers())])
+    imu = log.imus["imu"]
+    np.testing.assert_allclose(imu.t, np.arange(20) / 50)
+    np.testing.assert_allclose(imu.dtheta / imu.dt[:, None], np.tile([0.1, 0.2, 0.3], (20, 1)))
+
+
+@pytest.mark.parametrize(("bad", "line"), [([5], 7), (range(20), 2)])
+def test_a_row_of_more_fields_than_there_are_names_is_refused(bad: Any, line: int, tmp_path: Path) -> None:
+    rows = [one + (",1" if k in bad else "") for k, one in enumerate(numbers())]
+    with pytest.raises(UserError, match=rf"flight\.csv: line {line} has 8 fields, and the first, which names them, 7"):
+        of_text(tmp_path, [HEADER, *rows])
+
+
+def test_commas_in_quotes_are_none(tmp_path: Path) -> None:
+    rows = [f'{one},"rest, armed"' for one in numbers()]
+    assert len(of_text(tmp_path, ['"t",gx,gy,gz,ax,ay,az,"phase, mode"', *rows]).imus["imu"]) == 20
+
+
+def dashed(rows: list[str]) -> None:
+    rows[10] = rows[10].replace("0.1", "-")
+
+
+def with_units(rows: list[str]) -> None:
+    rows.insert(0, "s,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2")
+
+
+def named_again(rows: list[str]) -> None:
+    rows.insert(15, HEADER)
+
+
+def filled_up(rows: list[str]) -> None:
+    rows.append("\0" * 4096)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("mangle", "said"),
+    [
+        (dashed, r'imu\.gyro: gx holds text, first "-" in row 11 of .*flight\.csv'),
+        (with_units, r'imu\.gyro: gx holds text, first "rad/s" in row 1 of'),
+        (named_again, r'imu\.gyro: gx holds text, first "gx" in row 16 of'),
+        (filled_up, r"imu\.time: t holds text, first .* in row 201 of"),
+    ],
+)
+def test_a_column_that_holds_text_is_told(mangle: Callable[[list[str]], None], said: str, tmp_path: Path) -> None:
+    rows = numbers(200)
+    mangle(rows)
+    with pytest.raises(UserError, match=rf"truth\.columns\.{said}"):
+        of_text(tmp_path, [HEADER, *rows])
+
+
+def test_a_column_of_dates_is_told(tmp_path: Path) -> None:
+    table = standing()
+    table["t"] = table["t"].astype("datetime64[s]")
+    with pytest.raises(UserError, match=r"imu\.time: t holds datetime64\[s\]: give seconds as numbers"):
+        read(tmp_path, table)
+
+
+def test_columns_are_listed_as_they_are_named(tmp_path: Path) -> None:
+    """With the brackets of their units, and those that hold no numbers with what they hold."""
+    rows = [f"{one},a" for one in numbers()]
+    path = tmp_path / "flight.csv"
+    path.write_text("\n".join([HEADER.replace("t", "time [s]") + ",mode [/]", *rows]) + "\n")
+    console = Console(width=200, file=io.StringIO())
+    console.print(columns(load(path), "flight.csv"))
+    shown = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "time [s]" in shown
+    assert re.search(r'mode \[/\] +│ holds text, first "a" in row 1 ', shown)
+
+
+def test_columns_with_brackets_are_in_what_a_log_holds(tmp_path: Path) -> None:
+    table = standing()
+    log = read(tmp_path, {**table, "mode [red]": table["t"]})
+    console = Console(width=200, file=io.StringIO())
+    console.print(next(tables(survey(log))))
+    assert "mode [red] 1500" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 # --- a reference that is contradicted
