@@ -325,7 +325,7 @@ def _column(table: Table, where: str, name: str) -> Array:
     if name in found:
         return found[name]
     if name in table.others:
-        raise UserError(f"{where}: {name} {table.others[name]} of {table.path}")
+        raise UserError(f"{where}: {name} of {table.path} {table.others[name]}")
     whole, _, number = name.rpartition(":")
     if whole in found and number.isdecimal() and found[whole].ndim == 2 and int(number) < found[whole].shape[1]:
         return found[whole][:, int(number)]

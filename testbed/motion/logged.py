@@ -12,6 +12,10 @@ from testbed.schema import Section
 
 COMPONENT = re.compile(r"(?P<minus>-?)(?P<axis>[xyz])")
 AXES = "xyz"
+INTEGRALS = {"gyro": ("rad", "deg"), "accel": ("m/s",)}  # the units of increments
+# Of whose axes a left-handed set is a slip: of those of the Earth up is often the third, beside north and east.
+OF_BODY = ("gyro", "accel", "field")
+REVERSED = ("-x", "-y", "-z")
 
 Component: TypeAlias = Annotated[str, Field(description="x, y or z: first, second or third column; - turns it round")]
 
@@ -64,6 +68,13 @@ class Column(Section):
         pairs = [(AXES.index(match["axis"]), -1.0 if match["minus"] else 1.0) for match in found if match]
         return [k for k, _ in pairs], [sign for _, sign in pairs]
 
+    @property
+    def is_left_handed(self) -> bool:
+        """Whether the axes are the mirror image of three that a body has."""
+        order, signs = self.order
+        turns = order in ([0, 1, 2], [1, 2, 0], [2, 0, 1])
+        return (signs.count(-1.0) % 2 == 0) != turns
+
 
 class Stream(Section):
     """The columns of one sensor in a table, or of the ``reference``; which it needs depends on its kind.
@@ -100,6 +111,31 @@ class Stream(Section):
             column = getattr(self, name)
             if name != "attitude" and isinstance(column, Column) and column.frame != "frd-ned":
                 raise ValueError(f"{name}.frame: is nothing but an attitude's: say it with axes")
+        return self
+
+    @model_validator(mode="after")
+    def _units_agree_with_form(self) -> Stream:
+        for name, integrals in INTEGRALS.items():
+            column = getattr(self, name)
+            if column is None or column.unit is None or (column.unit in integrals) == (self.form == "increments"):
+                continue
+            if self.form == "increments":
+                raise ValueError(f'{name}.unit: is "{column.unit}", and of increments one of {", ".join(integrals)}')
+            raise ValueError(f'{name}.unit: is "{column.unit}", of an integral: form = "increments"?')
+        return self
+
+    @model_validator(mode="after")
+    def _right_handed(self) -> Stream:
+        for name in OF_BODY:
+            column = getattr(self, name)
+            # All three reversed are no axes but a sign: a rate the other way round, a load instead of its reaction.
+            if column is None or not column.is_left_handed or column.axes == REVERSED:
+                continue
+            others = ", ".join(f'"{axis[1:] if axis.startswith("-") else "-" + axis}"' for axis in column.axes)
+            said = f"say scale = {-column.scale:g} and axes = [{others}]"
+            raise ValueError(
+                f"{name}.axes: are left-handed: is a sign missing? Of values whose signs are all reversed {said}"
+            )
         return self
 
 
