@@ -34,16 +34,16 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     from testbed.motion.logged import LogTruth
     from testbed.report import log as pages
 
-    truth = None
+    truth, date = None, None
     if not file.exists() and (data_dir("scenarios") / file).is_file():
         file = data_dir("scenarios") / file  # a shipped log, by its name
     if file.suffix == ".toml":
         from testbed.scenario import Scenario
 
-        loaded = Scenario.load(file).truth
-        if not isinstance(loaded, LogTruth):
-            raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.source!r}")
-        truth = loaded
+        loaded = Scenario.load(file)
+        if not isinstance(loaded.truth, LogTruth):
+            raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
+        truth, date = loaded.truth, loaded.date if "date" in loaded.model_fields_set else None
     if scenario is not None and scenario.exists() and not force:
         raise UserError(f"{scenario}: is there already: choose another name, or replace it with --force")
     place = file if truth is None else Path(truth.file)
@@ -66,7 +66,7 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         for table in pages.tables(found):
             console().print(table)
     if scenario is not None:
-        write_file(scenario, draft.scenario(found, scenario, truth).encode())
+        write_file(scenario, draft.scenario(found, scenario, truth, date).encode())
         print(printable(f"scenario: {scenario}"))
         if (truth is None or truth.start is None) and not draft.is_placed(found.log):
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 import math
 import os
@@ -19,6 +20,7 @@ from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.reference import doubt
 from testbed.feeds.survey import Noise, Survey
 from testbed.motion.logged import LogTruth
+from testbed.motion.terrain import JACKSBORO
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
 from testbed.sensors.imu_grades import GRADES as IMUS
 from testbed.sensors.magnetometer import GRADES as MAGNETOMETERS
@@ -30,6 +32,7 @@ NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its
 DIGITS = 3
 AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
 ROWS_HZ, RECORD_HZ = 100.0, 10.0
+SHORTEST_S = 0.1  # of a run; one that begins after the log's end is refused when it is run
 # A place for a log that has none, so that its scenario runs: an AHRS needs gravity and declination.
 ASSUMED = {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 400.0}
 
@@ -101,10 +104,15 @@ def _margin(key: str) -> float:
     return BIAS_SIGMAS if key.endswith(("turn_on_degph", "turn_on_mg")) else NOISE_MARGIN
 
 
-def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
-    """The text of a scenario file at ``out``; of a table, ``truth`` has its columns."""
+def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | None = None) -> str:
+    """The text of a scenario file at ``out``; of a table, ``truth`` has its columns.
+
+    What ``truth`` says, and a ``date`` that is given, are kept before what the log says.
+    """
     log = found.log
     end = min(float(own.t[-1]) for own in log.imus.values()) - log.t0
+    lasts = max(end - (0.0 if truth is None else truth.start_s), SHORTEST_S)
+    date = log.date if date is None else date
     own = sections(found)
     aids = [name for name, keys in own.items() if keys["kind"] != "imu"]
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
@@ -112,14 +120,16 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None) -> str:
         first["gnss"] = log.receiver  # the first with a fix
     lines = [
         f"title = {json.dumps(log.path.name)}",
-        f"duration_s = {math.floor(10 * end) / 10:.1f}",
+        f"duration_s = {math.floor(10 * lasts) / 10:.1f}",
     ]
-    if log.date is not None and WMM_YEARS[0] <= log.date.year < WMM_YEARS[1]:
-        lines.append(f"date = {log.date.isoformat()}")
+    if date is not None and WMM_YEARS[0] <= date.year < WMM_YEARS[1]:
+        lines.append(f"date = {date.isoformat()}")
     else:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
     place = os.path.relpath(log.path.resolve(), out.resolve().parent)
-    lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}", f"rate_hz = {ROWS_HZ:g}"]
+    kept = {} if truth is None else _kept(truth, out)
+    lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}"]
+    lines += [f"{key} = {_inline(value)}" for key, value in ({"rate_hz": ROWS_HZ} | kept).items()]
     if truth is not None and "reference" in truth.model_fields_set:
         lines.append(f"reference = {_inline(truth.reference)}")
     elif doubt(log.solution, log.samples):
@@ -162,6 +172,15 @@ def _heading(log: Log) -> str:
         return "heading_deg = 0  # at the start: nothing in the log tells it: give it"
     heading = math.degrees(euler_from_quat(q_nb[known[0]])[2])
     return f"heading_deg = {round(heading)}  # at the start, as its autopilot thought: there is no magnetometer"
+
+
+def _kept(truth: LogTruth, out: Path) -> dict[str, Any]:
+    """What the scenario of a table said of its flight, files as seen from ``out``."""
+    said = truth.model_dump(exclude_unset=True, include={"aircraft", "rate_hz", "start_s", "terrain"})
+    ground = said.get("terrain", {})
+    if ground.get("file") not in (None, JACKSBORO):
+        ground["file"] = os.path.relpath(Path(ground["file"]).resolve(), out.resolve().parent)
+    return {key: value for key, value in said.items() if value is not None}
 
 
 def _columns(truth: LogTruth) -> Mapping[str, Any]:

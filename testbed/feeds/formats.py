@@ -51,8 +51,8 @@ def open_log(truth: LogTruth) -> Log:
         stat = path.stat()
     except OSError as error:
         raise UserError(f"truth.file: {path}: {error.strerror}") from None
-    asked = truth.model_copy(update={"start": None, "start_s": 0.0})  # what the log is read by
-    return _read_once(asked.model_dump_json(), stat.st_size, stat.st_mtime_ns)
+    asked = truth.model_dump_json(include={"source", "file", "columns"})  # what the log is read by
+    return _read_once(asked, stat.st_size, stat.st_mtime_ns)
 
 
 @lru_cache(maxsize=2)

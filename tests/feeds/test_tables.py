@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import testbed.__main__ as cli
 from nav.rotation import quat_from_euler, quat_multiply
 from testbed import Scenario, run
 from testbed.errors import UserError
@@ -453,3 +455,27 @@ def test_a_run_of_which_its_reference_knows_nothing_says_so(tmp_path: Path) -> N
     (tmp_path / "flight.toml").write_text(text)
     (said,) = [one for one in run(Scenario.load(tmp_path / "flight.toml")).remarks if "outside of" in one]
     assert "is of 25 to 29.98 s, outside of the 0 to 20 s of the run: nothing is judged by it" in said
+
+
+def test_a_draft_keeps_what_the_scenario_of_a_table_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And lasts as long as the log does from where it begins; files are as seen from where it is written."""
+    np.savez(tmp_path / "flight.npz", **known())
+    grid = np.linspace(46.9, 47.1, 3)
+    np.savez(tmp_path / "ground.npz", lat_deg=grid, lon_deg=grid - 39, height_m=np.full((3, 3), 300.0))
+    said = 'rate_hz = 200\naircraft = "loiter"\nstart_s = 12\nterrain = { file = "ground.npz", map_sigma_m = 2.0 }'
+    text = SCENARIO.replace("[truth]", "date = 2021-03-04\n[truth]").replace("rate_hz = 50", said)
+    (tmp_path / "flight.toml").write_text(text.replace("duration_s = 20", "duration_s = 10"))
+    (tmp_path / "drafts").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["testbed", "log", "flight.toml", "--scenario", "drafts/new.toml"])
+    with suppress(SystemExit):
+        cli.main()
+    before, after = Scenario.load("flight.toml"), Scenario.load("drafts/new.toml")
+    assert isinstance(before.truth, LogTruth)
+    assert isinstance(after.truth, LogTruth)
+    assert after.date == before.date
+    assert after.duration_s == pytest.approx(18, abs=0.11)
+    for name in ("aircraft", "rate_hz", "start_s"):
+        assert getattr(after.truth, name) == getattr(before.truth, name)
+    assert after.truth.terrain.map_sigma_m == 2.0
+    assert Path(after.truth.terrain.file or "").resolve() == tmp_path / "ground.npz"
