@@ -176,11 +176,18 @@ def shade(ax: Axes, windows: Iterable[tuple[float, float]], colour: str, end: fl
 
 
 def keys_of(axes: Iterable[Axes]) -> dict[str, Any]:
-    """What is labelled in some panels, each label once, in the order in which it appears."""
+    """What is labelled in some panels, each label once, in the order in which it appears.
+
+    A line whose points are all unknown is none; one without points is there for its key.
+    """
+    from matplotlib.lines import Line2D
+
     found: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            found.setdefault(label, handle)
+            y = np.asarray(handle.get_ydata() if isinstance(handle, Line2D) else (), float)
+            if not len(y) or np.isfinite(y).any():
+                found.setdefault(label, handle)
     return found
 
 

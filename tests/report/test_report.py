@@ -327,3 +327,27 @@ def test_a_short_track_is_in_metres(grown: float, unit: str) -> None:
     assert ax.get_xlabel().endswith(f"[{unit}]")
     assert ax.get_ylabel().endswith(f"[{unit}]")
     assert unit == "km" or ax.xaxis.get_major_formatter()(0.5, 0) == "500"
+
+
+def labels(figure: Figure | None) -> set[str]:
+    """What the legend of a figure names."""
+    assert figure is not None
+    return {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_a_legend_names_no_line_that_is_not_there(recorded: bool) -> None:
+    """Of a recorded flight airspeed and increments are known to nobody, and speed is the reference's."""
+    dataset = synthetic_run.dataset(120.0, {"ins": Errors(aligned_after=0.0)})
+    if recorded:
+        dataset.attrs["reference"] = "reference of the log"
+        dataset["truth/airspeed"].values[:] = np.nan
+        for name in ("dtheta", "dv"):
+            dataset[f"truth/{name}"].values[:] = 0.0
+    run = Run(dataset)
+    flown, spectra = labels(flight.flight(run)), labels(imu.spectra(run, "imu"))
+    assert "measured" in spectra
+    assert ("truth, up to half the rate of the record" in spectra) != recorded
+    assert ("true airspeed" in flown) != recorded
+    assert ("true speed over ground" in flown) != recorded
+    assert ("speed over ground of the reference" in flown) == recorded

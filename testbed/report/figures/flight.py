@@ -110,7 +110,8 @@ def flight(run: Run) -> Figure:
     top.set_ylabel("height above\nellipsoid [m]")
     bottom.plot(*thin(run.t, run.truth("airspeed")), color=TRUTH, lw=1.2, label="true airspeed")
     ground = np.hypot(run.truth("v_n")[:, 0], run.truth("v_n")[:, 1])
-    bottom.plot(*thin(run.t, ground), color=GUIDE, lw=1, ls="--", label="true speed over ground")
+    whose = "speed over ground of the reference" if run.recorded else "true speed over ground"
+    bottom.plot(*thin(run.t, ground), color=GUIDE, lw=1, ls="--", label=whose)
     bottom.set_ylabel("speed [m/s]")
     run.against_time(drawn)
     return drawn.figure

@@ -214,8 +214,9 @@ def spectra(run: Run, imu: str) -> Figure | None:
         true_frequency, true = _density(run.truth(name)[1:] / true_dt, true_dt)
         for k, ax in enumerate(axes):
             ax.plot(frequency, scale * density[:, k], color=NEUTRAL, lw=0.9, label="measured")
-            label = "truth, up to half the rate of the record"
-            ax.plot(true_frequency, scale * true[:, k], color=TRUTH, lw=0.8, label=label)
+            if np.any(true > 0):  # nobody knows it of a recorded flight
+                label = "truth, up to half the rate of the record"
+                ax.plot(true_frequency, scale * true[:, k], color=TRUTH, lw=0.8, label=label)
             if errors is not None and (noise := _noise_of(errors, what)[0]):
                 # A random walk of N per root second is white noise of one-sided density 2 N^2.
                 ax.axhline(np.sqrt(2) * scale * noise, color=PROMISED, lw=1.2, ls="--", label="data sheet: white noise")
