@@ -82,7 +82,7 @@ def first_place(log: Log, start_s: float) -> Place:
     """Where a log begins: by its solution, or else by its GNSS. Raises UserError when it does not say it."""
     solution = log.solution.columns if log.solution is not None else {}
     if log.solution is not None and "lat" in solution:
-        known = np.flatnonzero(np.isfinite(solution["lat"]) & (log.solution.t >= log.t0 + start_s))
+        known = np.flatnonzero(is_flown(solution["lat"], solution["h"]) & (log.solution.t >= log.t0 + start_s))
         if len(known):
             return _place(*(float(solution[key][known[0]]) for key in ("lat", "lon", "h")))
     for own in log.samples.values():

@@ -16,7 +16,7 @@ from nav.earth import isa_pressure
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.reference import doubt, is_flown, silence
+from testbed.feeds.reference import doubt, silence
 from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
@@ -53,7 +53,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "attitude": ANGLE,
 }
 STEEPEST = math.radians(91)  # a pitch; one that is in degrees and said to be in radians is soon more
-LARGEST = {"lat": math.pi / 2, "lon": 2 * math.pi}  # that there may be of these
+LARGEST = {"lat": math.pi / 2, "lon": 4 * math.pi}  # that there may be of these, with a turn too many
 GARBAGE = 0.01  # share of rows that may be what no such quantity is
 ANGLES_ALIKE = 'offset would be added to roll, pitch and heading alike: of angles to other axes say frame = "flu-enu"'
 QUATERNION = (
@@ -61,7 +61,7 @@ QUATERNION = (
     ' column = ["q:3", "q:0", "q:1", "q:2"] of one that has w last, and say with frame what it turns between'
 )
 CODES = "and are taken to be without a fix: leave fix out where it is another code, as RTKLIB's Q or NMEA's quality"
-NOWHERE = "are without height, at latitude and longitude 0, or where no aircraft is"
+NOWHERE = "are without height, or at latitude and longitude 0"
 VECTORS = frozenset({"gyro", "accel", "velocity", "sigma_position", "sigma_velocity", "field"})
 # What each kind needs, one of each tuple, and what it may have.
 NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
@@ -366,18 +366,21 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
 
 
 def _reference(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:
-    """What the table says of the motion: where there is no whole place, or one of nobody, it is unknown."""
+    """What the table says of the motion: where there is no whole place, or that of zeros, it is unknown."""
     named = {"height": "h", "velocity": "v_n", "attitude": "q_nb"}
     columns = {named.get(key, key): array for key, array in values.items()}
     place = {key: columns.pop(key) for key in ("lat", "lon", "h") if key in columns}
     if len(place) == 3:
         lat, lon, h = place.values()
-        known = is_flown(lat, h) & np.isfinite(lon) & ((lat != 0) | (lon != 0))
+        nowhere = (lat == 0) & (lon == 0)
+        known = np.isfinite(lat + lon + h) & ~nowhere
         if strange := int(np.sum(~known & np.isfinite(lat))):
             notes.append(f"reference: {strange} of {len(t)} rows {NOWHERE}: its place is unknown there")
         if known.any():
             place["lon"] = np.mod(lon + math.pi, 2 * math.pi) - math.pi
             columns |= {key: np.where(known, array, np.nan) for key, array in place.items()}
+        if "v_n" in columns:  # who does not know where it is knows no velocity
+            columns["v_n"] = np.where(nowhere[:, None], np.nan, columns["v_n"])
     elif place:
         notes.append("reference: not all of lat, lon and height are said: nothing is judged by its place")
     return Reference("reference of the log", t, columns)

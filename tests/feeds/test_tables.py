@@ -214,13 +214,14 @@ def test_a_latitude_that_can_be_none_is_of_another_unit(
         read(tmp_path, table, **{name: place})
 
 
-def test_a_longitude_may_be_of_a_whole_turn_and_not_of_more(tmp_path: Path) -> None:
+def test_a_longitude_may_have_a_turn_too_many(tmp_path: Path) -> None:
     table = standing()
-    table["lon"] = table["lon"] * 0 + 351.0
-    log = read(tmp_path, table, reference=PLACE)
-    assert log.solution is not None
-    np.testing.assert_allclose(log.solution.columns["lon"], np.radians(-9.0))
-    with pytest.raises(UserError, match=r'lon: is 351 rad: unit = "deg"\?'):
+    for turned in (351.0, 711.0):
+        table["lon"] = np.full(1500, turned)
+        log = read(tmp_path, table, reference=PLACE)
+        assert log.solution is not None
+        np.testing.assert_allclose(log.solution.columns["lon"], np.radians(-9.0))
+    with pytest.raises(UserError, match=r'lon: is 711 rad: unit = "deg"\?'):
         read(tmp_path, table, reference={**PLACE, "lon": "lon"})
 
 
@@ -252,10 +253,16 @@ def test_where_a_reference_is_nowhere_it_is_unknown(tmp_path: Path) -> None:
         table[name][::3] = 0
     table["h"][1::3] = np.nan
     log = read(tmp_path, table, reference=PLACE)
-    assert any("reference: 1000 of 1500 rows are without height, at latitude" in note for note in log.notes)
+    assert any("reference: 1000 of 1500 rows are without height, or at latitude" in note for note in log.notes)
     assert log.solution is not None
     assert np.array_equal(np.isfinite(log.solution.columns["lat"]), np.arange(1500) % 3 == 2)
-    assert np.isfinite(log.solution.columns["v_n"]).all()
+    assert np.array_equal(np.isfinite(log.solution.columns["v_n"]).all(axis=1), np.arange(1500) % 3 != 0)
+
+
+def test_a_log_does_not_begin_where_no_aircraft_is(tmp_path: Path) -> None:
+    table = standing()
+    table["h"][:10] = 62815.0
+    assert first_place(read(tmp_path, table, reference=PLACE), 0.0).alt_m == 500.0
 
 
 def test_of_a_reference_without_height_no_place_is_left(tmp_path: Path) -> None:
