@@ -267,7 +267,8 @@ class Estimate:
     @classmethod
     def of(
         cls, t: float, *, q_nb: Array | None = None, lla: Array | None = None, v_n: Array | None = None,
-        covariance: Array | None = None, status: Status | None = None,
+        covariance: Array | None = None, gyro_bias: Array | None = None, accel_bias: Array | None = None,
+        extra: Mapping[str, tuple[Array, Array]] | None = None, status: Status | None = None,
     ) -> Estimate:  # fmt: skip
         """An estimate of what is given, ``lla`` being (lat, lon, h); what is not given is NaN, and not known.
 
@@ -280,6 +281,8 @@ class Estimate:
         lat, lon, h = unknown if lla is None else lla
         return cls(
             t, float(lat), float(lon), float(h), unknown if v_n is None else v_n,
-            np.full(4, np.nan) if q_nb is None else q_nb, unknown, unknown,
+            np.full(4, np.nan) if q_nb is None else q_nb, unknown if gyro_bias is None else gyro_bias,
+            unknown if accel_bias is None else accel_bias,
             np.full((9, 9), np.nan) if covariance is None else covariance, unknown, unknown, status,
+            {} if extra is None else extra,
         )  # fmt: skip

@@ -3,7 +3,7 @@
 What comes from where (`testbed.scenario.FeedbackConfig`), every `FRAME_HZ`, at the newest tick t:
 
 * Attitude group. Roll, pitch and heading are the estimator's at t, predicted with the newest increments. Body rates
-  are the mean of the increments since the last frame, in body axes, less the estimated gyro bias.
+  are the mean of the increments since the last frame, in body axes, less the gyro bias where one is estimated.
 * Position group of an estimator that has one. Place, height, velocity and climb are the estimator's at t, moved from
   its IMU to the centre of gravity. True airspeed is V = EAS sqrt(rho0 / rho), EAS the newest sample that has arrived,
   rho the standard atmosphere's at the static pressure that has. While the estimator refuses the sensor
@@ -85,6 +85,7 @@ AIRSPEED_SOURCES = {
 }
 MOST_HEIGHT, MOST_SPEED = 1e5, 1e3  # that can be flown on [m, m/s]
 MOST_OF_QUATERNION = 1.1  # of a component
+PLACE, VELOCITY = ("lat", "lon", "h"), ("v_north", "v_east", "v_down")  # of `Feedback`
 
 UNKNOWN = np.full(3, np.nan)
 
@@ -219,7 +220,7 @@ class Autopilot:
             if self._good is not None and t - self._good[0] <= HOLD_S:
                 self._source.feed_back(self._good[1])
             else:
-                self._source.give_up(f"the autopilot lost its estimate: {self._missing(state)}")
+                self._source.give_up(f"the autopilot lost its estimate: {self._missing(state, estimates)}")
         self._turned[:], self._pushed[:], self._span = 0.0, 0.0, 0.0
 
     def _names(self) -> str:
@@ -227,10 +228,17 @@ class Autopilot:
             return self._attitude
         return f"attitude of {self._attitude} and position of {self._position}"
 
-    def _missing(self, state: Feedback) -> str:
-        """Which numbers of whom can't be flown on."""
+    def _missing(self, state: Feedback, estimates: Mapping[str, Estimate]) -> str:
+        """Which numbers of whom can't be flown on, less those that only could not be worked out for want of others."""
+        known: set[str] = set()
+        if self._reckoning is not None and not math.isfinite(state.heading):
+            known = {*PLACE, *VELOCITY}
+        elif self._reckoning is None and self._air is not None:
+            estimate = estimates[self._position]
+            told = dict(zip((*PLACE, *VELOCITY), (estimate.lat, estimate.lon, estimate.h, *estimate.v_n), strict=True))
+            known = {name for name, value in told.items() if math.isfinite(value)}
         bad = [name for name, value in state._asdict().items() if not math.isfinite(value)]
-        return f"{self._names()} gives no {', '.join(bad)}"
+        return f"{self._names()} gives no {', '.join([name for name in bad if name not in known] or bad)}"
 
     def _ready(self, t: float, estimates: Mapping[str, Estimate]) -> bool:
         aligned = all(Status.ALIGNED in estimate.status for estimate in estimates.values())
@@ -242,6 +250,8 @@ class Autopilot:
         state = self._source.true_feedback()
         attitude = estimates[self._leader]
         roll, pitch, heading = euler_from_quat(attitude.q_nb).tolist()
+        if not math.isfinite(roll):
+            pitch = math.nan  # its sine was brought within bounds
         f_b = np.zeros(3)
         if self._span > 0.0:  # an IMU slower than the frames has nothing new in some
             self._rates, f_b = self._turned / self._span - attitude.gyro_bias, self._pushed / self._span
@@ -385,8 +395,12 @@ def _speed_through_air(estimate: Estimate) -> float:
 
 
 def _sound(estimate: Estimate) -> Estimate:
-    """The same, with NaN for numbers too large to be flown on, so that nothing has to reckon with them."""
-    e = estimate
+    """The same, with NaN for numbers too large to be flown on, so that nothing has to reckon with them.
+
+    A gyro bias that is not estimated is 0: there is none to take off.
+    """
+    unknown = np.isnan(estimate.gyro_bias)
+    e = replace(estimate, gyro_bias=np.where(unknown, 0.0, estimate.gyro_bias)) if unknown.any() else estimate
     lost = abs(e.lat) > math.pi / 2 or abs(e.lon) > 2 * math.pi or abs(e.h) > MOST_HEIGHT
     limits = {"v_n": MOST_SPEED, "q_nb": MOST_OF_QUATERNION, "gyro_bias": RATE_LIMIT}
     large = {name: np.abs(getattr(e, name)) > most for name, most in limits.items()}

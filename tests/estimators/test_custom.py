@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from worlds.loop import same
 
+from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
+TEMPLATE = Path(__file__).parents[2] / "testbed/template/first.toml"
 SHORT = {"duration_s": 12, "expect": {}}
 
 MINE = """
@@ -130,10 +132,31 @@ def test_same_bits_live_and_batch(folder: Path, healthy) -> None:
 
 
 def test_nan_is_never_flown_on(folder: Path) -> None:
-    keys = {"estimator[1].how": "nan", "estimator[1].after_s": 6.0, "autopilot.feedback": "mine"}
+    keys = {"estimator[1].how": "nan", "estimator[1].after_s": 1.0, "autopilot.feedback": "mine"}
     result = run(Scenario.load(folder / "own.toml", SHORT | keys))
-    assert result.failure.startswith("the autopilot lost its estimate: mine gives no")
+    numbers = "lat, lon, h, v_north, v_east, v_down, roll, pitch, heading"
+    assert result.failure == f"the autopilot lost its estimate: mine gives no {numbers}"
     assert np.isfinite(result.dataset["truth/lat"].values).all()
+
+
+def test_it_flies_the_aircraft() -> None:
+    """The one that `testbed init` writes estimates no biases: there are none to take off the rates."""
+    result = run(Scenario.load(TEMPLATE, {"autopilot.feedback": "mine", "duration_s": 15, "expect": {}}))
+    assert result.failure == ""
+    told = result.dataset["events"]["text"].values.tolist()
+    assert "the autopilot flies on mine from here on" in told
+    assert result.dataset["truth/time"].values[-1] == 15.0
+
+
+def test_an_estimate_is_made_of_what_is_given() -> None:
+    """What is not given is unknown."""
+    wind = np.array([3.0, 1.0]), np.array([0.5, 0.5])
+    made = Estimate.of(1.0, gyro_bias=np.ones(3), accel_bias=np.zeros(3), extra={"wind": wind})
+    assert made.gyro_bias.tolist() == [1.0, 1.0, 1.0]
+    assert made.accel_bias.tolist() == [0.0, 0.0, 0.0]
+    assert made.extra == {"wind": wind}
+    assert np.isnan([made.lat, *made.q_nb, *made.sigma_gyro_bias, *made.sigma_accel_bias]).all()
+    assert not Estimate.of(1.0).extra
 
 
 @pytest.mark.parametrize(
