@@ -38,7 +38,7 @@ def load(kind: str, folder: Path, group: str) -> Any:
             raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}") from error
         todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
         raise UserError(f"kind {shown(kind)}: there is no module {where}: {todo}") from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"kind {shown(kind)}: {where} can't be imported: {raised(error)}") from error
     if not hasattr(module, name):
         classes = [key for key, value in vars(module).items() if isinstance(value, type) and not key.startswith("_")]

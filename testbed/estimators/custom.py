@@ -29,6 +29,7 @@ from nav.horizon import FusionHorizon
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from testbed import plugins
 from testbed.errors import UserError, choice, shown, unknown
+from testbed.estimators.given import Given, Unfit
 from testbed.estimators.lane import Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Mistake
@@ -76,11 +77,11 @@ def build(section: CustomSection, rig: Rig) -> Lane:
     options = _options(section, made)
     try:
         inner = made(rig, **options)
+        missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"estimator {section.name}: {section.kind} can't be made: {plugins.raised(error)}") from error
-    missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     if missing:
         raise UserError(f"estimator {section.name}: {section.kind} lacks {', '.join(missing)}: see docs/extending.md")
     used = section.aiding(rig.sensors)
@@ -113,61 +114,73 @@ def _options(section: CustomSection, made: Any) -> dict[str, Any]:
 class Adapter:
     """A class of three methods as an estimator of the house (`nav.horizon.Estimator`).
 
-    What it raises, or gives that is no estimate, is its end: ``failure`` says why, and from there on it has no
-    estimate. It is handed copies, so that it can't change what others see.
+    What it raises, or gives that can't be used, is its end: ``failure`` says why, and from there on it has no estimate.
+    It is handed copies, so that it can't change what others see.
     """
 
     def __init__(self, inner: Any) -> None:
         self.inner = inner
         self.failure = ""
         self._t = np.nan
+        self._given = Given()
 
     @property
     def listening(self) -> bool:
         """Whether a sample of some kind would still be used."""
-        return not self.failure and bool(getattr(self.inner, "listening", True))
+        return self._asked(lambda: bool(getattr(self.inner, "listening", True)), False)
 
     def accepts(self, sample: Sample) -> bool:
         """Whether `update` would use the sample now."""
-        accepts: Callable[[Sample], bool] | None = getattr(self.inner, "accepts", None)
-        if self.failure or accepts is None:
-            return not self.failure
-        return self._asked(lambda: bool(accepts(_copied(sample))), False)
+
+        def ask() -> bool:
+            accepts = getattr(self.inner, "accepts", None)
+            return accepts is None or bool(accepts(_copied(sample)))
+
+        return self._asked(ask, False)
 
     def propagate(self, imu: ImuSamples) -> Sequence[UpdateReport]:
         """Advance by a block of increments."""
         self._t = float(imu.t[-1])
-        return self._asked(lambda: _reports(self.inner.propagate(_copied(imu))), [])
+        return self._asked(lambda: self._given.reports(self.inner.propagate(_copied(imu)), "propagate"), [])
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample that is valid at the estimator's own time."""
-        return self._asked(lambda: _reports(self.inner.update(_copied(sample))), [])
+        return self._asked(lambda: self._given.reports(self.inner.update(_copied(sample)), "update"), [])
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """The reports on a sample that came too late: none, unless it has something to say."""
-        refuse = getattr(self.inner, "refuse", None)
-        return [] if refuse is None else self._asked(lambda: _reports(refuse(_copied(sample), reason)), [])
+
+        def ask() -> list[UpdateReport]:
+            refuse = getattr(self.inner, "refuse", None)
+            return [] if refuse is None else self._given.reports(refuse(_copied(sample), reason), "refuse")
+
+        return self._asked(ask, [])
 
     def estimate(self) -> Estimate:
         """The state at its own time."""
-        return self._asked(lambda: _checked(self.inner.estimate()), Estimate.of(self._t))
+        return self._asked(lambda: self._given.estimate(self.inner.estimate(), "estimate"), Estimate.of(self._t))
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments: its own prediction, or its estimate carried on by the increments."""
-        end = float(imu.t[-1])
-        predict = getattr(self.inner, "predict", None)
-        if predict is not None:
-            return self._asked(lambda: _checked(predict(_copied(imu))), Estimate.of(end))
-        return self._asked(lambda: carried(_checked(self.inner.estimate()), imu), Estimate.of(end))
+
+        def ask() -> Estimate:
+            predict = getattr(self.inner, "predict", None)
+            if predict is not None:
+                return self._given.estimate(predict(_copied(imu)), "predict")
+            return carried(self._given.estimate(self.inner.estimate(), "estimate"), imu)
+
+        return self._asked(ask, Estimate.of(float(imu.t[-1])))
 
     def _asked(self, ask: Callable[[], T], otherwise: T) -> T:
         if self.failure:
             return otherwise
         try:
             return ask()
-        except Exception as error:
+        except Unfit as error:
+            self.failure = str(error)
+        except (Exception, SystemExit, GeneratorExit) as error:  # `sys.exit` in it is its own end, not the run's
             self.failure = plugins.raised(error)
-            return otherwise
+        return otherwise
 
 
 def carried(estimate: Estimate, imu: ImuSamples) -> Estimate:
@@ -186,29 +199,6 @@ def carried(estimate: Estimate, imu: ImuSamples) -> Estimate:
         return dataclasses.replace(estimate, t=ends, q_nb=q_nb)
     lat, lon, h = lla.tolist()
     return dataclasses.replace(estimate, t=ends, lat=lat, lon=lon, h=h, v_n=v_n, q_nb=q_nb)
-
-
-def _reports(given: Any) -> list[UpdateReport]:
-    """What `update` gave as a list. Raises TypeError when it is no such thing."""
-    reports = [] if given is None else [given] if isinstance(given, UpdateReport) else list(given)
-    for report in reports:
-        if not isinstance(report, UpdateReport):
-            raise TypeError(f"update gave {type(report).__name__} where nav.samples.UpdateReport was expected")
-    return reports
-
-
-SHAPES = {"v_n": (3,), "q_nb": (4,), "gyro_bias": (3,), "accel_bias": (3,), "covariance": (9, 9),
-          "sigma_gyro_bias": (3,), "sigma_accel_bias": (3,)}  # fmt: skip
-
-
-def _checked(estimate: Any) -> Estimate:
-    """The same, if it is an estimate. Raises TypeError or ValueError, saying what is wrong with it."""
-    if not isinstance(estimate, Estimate):
-        raise TypeError(f"estimate gave {type(estimate).__name__} where nav.samples.Estimate was expected")
-    for name, shape in SHAPES.items():
-        if np.shape(getattr(estimate, name)) != shape:
-            raise ValueError(f"estimate: {name} has shape {np.shape(getattr(estimate, name))}, not {shape}")
-    return estimate
 
 
 def _copied(record: T) -> T:

@@ -388,7 +388,7 @@ def _speed_through_air(estimate: Estimate) -> float:
     wind = next(
         (value for name, (value, _) in estimate.extra.items() if name == "wind" or name.endswith("_wind")), None
     )
-    if wind is None:
+    if wind is None or len(wind) < 2:  # an estimator of the user's may call another thing so
         return math.nan
     north, east, down = estimate.v_n.tolist()
     return math.sqrt((north - float(wind[0])) ** 2 + (east - float(wind[1])) ** 2 + down**2)

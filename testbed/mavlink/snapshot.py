@@ -195,9 +195,10 @@ class Snapshot:
     @property
     def wind(self) -> tuple[Array, Array] | None:
         """Estimated wind (north, east) [m/s] and its 1-sigma, of an estimator that has wind states."""
-        if "wind" not in self._moments.estimates.extra:
+        found = self._moments.estimates.extra.get("wind")
+        if found is None or found[0].shape[1] < 2:  # an estimator of the user's may call another thing so
             return None
-        wind, sigma = (column[self._row] for column in self._moments.estimates.extra["wind"])
+        wind, sigma = (column[self._row, :2] for column in found)
         return None if np.isnan((wind, sigma)).all() else (wind, sigma)
 
     def sigma(self, block: slice, dimensions: int = 3) -> float:

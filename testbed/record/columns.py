@@ -183,10 +183,15 @@ EXTRA = {
 }
 
 
-def extra_state(name: str) -> Variable:
-    """What a further state is; receivers have names of their own, and a local filter's may stand in front."""
+def extra_state(name: str, width: int) -> Variable:
+    """What a further state of as many numbers is; receivers have names of their own, a local filter's may be in front.
+
+    One of an estimator of the user's may have a known name, and another number of numbers: then it is not known.
+    """
     for known, variable in EXTRA.items():
         if name == known or name.endswith(("_" + known, known.removeprefix("gnss"))):
+            if width != (len(AXES.get(variable.dims[0], range(width))) if variable.dims else 1):
+                break
             return variable
     return Variable("unknown", "further state", (f"{name}_component",))
 

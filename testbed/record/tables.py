@@ -15,7 +15,19 @@ import numpy.typing as npt
 from nav.columns import VECTORS, Estimates, FusedReports
 from nav.samples import Outcome, Sample, UpdateReport
 from testbed import interrupts
-from testbed.record.columns import AIDS, ESTIMATE, EVENT, FAULT, REPORT, REQUEST, SAMPLE, STEERED, Variable, extra_state
+from testbed.record.columns import (
+    AIDS,
+    AXES,
+    ESTIMATE,
+    EVENT,
+    FAULT,
+    REPORT,
+    REQUEST,
+    SAMPLE,
+    STEERED,
+    Variable,
+    extra_state,
+)
 
 if TYPE_CHECKING:
     from testbed.sensors.faults import FaultTruth
@@ -189,7 +201,7 @@ def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict
     sizes = set(map(len, innovations))
     m = max(sizes)
     if m:
-        variables |= _innovation(aid)
+        variables |= _innovation(aid, m)
         if sizes == {m}:
             block["innovation"], block["S"] = _joined(innovations), _vectors(reports, "S")
         else:  # broken samples are refused before an innovation is formed
@@ -216,12 +228,14 @@ def fused_columns(reports: FusedReports) -> tuple[Block, dict[str, Variable]]:
     for name, value in (("weight", 1.0), ("outcome", Outcome.FUSED), ("sensor", sensor.encode())):
         block[name] = np.full(len(reports), value, REPORT[name].dtype)
     block["reason"] = np.zeros(len(reports), REPORT["reason"].dtype)
-    return block, REPORT | _innovation(aid)
+    return block, REPORT | _innovation(aid, m)
 
 
-def _innovation(aid: str) -> dict[str, Variable]:
-    """What the innovation of an aid is, and its covariance."""
+def _innovation(aid: str, m: int) -> dict[str, Variable]:
+    """What an innovation of an aid with m components is, and its covariance."""
     unit, dims = AIDS.get(aid, ("unknown", ("component",)))
+    if len(AXES.get(dims[0], range(m))) != m:  # an estimator of the user's may call another thing so
+        unit, dims = "unknown", ("component",)
     return {
         "innovation": Variable(unit, "measurement - prediction", dims),
         "S": Variable(f"({unit})^2", "innovation covariance before the update", ("component", "component_column")),
@@ -238,7 +252,7 @@ def estimate_columns(estimates: Estimates) -> tuple[Block, dict[str, Variable]]:
     for k, name in enumerate(("sigma_position_n", "sigma_velocity_n", "sigma_attitude_n")):
         block[name] = sigma[:, 3 * k : 3 * k + 3]
     for name, pair in estimates.extra.items():
-        variable = extra_state(name)
+        variable = extra_state(name, pair[0].shape[1])
         for column, values in zip((name, f"sigma_{name}"), pair, strict=True):
             block[column] = values if variable.dims else values[:, 0]
             variables[column] = variable if column == name else replace(variable, meaning=f"1-sigma of {name}")

@@ -16,6 +16,8 @@ TEMPLATE = Path(__file__).parents[2] / "testbed/template/first.toml"
 SHORT = {"duration_s": 12, "expect": {}}
 
 MINE = """
+import sys
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 from nav.samples import Estimate, GnssSample
@@ -36,6 +38,8 @@ class Mine:
         self.t = imu.t[-1]
         if self.t > self.after_s and self.how == "raise":
             raise RuntimeError("lost its way")
+        if self.t > self.after_s and self.how == "exit":
+            sys.exit(3)
         if self.how == "spoil":
             imu.dtheta[:] = 0.0
 
@@ -101,8 +105,9 @@ def test_it_runs_beside_ours_and_is_recorded(healthy) -> None:
     ("how", "says"),
     [
         ("raise", "RuntimeError: lost its way (filters.py, line"),
-        ("shape", "ValueError: estimate: q_nb has shape (3,), not (4,)"),
-        ("type", "TypeError: estimate gave float where nav.samples.Estimate was expected"),
+        ("exit", "SystemExit: 3 (filters.py, line"),
+        ("shape", "estimate: q_nb has shape (3,), not (4,)"),
+        ("type", "estimate gave 3.0, not a nav.samples.Estimate"),
     ],
 )
 def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str) -> None:
@@ -169,6 +174,7 @@ def test_an_estimate_is_made_of_what_is_given() -> None:
         ("nowhere.filters:Mine", "there is no module nowhere.filters: install it, or give its file, such as"),
         ("./filters.py:Bare", "./filters.py:Bare lacks propagate, update, estimate"),
         ("math:pi", "math:pi can't be made: TypeError"),
+        ("sys:exit", "sys:exit can't be made: SystemExit"),
     ],
 )
 def test_what_is_wrong_with_a_kind_is_said(folder: Path, kind: str, says: str) -> None:

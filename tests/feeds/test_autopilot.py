@@ -204,6 +204,16 @@ def test_an_estimate_that_is_no_number_ends_the_run(monkeypatch: pytest.MonkeyPa
     assert "flight.bank_max_deg" in result.metrics
 
 
+@pytest.mark.parametrize(
+    ("wind", "speed"), [(np.array([3.0, 0.0]), 4.0), (np.array([3.0]), math.nan), (None, math.nan)]
+)
+def test_speed_through_air_needs_a_wind_north_and_east(wind: np.ndarray | None, speed: float) -> None:
+    """An own estimator may call another thing wind."""
+    extra = None if wind is None else {"wind": (wind, wind)}
+    estimate = Estimate.of(1.0, v_n=np.array([3.0, 4.0, 0.0]), extra=extra)
+    assert autopilot._speed_through_air(estimate) == pytest.approx(speed, nan_ok=True)
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize(("lasting", "survives"), [(0.7, True), (3.0, False)])
 def test_gyros_may_be_silent_for_a_moment(lasting: float, survives: bool) -> None:

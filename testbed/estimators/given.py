@@ -1,0 +1,191 @@
+"""What an estimator of the user's gives, looked at before anybody reckons with it: it may be anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+
+from nav.columns import VECTORS
+from nav.samples import Array, Estimate, Outcome, Status, UpdateReport
+from testbed.errors import shown
+
+FLOAT = np.dtype(float)
+NUMBERS = ("t", "lat", "lon", "h")
+ALL = sum(Status)
+LENGTH = 1e-3  # by which that of a quaternion may be off 1: angles are wrong by as much
+# Names in the record beside the further states of an estimate: columns, dimensions and groups.
+TAKEN = {*NUMBERS, *VECTORS, "time", "status", "sigma_position_n", "sigma_velocity_n", "sigma_attitude_n",
+         "ned", "body", "quaternion", "error", "error_column", "innovations"}  # fmt: skip
+
+
+class Unfit(Exception):
+    """What the user's class gave can't be used. The text says what it gave, and what was wanted."""
+
+
+class Given:
+    """Looks at what one estimator gives; the length of what has a name must stay as it was at first.
+
+    Numbers and arrays of another type than that of the record become of that type.
+    """
+
+    def __init__(self) -> None:
+        self._innovations: dict[str, int] = {}  # by aid
+        self._states: dict[str, int] = {}
+
+    def estimate(self, given: Any, method: str) -> Estimate:
+        """What a method gave as an estimate. Raises Unfit."""
+        if not isinstance(given, Estimate):
+            raise Unfit(f"{method} gave {_told(given)}, not a nav.samples.Estimate")
+        changes: dict[str, Any] = {}
+        for name in NUMBERS:
+            value = getattr(given, name)
+            if not isinstance(value, float):
+                changes[name] = _number(value, f"{method}: {name}")
+        for name, shape in VECTORS.items():
+            value = getattr(given, name)
+            if type(value) is not np.ndarray or value.dtype is not FLOAT:
+                value = changes[name] = _array(value, f"{method}: {name}")
+            if value.shape != shape:
+                raise Unfit(f"{method}: {name} has shape {value.shape}, not {shape}")
+        w, x, y, z = changes.get("q_nb", given.q_nb).tolist()
+        square = w * w + x * x + y * y + z * z
+        if abs(square - 1.0) > 2 * LENGTH:  # false for NaN
+            raise Unfit(f"{method}: q_nb has length {math.sqrt(square):.4g}, not 1")
+        if type(given.status) is not Status or not 0 <= given.status <= ALL:
+            changes["status"] = _status(given.status, f"{method}: status")
+        if type(given.extra) is not dict or given.extra:
+            changes["extra"] = self._extra(given.extra, f"{method}: extra")
+        return dataclasses.replace(given, **changes) if changes else given
+
+    def reports(self, given: Any, method: str) -> list[UpdateReport]:
+        """What a method gave as a list of reports. Raises Unfit."""
+        if given is None:
+            return []
+        if isinstance(given, UpdateReport):
+            return [self._report(given, f"{method}: a report's")]
+        if not isinstance(given, Iterable) or isinstance(given, str):
+            raise Unfit(f"{method} gave {_told(given)}, not a list of reports")
+        reports = []
+        for one in given:
+            if not isinstance(one, UpdateReport):
+                raise Unfit(f"{method} gave a list with {_told(one)} in it, not a nav.samples.UpdateReport")
+            reports.append(self._report(one, f"{method}: a report's"))
+        return reports
+
+    def _report(self, given: UpdateReport, of: str) -> UpdateReport:
+        changes: dict[str, Any] = {
+            name: _number(getattr(given, name), f"{of} {name}") for name in ("t", "nis", "threshold", "weight")
+        }
+        for name in ("sensor", "reason"):
+            if not _is_text(getattr(given, name)):
+                raise Unfit(f"{of} {name} is {_told(getattr(given, name))}, not a text")
+        _require_name(given.aid, f"{of} aid")
+        innovation = changes["innovation"] = _array(given.innovation, f"{of} innovation")
+        if innovation.ndim != 1:
+            raise Unfit(f"{of} innovation has shape {innovation.shape}, not (m,)")
+        m = len(innovation)
+        S = changes["S"] = _array(given.S, f"{of} S")
+        if S.shape != (m, m):
+            raise Unfit(f"{of} S has shape {S.shape}, not {(m, m)} as its innovation has {m}")
+        if m:  # a sample that was refused before has none
+            _require_length(self._innovations, given.aid, m, f"{of} innovation of {given.aid}")
+        try:
+            changes["outcome"] = Outcome(given.outcome)
+        except ValueError:
+            raise Unfit(f"{of} outcome is {_told(given.outcome)}, not a nav.samples.Outcome") from None
+        return dataclasses.replace(given, **changes)
+
+    def _extra(self, given: Any, what: str) -> dict[str, tuple[Array, Array]]:
+        if not isinstance(given, Mapping):
+            raise Unfit(f"{what} is {_told(given)}, not further states by name")
+        states = {}
+        for name, pair in given.items():
+            if name not in self._states:
+                self._require_free(name, what)
+            own = f"{what}: {name}"
+            if not (isinstance(pair, tuple | list) or np.ndim(pair) > 1) or len(pair) != 2:
+                raise Unfit(f"{own} is {_told(pair)}, not (value, sigma)")
+            value, sigma = (_array(one, f"{own}, {part}") for one, part in zip(pair, ("value", "sigma"), strict=True))
+            if value.ndim != 1 or not len(value):
+                raise Unfit(f"{own}, value has shape {value.shape}, not (k,)")
+            if sigma.shape != value.shape:
+                raise Unfit(f"{own}, sigma has shape {sigma.shape}, and its value {value.shape}")
+            _require_length(self._states, name, len(value), own)
+            states[name] = value, sigma
+        return states
+
+    def _require_free(self, name: Any, what: str) -> None:
+        """Raises Unfit when the record can't have a state of this name beside what it has."""
+        _require_name(name, f"{what}: a name")
+        taken = TAKEN.union(*map(_columns, self._states))
+        both = sorted(_columns(name) & taken)
+        if both:
+            raise Unfit(f"{what}: {name} can't be a name: the record has {both[0]} already")
+
+
+def _columns(name: str) -> set[str]:
+    """What the record has of a further state: value, sigma, and the dimension of both."""
+    return {name, f"sigma_{name}", f"{name}_component"}
+
+
+def _number(value: Any, what: str) -> float:
+    if isinstance(value, np.ndarray) and not value.ndim:
+        value = value[()]
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise Unfit(f"{what} is {_told(value)}, not a number")
+    return float(value)
+
+
+def _array(value: Any, what: str) -> Array:
+    if type(value) is np.ndarray and value.dtype is FLOAT:
+        return value
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise Unfit(f"{what} is {_told(value)}, not an array of numbers") from None
+    if array.dtype.kind not in "fiu" and array.size:
+        raise Unfit(f"{what} is {_told(value)}, not an array of real numbers")
+    numbers: Array = array.astype(float)
+    return numbers
+
+
+def _status(value: Any, what: str) -> Status:
+    if not isinstance(value, Integral) or not 0 <= int(value) <= ALL:
+        raise Unfit(f"{what} is {_told(value)}, not a nav.samples.Status")
+    return Status(int(value))
+
+
+def _require_name(name: Any, what: str) -> None:
+    """Raises Unfit when a group or a column of the record can't be called so."""
+    if not isinstance(name, str) or not name.strip(".") or "/" in name or not name.isprintable():
+        raise Unfit(f"{what} is {_told(name)}, not a text that can be a name: no slash, no control character")
+
+
+def _require_length(lengths: dict[str, int], name: str, length: int, what: str) -> None:
+    if lengths.setdefault(name, length) != length:
+        raise Unfit(f"{what} has {length} numbers, and had {lengths[name]} before")
+
+
+def _is_text(value: Any) -> bool:
+    """Whether it is one that can be written."""
+    try:
+        return isinstance(value, str) and value.encode() is not None
+    except UnicodeEncodeError:
+        return False
+
+
+def _told(value: Any) -> str:
+    """What something is, in a few words."""
+    if value is None or isinstance(value, int | float | np.number):
+        return str(value)
+    if isinstance(value, str):
+        return shown(value)
+    if isinstance(value, np.ndarray):
+        return f"an array of {value.dtype} of shape {value.shape}"
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"

@@ -1,0 +1,234 @@
+"""What an own estimator gives may be anything: what can't be used is its own end, and is named."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nav.samples import BarometerSample, Estimate, ImuSamples, Outcome, Status, UpdateReport
+from testbed import Scenario, run
+from testbed.estimators.custom import Adapter
+from testbed.record.reader import load
+from testbed.score.accuracy import column
+
+IMU = ImuSamples(np.array([1.0]), np.array([0.01]), np.zeros((1, 3)), np.zeros((1, 3)))
+SAMPLE = BarometerSample(1.0, 1.0, 1e5)
+SOUND = Estimate.of(1.0, q_nb=np.array([1.0, 0, 0, 0]), lla=np.zeros(3), v_n=np.ones(3), covariance=np.eye(9))
+REPORT = UpdateReport(1.0, "gnss", "gnss_position", np.zeros(3), np.eye(3), 1.0, 10.0, 1.0, Outcome.FUSED)
+
+
+class Giving:
+    """Gives what it is told to."""
+
+    def __init__(self, estimate: Any = SOUND, reports: Any = None) -> None:
+        self.given, self.reports = estimate, reports
+
+    def propagate(self, imu: ImuSamples) -> None: ...
+
+    def update(self, sample: Any) -> Any:
+        return self.reports
+
+    def estimate(self) -> Any:
+        return self.given
+
+
+def told(**changes: Any) -> tuple[Estimate, str]:
+    adapter = Adapter(Giving(dataclasses.replace(SOUND, **changes)))
+    return adapter.estimate(), adapter.failure
+
+
+def reported(given: Any) -> tuple[list[UpdateReport], str]:
+    adapter = Adapter(Giving(reports=given))
+    return adapter.update(SAMPLE), adapter.failure
+
+
+def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros(k), np.ones(k)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"lat": None}, "estimate: lat is None, not a number"),
+        ({"lat": np.array([0.5])}, "estimate: lat is an array of float64 of shape (1,), not a number"),
+        ({"h": "500"}, 'estimate: h is "500", not a number'),
+        ({"t": None}, "estimate: t is None, not a number"),
+        ({"v_n": None}, "estimate: v_n is None, not an array of real numbers"),
+        ({"v_n": np.array(["1", "2", "3"])}, "estimate: v_n is an array of <U1 of shape (3,), not an array of real"),
+        ({"v_n": np.ones(3) + 1j}, "estimate: v_n is an array of complex128 of shape (3,), not an array of real"),
+        ({"v_n": [[1.0], [2.0, 3.0]]}, "estimate: v_n is a list, not an array of numbers"),
+        ({"v_n": np.ones((3, 1))}, "estimate: v_n has shape (3, 1), not (3,)"),
+        ({"covariance": np.eye(6)}, "estimate: covariance has shape (6, 6), not (9, 9)"),
+        ({"q_nb": np.zeros(4)}, "estimate: q_nb has length 0, not 1"),
+        ({"q_nb": 2 * SOUND.q_nb}, "estimate: q_nb has length 2, not 1"),
+        ({"status": None}, "estimate: status is None, not a nav.samples.Status"),
+        ({"status": "ALIGNED"}, 'estimate: status is "ALIGNED", not a nav.samples.Status'),
+        ({"status": 99999}, "estimate: status is 99999, not a nav.samples.Status"),
+        ({"extra": None}, "estimate: extra is None, not further states by name"),
+        ({"extra": {"b": (0.0, 1.0)}}, "estimate: extra: b, value has shape (), not (k,)"),
+        ({"extra": {"b": np.zeros(2)}}, "estimate: extra: b is an array of float64 of shape (2,), not (value, sigma)"),
+        ({"extra": {"b": pair(0)}}, "estimate: extra: b, value has shape (0,), not (k,)"),
+        ({"extra": {"b": (np.zeros(2), np.ones(3))}}, "estimate: extra: b, sigma has shape (3,), and its value (2,)"),
+        ({"extra": {"b": (np.array(["a"]), np.ones(1))}}, "estimate: extra: b, value is an array of <U1 of shape"),
+        ({"extra": {3: pair(1)}}, "estimate: extra: a name is 3, not a text that can be a name"),
+        ({"extra": {"a/b": pair(1)}}, 'estimate: extra: a name is "a/b", not a text that can be a name: no slash'),
+        ({"extra": {"h": pair(1)}}, "estimate: extra: h can't be a name: the record has h already"),
+        ({"extra": {"gyro_bias": pair(3)}}, "estimate: extra: gyro_bias can't be a name: the record has gyro_bias"),
+        ({"extra": {"position_n": pair(3)}}, "extra: position_n can't be a name: the record has sigma_position_n"),
+        ({"extra": {"x": pair(1), "sigma_x": pair(1)}}, "extra: sigma_x can't be a name: the record has sigma_x"),
+    ],
+)
+def test_what_is_no_estimate_is_named(changes: dict[str, Any], says: str) -> None:
+    estimate, failure = told(**changes)
+    assert says in failure
+    assert np.isnan(estimate.lat)
+    assert estimate.status == Status.ALIGNING
+
+
+def test_what_only_has_another_type_is_taken() -> None:
+    estimate, failure = told(
+        lat=np.float32(0.5), h=np.array(3), q_nb=[1, 0, 0, 0], v_n=np.arange(3), status=2, extra={"b": ([1], [2.0])}
+    )
+    assert failure == ""
+    assert (estimate.lat, estimate.h, estimate.status) == (0.5, 3.0, Status.ALIGNED)
+    assert {getattr(estimate, name).dtype for name in ("q_nb", "v_n")} == {np.dtype(float)}
+    assert isinstance(estimate.status, Status)
+    assert [one.tolist() for one in estimate.extra["b"]] == [[1.0], [2.0]]
+
+
+def test_unknown_is_no_mistake() -> None:
+    for changes in ({"q_nb": np.full(4, np.nan)}, {"lat": np.nan}, {"covariance": np.full((9, 9), np.nan)}):
+        assert told(**changes)[1] == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (5, "update gave 5, not a list of reports"),
+        (True, "update gave True, not a list of reports"),
+        ("abc", 'update gave "abc", not a list of reports'),
+        ([REPORT, {"a": 1}], "update gave a list with a dict in it, not a nav.samples.UpdateReport"),
+        ({"innovation": 0.0, "S": 1.0}, "update: a report's innovation has shape (), not (m,)"),
+        ({"innovation": None, "S": None}, "update: a report's innovation is None, not an array of real numbers"),
+        ({"innovation": np.zeros(2)}, "update: a report's S has shape (3, 3), not (2, 2) as its innovation has 2"),
+        ({"outcome": "fused"}, 'update: a report\'s outcome is "fused", not a nav.samples.Outcome'),
+        ({"outcome": 99}, "update: a report's outcome is 99, not a nav.samples.Outcome"),
+        ({"t": None}, "update: a report's t is None, not a number"),
+        ({"nis": None}, "update: a report's nis is None, not a number"),
+        ({"sensor": 3}, "update: a report's sensor is 3, not a text"),
+        ({"reason": "\ud800"}, "update: a report's reason is "),
+        ({"aid": "mine/x y:z"}, 'update: a report\'s aid is "mine/x y:z", not a text that can be a name: no slash'),
+        ({"aid": ""}, 'update: a report\'s aid is "", not a text that can be a name'),
+    ],
+)
+def test_what_is_no_report_is_named(given: Any, says: str) -> None:
+    changed = dataclasses.replace(REPORT, **given) if isinstance(given, dict) else given
+    reports, failure = reported(changed)
+    assert says in failure
+    assert reports == []
+
+
+def test_reports_in_any_wrapping() -> None:
+    lists = dataclasses.replace(REPORT, innovation=[0, 0, 0], S=np.eye(3).tolist(), outcome=0)
+    for given in (REPORT, [REPORT], (one for one in (REPORT,)), lists):
+        (report,), failure = reported(given)
+        assert failure == ""
+        assert report.innovation.shape == (3,)
+        assert report.outcome is Outcome.FUSED
+    assert reported(None) == ([], "")
+
+
+def test_lengths_stay_as_they_were() -> None:
+    inner = Giving(dataclasses.replace(SOUND, extra={"b": pair(2)}), REPORT)
+    adapter = Adapter(inner)
+    adapter.update(SAMPLE)
+    inner.reports = dataclasses.replace(REPORT, innovation=np.empty(0), S=np.empty((0, 0)))  # refused before
+    adapter.update(SAMPLE)
+    assert adapter.failure == ""
+    inner.reports = dataclasses.replace(REPORT, innovation=np.zeros(2), S=np.eye(2))
+    adapter.update(SAMPLE)
+    assert adapter.failure == "update: a report's innovation of gnss_position has 2 numbers, and had 3 before"
+    adapter = Adapter(inner)
+    adapter.estimate()
+    inner.given = dataclasses.replace(SOUND, extra={"b": pair(1)})
+    adapter.estimate()
+    assert adapter.failure == "estimate: extra: b has 1 numbers, and had 2 before"
+
+
+class Raising(Giving):
+    """Raises in what it need not have."""
+
+    def __init__(self, error: BaseException) -> None:
+        super().__init__()
+        self.error = error
+
+    def _raise(self) -> Any:
+        raise self.error
+
+    listening = accepts = refuse = predict = property(_raise)
+    propagate = update = _raise  # type: ignore[assignment]
+
+
+ASKED: list[Callable[[Adapter], Any]] = [
+    lambda a: a.listening,
+    lambda a: a.accepts(SAMPLE),
+    lambda a: a.refuse(SAMPLE, "late"),
+    lambda a: a.predict(IMU),
+]
+
+
+@pytest.mark.parametrize("ask", ASKED)
+@pytest.mark.parametrize("error", [RuntimeError("no"), SystemExit(3), GeneratorExit("no")])
+def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any], error: BaseException) -> None:
+    adapter = Adapter(Raising(error))
+    ask(adapter)
+    assert adapter.failure.startswith(f"{type(error).__name__}: {error} (test_given.py, line")
+    assert not adapter.listening
+    assert not adapter.accepts(SAMPLE)
+
+
+def test_who_stops_the_run_stops_it() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Adapter(Raising(KeyboardInterrupt())).listening  # noqa: B018
+
+
+UNUSUAL = """
+import numpy as np
+from nav.samples import Estimate, GnssSample, Outcome, UpdateReport
+
+
+class Unusual:
+    def __init__(self, rig):
+        self.t, self.fix = 0.0, None
+
+    def propagate(self, imu):
+        self.t = imu.t[-1]
+
+    def update(self, sample):
+        if isinstance(sample, GnssSample) and sample.has_fix:
+            self.fix = sample
+            numbers = 1.0, 10.0, 1.0, Outcome.FUSED
+            return UpdateReport(sample.t, sample.sensor, "gnss_position", np.zeros(2), np.eye(2), *numbers)
+
+    def estimate(self):
+        if self.fix is None:
+            return Estimate.of(self.t)
+        lla, extra = np.array([self.fix.lat, self.fix.lon, self.fix.h]), {"wind": (np.zeros(3), np.ones(3))}
+        return Estimate.of(self.t, q_nb=np.array([1.0, 0, 0, 0]), lla=lla, v_n=self.fix.v_n, extra=extra)
+"""
+
+
+def test_a_known_name_for_another_thing_is_recorded(tmp_path: Path) -> None:
+    """Position of two components, wind of three: their own components, not north, east and down."""
+    (tmp_path / "unusual.py").write_text(UNUSUAL)
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[[estimator]]")[0]
+    (tmp_path / "own.toml").write_text(f'{text}\n[[estimator]]\nname = "own"\nkind = "./unusual.py:Unusual"\n', "utf-8")
+    result = run(Scenario.load(tmp_path / "own.toml", {"duration_s": 5, "expect": {}}), out=tmp_path / "out")
+    assert not [one for one in result.remarks if "has ended" in one]
+    record = load(tmp_path / "out/run.nc")
+    assert column(record, "estimators/own/innovations/gnss_position/innovation").shape[1:] == (2,)
+    assert column(record, "estimators/own/wind").shape[1:] == (3,)
+    assert np.isfinite(column(record, "estimators/own/sigma_wind")[-1]).all()
