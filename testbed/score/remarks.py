@@ -1,6 +1,7 @@
 """What the reader of a record should know first: what is not scored, a leg cut short, estimators not to be trusted.
 
-An estimator is not to be trusted that faults led astray, or that is surer than its innovations allow.
+An estimator is not to be trusted that faults led astray, or that is surer than its innovations allow. One that claims
+variances that there can't be is judged by its errors alone where it does, and that is said: NEES would just be missing.
 
 The normalised innovation squared of n samples with m components each is, summed, chi-square with n m degrees of freedom
 if the filter's model is right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nav.detection import chi_square_threshold
+from nav.samples import Status
 from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
 from testbed.score.plan import unfinished_leg
@@ -24,6 +26,7 @@ from testbed.score.plan import unfinished_leg
 if TYPE_CHECKING:
     import xarray
 
+VARIANCES = tuple(f"{axis} {what}" for what in ("position", "velocity", "attitude") for axis in accuracy.AXES)
 CONFIDENCE = 0.999  # of the bound
 WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
@@ -38,9 +41,27 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *([f"errors are against {reference}"] if reference else []),
         *scores.unscored(dataset),
         *unfinished_leg(dataset),
+        *_impossible(dataset),
         *astray.values(),
         *_overconfident(dataset, metrics, trusted),
     ]
+
+
+def _impossible(dataset: xarray.DataTree) -> Iterator[str]:
+    """Who claims to be sure beyond all doubt, or surer; NaN claims nothing."""
+    for name in accuracy.names(dataset):
+        own = f"estimators/{name}"
+        status, covariance = (accuracy.column(dataset, f"{own}/{what}") for what in ("status", "covariance"))
+        aligned = (status & Status.ALIGNED) != 0
+        known = np.arange(len(VARIANCES)) >= np.where(status & Status.ATTITUDE_ONLY, 6, 0)[:, None]
+        wrong = (np.diagonal(covariance, axis1=1, axis2=2) <= 0) & known & aligned[:, None]
+        rows = wrong.any(axis=1)
+        if rows.any():
+            which = ", ".join(VARIANCES[k] for k in np.flatnonzero(wrong.any(axis=0)))
+            yield (
+                f"{name} claims a variance of 0 or below in {rows.sum()} of {aligned.sum()} estimates ({which}): no "
+                f"NEES and no 3 σ there"
+            )
 
 
 def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[tuple[str, str]]:

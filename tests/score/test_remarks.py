@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
+from nav.samples import Status
 from testbed.record.recorder import Recorder
 from testbed.score import accuracy, metrics
 from testbed.score.remarks import remarks
@@ -105,4 +106,24 @@ def test_a_few_large_innovations_tell_nothing() -> None:
     nis = run["estimators/ins/innovations/barometer"]["nis"].values
     nis[:-4] = np.nan
     nis[-4:] = 2.0
+    assert doubts(run, metrics.compute(run)) == []
+
+
+@pytest.mark.parametrize(("variance", "told"), [(1.0, False), (np.nan, False), (0.0, True), (-1.0, True)])
+def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> None:
+    """Of those there is no NEES, nor what is judged against three sigma. NaN claims none."""
+    run = flown()
+    covariance = accuracy.column(run, "estimators/other/covariance")
+    covariance[-100:, 0, 0] = covariance[-100:, 8, 8] = variance
+    text = (
+        f"other claims a variance of 0 or below in 100 of {len(covariance)} estimates (north position, down attitude): "
+        "no NEES and no 3 σ there"
+    )
+    assert doubts(run, metrics.compute(run)) == [text] * told
+
+
+def test_an_estimator_of_attitude_alone_claims_no_position() -> None:
+    run = flown()
+    accuracy.column(run, "estimators/other/covariance")[:, 0, 0] = 0.0
+    accuracy.column(run, "estimators/other/status")[:] |= Status.ATTITUDE_ONLY
     assert doubts(run, metrics.compute(run)) == []
