@@ -233,6 +233,8 @@ def campaign(
     for table in campaign_report.tables(result):
         console().print(table)
     print(printable(f"campaign: {folder}"))
+    for text in result.ended():
+        remark(text)
     for failure in result.failures:
         case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()
         remark(f"{case}: {failure.message}")

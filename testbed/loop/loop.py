@@ -11,7 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -64,6 +64,7 @@ class RunResult:
 
     ``failure`` is empty unless the motion ended early because control was lost; then it says how. ``remarks`` are what
     else the caller should know: a plan that ended before the run, deadlines missed in real time, errors not scored.
+    ``ended`` are the estimators that ended by errors of their own, and why.
     """
 
     dataset: xarray.DataTree
@@ -71,6 +72,7 @@ class RunResult:
     path: Path | None
     failure: str = ""
     remarks: tuple[str, ...] = ()
+    ended: Mapping[str, str] = field(default_factory=dict)
 
 
 def run(
@@ -136,7 +138,7 @@ def run(
         if setup.out is not None:
             metrics.save(results, setup.out / METRICS)
     told = (*flown.remarks, *remarks(flown.dataset, results))
-    return RunResult(flown.dataset, results, setup.out, flown.failure, told)
+    return RunResult(flown.dataset, results, setup.out, flown.failure, told, flown.ended)
 
 
 def _leaves_to_compile(scenario: Scenario, setup: Setup) -> bool:
@@ -172,11 +174,12 @@ class Setup:
 
 
 class _Flown(NamedTuple):
-    """A run from its first tick to its end: record, failure, remarks, and what it has to say of its own speed."""
+    """A run from its first tick to its end: record, failure, remarks, who ended, and what it says of its own speed."""
 
     dataset: xarray.DataTree
     failure: str
     remarks: list[str]
+    ended: dict[str, str]
     seconds: dict[str, float]
 
 
@@ -197,7 +200,7 @@ def _fly(scenario: Scenario, setup: Setup, director: Director) -> _Flown:
         remarks = passage.conclude()
         passage.look_back()
         dataset = passage.recorder.finish()
-    return _Flown(dataset, passage.feed.failure, remarks, passage.seconds())
+    return _Flown(dataset, passage.feed.failure, remarks, passage.ended, passage.seconds())
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,7 +253,7 @@ class _Passage:
         self.backlog = {name: Backlog(one) for name, one in behind.items()}
         self.showing = Showing(setup.links, publish, behind[setup.shown] if setup.shown else 0.0)
         self.row = 0  # of the turn, that is looked at for events
-        self.ended: set[str] = set()  # estimators that have ended by an error of their own
+        self.ended: dict[str, str] = {}  # estimators that have ended by an error of their own, and why
 
     def _behind(self, lane: Lane) -> float:
         """Between a tick and what a filter has surely used by then [s]: an increment may not be complete yet."""
@@ -300,7 +303,7 @@ class _Passage:
         self.recorder.reports(name, tracked.reports.pieces)
         self.backlog[name].add(tracked.votes, tracked.reports)
         if lane.failure and name not in self.ended:
-            self.ended.add(name)
+            self.ended[name] = lane.failure
             self.told.emit(float(turn.reference.t[-1]), "error", f"{name} has ended: {lane.failure}")
         return tracked
 
@@ -370,7 +373,7 @@ class _Passage:
         elif unflown := legs_unflown(self.scenario, self.watch.leg):
             self.told.emit(end, "warning", unflown)
             remarks.append(unflown)
-        remarks += [f"{name} has ended: {self.lanes[name].failure}" for name in self.lanes if name in self.ended]
+        remarks += [f"{name} has ended: {self.ended[name]}" for name in self.lanes if name in self.ended]
         for name, lane in self.lanes.items():
             if lane.problem:
                 remarks.append(f"{name} is not aligned at the end: {lane.problem}")

@@ -68,13 +68,15 @@ class Outcome:
     ``history`` has ``time`` (N,) [s], ``outage`` (N,) 1 while some GNSS receiver has no fix, and for each estimator
     ``<name>.error`` horizontal position error [m], ``<name>.sigma`` its own 1-sigma sqrt(P_N + P_E) [m] and
     ``<name>.nees`` the position NEES per degree of freedom; each (N,), NaN while aligning. Of an estimator of attitude
-    alone they are the error of roll and pitch [deg], its sigma [deg] and the attitude NEES.
+    alone they are the error of roll and pitch [deg], its sigma [deg] and the attitude NEES. ``ended`` are
+    the estimators that ended by errors of their own, and why.
     """
 
     combination: int
     seed: int
     metrics: Mapping[str, float]
     history: Mapping[str, Array]
+    ended: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +144,18 @@ class CampaignResult:
                 for o in self.outcomes
             ]
         )
+
+    def ended(self) -> list[str]:
+        """Which estimators ended by errors of their own, in how many runs, and why: a sentence each."""
+        seeds: dict[tuple[int, str, str], list[int]] = {}
+        for one in self.outcomes:
+            for name, why in one.ended.items():
+                seeds.setdefault((one.combination, name, why), []).append(one.seed)
+        told = []
+        for (combination, name, why), own in seeds.items():
+            which = f"seed {own[0]}" if len(own) == 1 else f"{len(own)} runs, the first of seed {own[0]}"
+            told.append(f"{self.combinations[combination]} {name} has ended in {which}: {why}".strip())
+        return told
 
     def dataset(self) -> xarray.Dataset:
         """What `Outcome` keeps over time, of all runs: dimensions run and time, NaN after the end of a shorter run.
@@ -335,6 +349,7 @@ def _store(folder: Path, outcome: Outcome) -> None:
     """Write one outcome: metrics last, so that a run with metrics is a whole run."""
     stem = _stem(folder, outcome.combination, outcome.seed)
     record = {"combination": outcome.combination, "seed": outcome.seed, "metrics": outcome.metrics}
+    record |= {"ended": outcome.ended} if outcome.ended else {}
     arrays = io.BytesIO()
     np.savez_compressed(arrays, **outcome.history)  # type: ignore[arg-type]
     write_file(stem.with_suffix(".npz"), arrays.getvalue())
@@ -360,12 +375,13 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
     """A stored outcome; None when there is none, or none that can be read."""
     stem = _stem(folder, combination, seed)
     try:
-        values = json.loads(stem.with_suffix(".json").read_bytes())["metrics"]
+        record = json.loads(stem.with_suffix(".json").read_bytes())
+        values, ended = record["metrics"], record.get("ended", {})
         with np.load(io.BytesIO(stem.with_suffix(".npz").read_bytes())) as file:
             history = {name: file[name] for name in file.files}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return Outcome(combination, seed, values, history)
+    return Outcome(combination, seed, values, history, ended)
 
 
 # --- the workers
@@ -396,7 +412,7 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
         finite = {key: value for key, value in kept.items() if math.isfinite(value)}
-        return Outcome(task.combination, task.seed, finite, _history(result.dataset))
+        return Outcome(task.combination, task.seed, finite, _history(result.dataset), result.ended)
     except Exception as error:
         message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         return Failure(task.combination, task.seed, message, traceback.format_exc())

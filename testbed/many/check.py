@@ -85,7 +85,10 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a scenario: ``failure`` says why there is nothing, or no whole flight, to judge; wall time [s]."""
+    """What became of a scenario; wall time [s].
+
+    ``failure`` says why there is nothing, no whole flight or an estimator less to judge.
+    """
 
     task: Task
     rows: Sequence[Row] = ()
@@ -250,10 +253,11 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
     started = time.perf_counter()
     try:
         result = loop.run(task.scenario, out=task.folder, progress=lambda now: tell(now.t / now.duration))
-        failure = NEVER_CLOSED if NEVER_CLOSED in result.remarks else ""
+        wrong = [NEVER_CLOSED] if NEVER_CLOSED in result.remarks else []
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
-            failure = f"the flight ended after {t:.0f} s: {result.failure}"
+            wrong = [f"the flight ended after {t:.0f} s: {result.failure}"]
+        failure = "\n".join([*wrong, *(f"{name} has ended: {why}" for name, why in result.ended.items())])
         rows = judge(task.scenario.expect, result.metrics)
         if task.golden is not None:
             rows += against_golden(task.golden, result.metrics)

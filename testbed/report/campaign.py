@@ -265,6 +265,11 @@ def _page(result: CampaignResult, shown: Sequence[Shown]) -> str:
         failures=[
             (f"{result.combinations[failure.combination]} seed {failure.seed}".strip(), failure.message)
             for failure in result.failures
+        ]
+        + [
+            (f"{result.combinations[one.combination]} seed {one.seed}".strip(), f"{name} has ended: {why}")
+            for one in result.outcomes
+            for name, why in one.ended.items()
         ],
     )
 
@@ -299,6 +304,11 @@ def _json(result: CampaignResult) -> dict[str, Any]:
         "efficiencies": plain(result.statistics.efficiencies),
         "expected": plain(result.statistics.expected),
         "failures": plain(result.failures),
+        "ended": [
+            {"combination": one.combination, "seed": one.seed, "estimator": name, "message": why}
+            for one in result.outcomes
+            for name, why in one.ended.items()
+        ],
     }
 
 

@@ -194,9 +194,15 @@ def _envelope(ax: Axes, estimator: str, group: Group, colour: Any, apart: bool) 
     low, median, high = np.nanpercentile(error, (5, 50, 95), axis=0)
     ax.plot(time, median, color=colour, lw=1.4, label="median" if apart else group.label)
     if apart:
-        claimed = np.nanmedian(stacked(group.outcomes, f"{estimator}.sigma")[:, known], axis=0)
+        claimed = median_of(stacked(group.outcomes, f"{estimator}.sigma")[:, known])
         ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0, label="5 – 95 %")
         ax.plot(time, claimed, color=style.GUIDE, lw=1.0, ls="--", label="claimed 1 sigma, median")
+
+
+def median_of(values: Array) -> Array:
+    """Over the runs (N, …) that have a number; NaN where none has, as of an estimator that claims no covariance."""
+    known = np.isfinite(values).any(axis=0)
+    return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
 
 
 def _nees(result: CampaignResult, groups: Sequence[Group], runs: int) -> Figure:

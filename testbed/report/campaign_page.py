@@ -61,7 +61,7 @@ def _errors(result: CampaignResult, groups: Sequence[Group], arrays: Arrays) -> 
             known = known[arrays.stride(len(known))]
             low, median, high = np.maximum(np.nanpercentile(error[:, known], (5, 50, 95), axis=0), LEAST)
             sigma = figures.stacked(group.outcomes, f"{estimator.name}.sigma")[:, known]
-            claimed = np.maximum(_median(sigma), LEAST)
+            claimed = np.maximum(figures.median_of(sigma), LEAST)
             t = arrays.add(figures.longest_of(group.outcomes)["time"][known])
             band = {"t": t, "low": arrays.add(low), "high": arrays.add(high)}
             name = group.label or ALL
@@ -70,12 +70,6 @@ def _errors(result: CampaignResult, groups: Sequence[Group], arrays: Arrays) -> 
         title, unit = ("roll, pitch error", "deg") if estimator.attitude_only else ("horizontal error", "m")
         if lines:
             yield {"title": f"{estimator.name}: {title}", "unit": unit, "lines": lines, "log": True}
-
-
-def _median(values: Any) -> Any:
-    """Over the runs that have a number; NaN where none has."""
-    known = np.isfinite(values).any(axis=0)
-    return np.where(known, np.nanmedian(np.where(known, values, 0.0), axis=0), np.nan)
 
 
 def _nees(result: CampaignResult, groups: Sequence[Group], arrays: Arrays) -> Iterator[dict[str, Any]]:

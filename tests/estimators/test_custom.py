@@ -1,6 +1,8 @@
 """Anybody's estimator: found, checked, run beside ours, and contained when it fails."""
 
+import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,8 @@ from worlds.loop import same
 from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
+from testbed.many import campaign as campaigns
+from testbed.many import check
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 TEMPLATE = Path(__file__).parents[2] / "testbed/template/first.toml"
@@ -122,6 +126,26 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
     before, after = ours(healthy), ours(result)
     assert before.keys() == after.keys()
     assert all(np.array_equal(before[name], after[name], equal_nan=before[name].dtype.kind == "f") for name in before)
+
+
+def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None:
+    """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure."""
+    overrides = ["duration_s=8", "estimator[1].after_s=5", 'expect={"ins.aligned_s"=60}']
+    flown = partial(campaigns.fly, campaigns.Plan(folder / "own.toml", 1, tmp_path / "many", overrides=overrides))
+    for result in (flown(), flown()):  # the second finds what the first has stored
+        assert result.failures == []
+        (told,) = result.ended()
+        assert told.startswith("mine has ended in seed 1: RuntimeError: lost its way (filters.py, line")
+    (kept,) = json.loads((tmp_path / "many/campaign.json").read_text("utf-8"))["ended"]
+    assert (kept["seed"], kept["estimator"]) == (1, "mine")
+    assert kept["message"].startswith("RuntimeError: lost its way")
+    assert "mine has ended: RuntimeError: lost its way" in (tmp_path / "many/report.html").read_text("utf-8")
+    scenario = Scenario.load(folder / "own.toml", overrides)
+    outcome = check.fly(check.Task("own", scenario, tmp_path / "one", None))
+    assert [row.verdict for row in outcome.rows] == ["kept"]
+    assert outcome.failed
+    assert "FAILED" in str(outcome)
+    assert "mine has ended: RuntimeError: lost its way (filters.py, line" in str(outcome)
 
 
 def test_what_it_does_to_its_samples_is_its_own_affair(folder: Path, healthy) -> None:
