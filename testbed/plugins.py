@@ -14,7 +14,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from testbed.errors import UserError, shown, unknown
+from testbed.errors import UserError, printable, shown, unknown
+
+OUR_FOLDERS = {Path(__file__).parent, Path(__file__).parent / "estimators"}  # whose lines tell a user nothing
 
 
 @cache
@@ -69,7 +71,9 @@ def _file(path: Path) -> ModuleType:
 
 
 def raised(error: BaseException) -> str:
-    """What was raised and where, on one line."""
-    frames = traceback.extract_tb(error.__traceback__)
+    """What was raised and where, on one line, in code that is not of `OUR_FOLDERS`."""
+    frames = [
+        frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).parent not in OUR_FOLDERS
+    ]
     at = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {error}{at}"
+    return f"{type(error).__name__}: {printable(str(error))}{at}"

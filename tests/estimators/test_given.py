@@ -190,6 +190,25 @@ def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any]
     assert not adapter.accepts(SAMPLE)
 
 
+def test_what_it_raises_is_told_on_one_line() -> None:
+    adapter = Adapter(Raising(ValueError("two\nlines, one \x1b[31mred")))
+    adapter.predict(IMU)
+    assert adapter.failure.startswith(r"ValueError: two\nlines, one \x1b[31mred (test_given.py, line")
+
+
+def test_a_method_that_cant_be_called_so_is_named() -> None:
+    """Where it is called from is no line of the user's."""
+
+    class Short(Giving):
+        def update(self) -> None:  # type: ignore[override]
+            ...
+
+    adapter = Adapter(Short())
+    adapter.update(SAMPLE)
+    assert adapter.failure.startswith("TypeError: ")
+    assert adapter.failure.endswith("Short.update() takes 1 positional argument but 2 were given")
+
+
 def test_who_stops_the_run_stops_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         Adapter(Raising(KeyboardInterrupt())).listening  # noqa: B018
