@@ -127,60 +127,74 @@ class Adapter:
     @property
     def listening(self) -> bool:
         """Whether a sample of some kind would still be used."""
-        return self._asked(lambda: bool(getattr(self.inner, "listening", True)), False)
+        return self._asked(self._listening, False)
 
     def accepts(self, sample: Sample) -> bool:
         """Whether `update` would use the sample now."""
-
-        def ask() -> bool:
-            accepts = getattr(self.inner, "accepts", None)
-            return accepts is None or bool(accepts(_copied(sample)))
-
-        return self._asked(ask, False)
+        return self._asked(self._accepts, False, sample)
 
     def propagate(self, imu: ImuSamples) -> Sequence[UpdateReport]:
         """Advance by a block of increments."""
         self._t = float(imu.t[-1])
-        return self._asked(lambda: self._given.reports(self.inner.propagate(_copied(imu)), "propagate"), [])
+        return self._asked(self._propagate, [], imu)
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample that is valid at the estimator's own time."""
-        return self._asked(lambda: self._given.reports(self.inner.update(_copied(sample)), "update"), [])
+        return self._asked(self._update, [], sample)
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """The reports on a sample that came too late: none, unless it has something to say."""
-
-        def ask() -> list[UpdateReport]:
-            refuse = getattr(self.inner, "refuse", None)
-            return [] if refuse is None else self._given.reports(refuse(_copied(sample), reason), "refuse")
-
-        return self._asked(ask, [])
+        return self._asked(self._refuse, [], sample, reason)
 
     def estimate(self) -> Estimate:
         """The state at its own time."""
-        return self._asked(lambda: self._given.estimate(self.inner.estimate(), "estimate"), Estimate.of(self._t))
+        return self._asked(self._estimate, None) or Estimate.of(self._t)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments: its own prediction, or its estimate carried on by the increments."""
+        return self._asked(self._predict, None, imu) or Estimate.of(float(imu.t[-1]))
 
-        def ask() -> Estimate:
-            predict = getattr(self.inner, "predict", None)
-            if predict is not None:
-                return self._given.estimate(predict(_copied(imu)), "predict")
-            return carried(self._given.estimate(self.inner.estimate(), "estimate"), imu)
-
-        return self._asked(ask, Estimate.of(float(imu.t[-1])))
-
-    def _asked(self, ask: Callable[[], T], otherwise: T) -> T:
+    def _asked(self, ask: Callable[..., T], otherwise: T, *arguments: Any) -> T:
         if self.failure:
             return otherwise
         try:
-            return ask()
+            return ask(*arguments)
         except Unfit as error:
             self.failure = str(error)
         except (Exception, SystemExit, GeneratorExit) as error:  # `sys.exit` in it is its own end, not the run's
             self.failure = plugins.raised(error)
         return otherwise
+
+    # What is asked: only `_asked` calls these, for whatever is done with the user's object may raise.
+
+    def _listening(self) -> bool:
+        return bool(getattr(self.inner, "listening", True))
+
+    def _accepts(self, sample: Sample) -> bool:
+        accepts = getattr(self.inner, "accepts", None)
+        return accepts is None or bool(accepts(_copied(sample)))
+
+    def _propagate(self, imu: ImuSamples) -> list[UpdateReport]:
+        given = self.inner.propagate(_copied(imu))
+        return [] if given is None else self._given.reports(given, "propagate")
+
+    def _update(self, sample: Sample) -> list[UpdateReport]:
+        given = self.inner.update(_copied(sample))
+        return [] if given is None else self._given.reports(given, "update")
+
+    def _refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
+        refuse = getattr(self.inner, "refuse", None)
+        given = None if refuse is None else refuse(_copied(sample), reason)
+        return [] if given is None else self._given.reports(given, "refuse")
+
+    def _estimate(self) -> Estimate | None:
+        return self._given.estimate(self.inner.estimate(), "estimate")
+
+    def _predict(self, imu: ImuSamples) -> Estimate | None:
+        predict = getattr(self.inner, "predict", None)
+        if predict is not None:
+            return self._given.estimate(predict(_copied(imu)), "predict")
+        return carried(self._given.estimate(self.inner.estimate(), "estimate"), imu)
 
 
 def carried(estimate: Estimate, imu: ImuSamples) -> Estimate:

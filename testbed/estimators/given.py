@@ -64,8 +64,6 @@ class Given:
 
     def reports(self, given: Any, method: str) -> list[UpdateReport]:
         """What a method gave as a list of reports. Raises Unfit."""
-        if given is None:
-            return []
         if isinstance(given, UpdateReport):
             return [self._report(given, f"{method}: a report's")]
         if not isinstance(given, Iterable) or isinstance(given, str):
