@@ -32,7 +32,7 @@ from testbed.data import write_file
 from testbed.errors import UserError
 from testbed.many import pool, progress
 from testbed.many.draws import DRAW, require_draw
-from testbed.many.folder import claim, code, require_code, versions
+from testbed.many.folder import claim, code, own, require_code, require_own_code, versions
 from testbed.many.shared_flight import log_digests, require_control, share_truth
 from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
@@ -217,6 +217,7 @@ class _Task:
     scenario: Scenario
     truth: Path | None  # the flight that all runs share; a worker that can't see it flies it again
     code: str
+    own: Mapping[str, Mapping[str, str]]  # the user's classes
 
 
 def campaign(
@@ -311,9 +312,10 @@ def _tasks(
     """The runs that are not there yet. There may be millions: they are made as they are flown."""
     now = code()
     for i, combination in enumerate(combinations):
+        mine = own([combination.scenario])
         for seed in plan.seeds(combination.scenario):
             if (i, seed) not in stored:
-                yield _Task(i, seed, combination.scenario, truth, now)
+                yield _Task(i, seed, combination.scenario, truth, now, mine)
 
 
 # --- the folder
@@ -327,6 +329,7 @@ def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
         "overrides": list(plan.overrides),
         "varied values": {key: list(values) for key, values in plan.vary.items()},
         "code": code(),
+        **own(scenarios),
         "aircraft": [aircraft.digest(name) for name in sorted(flown)],
         "logs": log_digests(scenarios),
         "versions": versions(),
@@ -404,6 +407,7 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
     gc.collect()
     try:
         require_code(task.code)
+        require_own_code(task.own, task.scenario)
         shared = task.truth if task.truth is not None and task.truth.is_dir() else None
         recorded = isinstance(task.scenario.truth, LogTruth)  # is read by the run itself
         source = Replay(shared) if shared else None if recorded else motion(task.scenario, task.seed)

@@ -5,15 +5,19 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import nav
 import testbed
+from testbed import plugins
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
+from testbed.estimators import custom
+from testbed.scenario import Scenario
+from testbed.sensors import registry as sensors
 
 SETUP = "setup.json"
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
@@ -40,6 +44,27 @@ def require_code(begun_with: str) -> None:
     """Raises UserError when a worker has other code than whoever gave it the task."""
     if code() != begun_with:
         raise UserError("this worker has other code than it was begun with: has a file been edited meanwhile?")
+
+
+def own(scenarios: Sequence[Scenario]) -> dict[str, dict[str, str]]:
+    """Digests of the user's classes in these scenarios, by kind. Raises UserError where one can't be had."""
+    estimators: dict[str, str] = {}
+    sensing: dict[str, str] = {}
+    for one in scenarios:
+        folder = one.path.parent if one.path else Path()
+        for section in one.estimator:
+            if isinstance(section, custom.CustomSection):
+                estimators[section.kind] = plugins.digest(section.kind, folder, custom.GROUP)
+        for sensor in one.sensors.values():
+            if sensor.kind not in sensors.BUILT_IN:
+                sensing[sensor.kind] = plugins.digest(sensor.kind, folder, sensors.GROUP)
+    return {"estimators": estimators, "sensors": sensing}
+
+
+def require_own_code(begun_with: Mapping[str, Mapping[str, str]], scenario: Scenario) -> None:
+    """Raises UserError when a class of the user's in a scenario is not what it was."""
+    if own([scenario]) != begun_with:
+        raise UserError("an estimator or sensor of yours has been edited meanwhile: fly all runs again, elsewhere")
 
 
 def versions() -> dict[str, str]:

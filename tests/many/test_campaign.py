@@ -477,6 +477,108 @@ def test_folder_of_another_campaign(at_rest: Path, tmp_path: Path, threads: str)
         campaign(at_rest, 1, workers=threads, out=out)
 
 
+OWN = """
+from dataclasses import dataclass
+
+from nav.samples import Estimate
+from testbed.sensors.timing import AidingTiming, Schedule
+from {helper} import OFFSET
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    t: float
+    t_arrival: float
+    height: float
+    sensor: str
+
+
+class Height:
+    class Section(AidingTiming):
+        offset_m: float = 0.0
+
+    def __init__(self, name, section, tick_rate_hz, seed):
+        self.name, self.schedule, self.offset = name, Schedule.of(name, section, tick_rate_hz), section.offset_m
+
+    def sense(self, truth):
+        rows = self.schedule.rows(truth)
+        return [Sample(truth.t[k], truth.t[k], truth.h[k] + self.offset + OFFSET, self.name) for k in rows]
+
+
+class Mine:
+    def __init__(self, rig):
+        self.t = 0.0
+
+    def propagate(self, imu):
+        self.t = imu.t[-1]
+
+    def update(self, sample):
+        pass
+
+    def estimate(self):
+        return Estimate.of(self.t)
+"""
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A scenario with classes of the user's in a file that imports another, and that of a package, which can be."""
+    monkeypatch.syspath_prepend(tmp_path)
+    before = set(sys.modules)
+    (tmp_path / "own_package").mkdir()
+    (tmp_path / "own_package/__init__.py").touch()
+    for name in ("own_helper.py", "own_package/helper.py"):
+        (tmp_path / name).write_text("OFFSET = 1.0\n")
+    (tmp_path / "classes.py").write_text(OWN.format(helper="own_helper"))
+    (tmp_path / "own_package/classes.py").write_text(OWN.format(helper=".helper"))
+    text = AT_REST.replace("duration_s = 80", "duration_s = 2").replace("denied = [[70, 75]]", "")
+    mine = '[[estimator]]\nname = "mine"\nkind = "./classes.py:Mine"\nestimates = "attitude"\n'
+    (tmp_path / "own.toml").write_text(f"{text}{mine}")
+    yield tmp_path / "own.toml"
+    for name in set(sys.modules) - before:
+        if name.startswith(("own_", "classes_")):
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("what", ["estimators", "sensors"])
+def test_a_class_that_was_edited_is_another(own: Path, what: str) -> None:
+    if what == "sensors":
+        text = own.read_text().partition('[[estimator]]\nname = "mine"')[0]
+        own.write_text(text + '[sensors.height]\nkind = "./classes.py:Height"\nrate_hz = 5\n')
+    out = own.parent / "out"
+    campaign(own, 1, workers=1, out=out)
+    file = own.parent / "classes.py"
+    file.write_text(file.read_text() + "\n\nMORE = 1\n")
+    with pytest.raises(UserError, match=f"holds a campaign with different {what}: choose"):
+        campaign(own, 1, workers=1, out=out)
+    file.write_text(OWN.format(helper="own_helper"))
+    campaign(own, 1, workers=1, out=out)
+
+
+@pytest.mark.parametrize(("kind", "edited"), [
+    ("./classes.py:Mine", "own_helper.py"), ("own_package.classes:Mine", "own_package/helper.py"),
+])  # fmt: skip
+def test_what_a_class_imports_belongs_to_it(own: Path, threads: str, kind: str, edited: str) -> None:
+    given = {"workers": threads, "overrides": [f"estimator[1].kind={kind!r}"], "out": own.parent / "out"}
+    campaign(own, 1, **given)
+    (own.parent / edited).write_text("OFFSET = 2.0\n")
+    with pytest.raises(UserError, match=f"{edited}: has been edited since it was imported"):
+        campaign(own, 1, **given)
+    for name in [name for name in sys.modules if name.startswith(("own_", "classes_"))]:
+        del sys.modules[name]  # as in a new process
+    with pytest.raises(UserError, match="holds a campaign with different estimators"):
+        campaign(own, 1, **given)
+
+
+def test_a_run_after_an_edit_is_none_of_the_campaign(own: Path) -> None:
+    scenario = Scenario.load(own)
+    task = campaigns._Task(0, 1, scenario, None, folder.code(), folder.own([scenario]))
+    (own.parent / "classes.py").write_text(OWN.format(helper="own_helper") + "#")
+    flown = campaigns._fly(task, lambda share: None)
+    assert isinstance(flown, Failure)
+    assert "has been edited meanwhile" in flown.message
+
+
 def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="can't write here"):
@@ -669,7 +771,8 @@ def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: 
     monkeypatch.setattr(campaigns, "_history", history)
     scenario = Scenario.load(at_rest, ["duration_s=5", "sensors.gnss.denied=[]"])
     for seed in (1, 2):
-        flown = campaigns._fly(campaigns._Task(0, seed, scenario, None, folder.code()), lambda share: None)
+        task = campaigns._Task(0, seed, scenario, None, folder.code(), folder.own([scenario]))
+        flown = campaigns._fly(task, lambda share: None)
         assert isinstance(flown, Outcome)
         assert sum(one() is not None for one in left) == 1  # the last
 
