@@ -67,6 +67,7 @@ BUILT_IN: dict[str, Kind] = {
 }
 _BY_SECTION: dict[type[Section], Kind] = {kind.section: kind for kind in BUILT_IN.values()}
 _CUSTOM: dict[tuple[str, Any], Kind] = {}
+_FOLDERS: dict[type[Section], Path] = {}  # from which the kind of a user's was seen
 
 
 def find(kind: str, folder: Path) -> Kind:
@@ -79,17 +80,32 @@ def find(kind: str, folder: Path) -> Kind:
         raise UserError(f'{text}, or name a class of your own, such as "./sensors.py:Mine"')
     made = plugins.load(kind, folder, GROUP)
     if (kind, made) not in _CUSTOM:
-        _CUSTOM[kind, made] = _custom(kind, made)
+        _CUSTOM[kind, made] = _custom(kind, made, folder.absolute())
     return _CUSTOM[kind, made]
 
 
-def _custom(kind: str, made: Any) -> Kind:
+class _Sent(Section):
+    """What makes the section of a user's class fit to be sent: another process finds its class as this one did."""
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str, Path], Any]:
+        section: Any = self
+        return _blank, (section.kind, _FOLDERS[type(section)]), section.__getstate__()
+
+
+def _blank(kind: str, folder: Path) -> Section:
+    """A section of this kind that has no values yet."""
+    section = find(kind, folder).section
+    return section.__new__(section)
+
+
+def _custom(kind: str, made: Any, folder: Path) -> Kind:
     section = getattr(made, "Section", None)
     if not (isinstance(section, type) and issubclass(section, AidingTiming)):
         raise UserError(f"kind {shown(kind)} lacks a Section, a class of testbed.sensors.timing.AidingTiming")
     if not callable(getattr(made, "sense", None)):
         raise UserError(f"kind {shown(kind)} lacks sense: see docs/extending.md")
-    named = create_model(section.__name__, __base__=section, kind=(str, kind))
+    named = create_model(section.__name__, __base__=(_Sent, section), kind=(str, kind))
+    _FOLDERS[named] = folder
     found = Kind(named, made, getattr(made, "aid", None))
     _BY_SECTION[named] = found
     return found

@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 from worlds import browser, synthetic_run
 
 import testbed
-from testbed import Scenario, run
+from testbed import Scenario, plugins, run
 from testbed.__main__ import app
 from testbed.errors import UserError
 from testbed.feeds import simulated
@@ -568,6 +568,23 @@ def test_what_a_class_imports_belongs_to_it(own: Path, threads: str, kind: str, 
         del sys.modules[name]  # as in a new process
     with pytest.raises(UserError, match="holds a campaign with different estimators"):
         campaign(own, 1, **given)
+
+
+@pytest.mark.ci
+def test_a_sensor_of_the_users_is_flown_by_workers(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info = own.parent / "own_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own_package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[navigation_testbed.sensors]\nown_height = own_package.classes:Height\n")
+    plugins.installed.cache_clear()
+    own.write_text(own.read_text() + "[sensors.height]\nkind = './classes.py:Height'\nrate_hz = 5\noffset_m = 2.0\n")
+    kinds = ['"./classes.py:Height"', '"own_package.classes:Height"', '"own_height"']
+    try:
+        flown = campaign(own, 1, vary={"sensors.height.kind": kinds}, workers=2, out=own.parent / "out")
+    finally:
+        plugins.installed.cache_clear()
+    assert not flown.failures
+    assert [len(one.history["time"]) for one in flown.outcomes] == [3, 3, 3]
 
 
 def test_a_run_after_an_edit_is_none_of_the_campaign(own: Path) -> None:

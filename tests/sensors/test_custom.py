@@ -1,5 +1,7 @@
 """Anybody's sensor: found, sensed, recorded, and aiding the filters."""
 
+import pickle
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 from testbed import Scenario, run
 from testbed.errors import UserError
+from testbed.sensors import registry
 
 RADAR = """
 from dataclasses import dataclass, field
@@ -79,3 +82,19 @@ def test_what_is_wrong_is_said(scenario: Path, overrides: dict[str, object], say
     with pytest.raises(UserError) as told:
         Scenario.load(scenario, overrides)
     assert says in str(told.value)
+
+
+def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To another process too, which has not seen its class, and with what was changed since it was loaded."""
+    loaded = Scenario.load(scenario, {"sensors.radar.noise_m": 2.0}).model_copy(update={"duration_s": 7.0})
+    sent = pickle.dumps(loaded)
+    for name in [name for name in sys.modules if name.startswith("radar_")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(registry, "_CUSTOM", {})
+    monkeypatch.setattr(registry, "_BY_SECTION", {kind.section: kind for kind in registry.BUILT_IN.values()})
+    monkeypatch.chdir("/")
+    found = pickle.loads(sent)
+    own = found.sensors["radar"]
+    assert registry.of(own).sensor.__name__ == "Radar"
+    assert (own.noise_m, own.kind, found.duration_s) == (2.0, "./radar.py:Radar", 7.0)
+    assert (found.text, found.path, found.overrides) == (loaded.text, loaded.path, loaded.overrides)
