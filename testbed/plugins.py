@@ -9,7 +9,7 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
@@ -19,7 +19,9 @@ from typing import Any
 
 from testbed.errors import UserError, printable, shown, unknown
 
-OUR_FOLDERS = {Path(__file__).parent, Path(__file__).parent / "estimators"}  # whose lines tell a user nothing
+# Packages that are not the user's to edit, and where our own are.
+_INSTALLED = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_HERE = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "nav")
 
 
 @cache
@@ -81,19 +83,22 @@ def _file(path: Path) -> ModuleType:
 
 
 def raised(error: BaseException) -> str:
-    """What was raised and where, on one line, in code that is not of `OUR_FOLDERS`."""
-    frames = [
-        frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).parent not in OUR_FOLDERS
-    ]
-    at = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+    """What was raised and where, on one line: in the user's code if it can be told, not in what that calls."""
+    found = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in found if not _lies(Path(frame.filename), _HERE)]
+    theirs = [frame for frame in frames if not _lies(Path(frame.filename), _INSTALLED)]
+    last = (theirs or frames)[-1:]
+    at = f" ({Path(last[0].filename).name}, line {last[0].lineno})" if last else ""
     return f"{type(error).__name__}: {printable(str(error))}{at}"
+
+
+def _lies(path: Path, places: Sequence[Path]) -> bool:
+    return any(place in path.parents for place in places)
 
 
 # --- what it is made of
 
-# Packages that are not the user's to edit, and our own, which the digest of the code has.
-_INSTALLED = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
-_OURS = ("nav", "testbed")
+_OURS = ("nav", "testbed")  # which the digest of the code has
 _SEEN: dict[str, tuple[object, str]] = {}  # by module: its spec, which a reload makes anew, and the digest of its file
 
 
@@ -160,7 +165,7 @@ def _is_own(top: str, home: str) -> bool:
     if top == home or spec is None:
         return top == home
     places = [*(spec.submodule_search_locations or ()), *([spec.origin] if spec.has_location and spec.origin else [])]
-    return not any(installed in Path(place).resolve().parents for place in places for installed in _INSTALLED)
+    return not any(_lies(Path(place).resolve(), _INSTALLED) for place in places)
 
 
 def _imports(name: str, file: Path, content: bytes) -> Iterator[str]:

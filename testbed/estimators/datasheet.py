@@ -30,7 +30,7 @@ from nav.point_mass import PointMass
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
-from testbed.sensors import Site, registry
+from testbed.sensors import Site, custom, registry
 from testbed.sensors.airspeed import REFERENCE_EAS, AirspeedConfig
 from testbed.sensors.barometer import BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocityConfig
@@ -175,7 +175,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             left = air.gust * math.sqrt(2 * length / max(section.mean_s, 2 * length))
             return WindReportAid(name, w.local, w.tau, left, air.wind_walk)
     maker = registry.of(section).aid  # of a sensor of the user's
-    return None if maker is None else maker(name, section, imu)
+    return None if maker is None else custom.aid(maker, name, section, imu)
 
 
 def _barometer(name: str, section: BarometerConfig) -> Aid:

@@ -13,6 +13,7 @@ from testbed.motion.ahead import Ahead
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.scenario import Scenario
+from testbed.sensors.custom import Guard, is_own
 from testbed.sensors.delivery import Delivery
 from testbed.sensors.faults import Faults
 from testbed.sensors.gnss import Gnss
@@ -41,6 +42,7 @@ class Simulated:
         self.motion_s = 0.0
         self.inertial: dict[str, sensors.Imu] = {}
         self.aiding: dict[str, sensors.AidingSensor] = {}
+        self._own: dict[str, Guard] = {}  # of the user's
         self._deliveries: dict[str, Delivery] = {}
         for name, section in scenario.sensors.items():
             sensor = sensors.build(name, section, source.rate_hz, seed, scenario.site())
@@ -50,6 +52,8 @@ class Simulated:
                 self.aiding[name] = sensor
                 assert isinstance(section, AidingTiming)
                 self._deliveries[name] = Delivery(name, section, seed)
+                if is_own(section):
+                    self._own[name] = Guard(name, section, sensor)
         self.receptions = {name: one.reception for name, one in self.aiding.items() if isinstance(one, Gnss)}
         self.origin: dict[str, str] = {}
         self.faults = Faults(scenario.fault, scenario.sensors, seed)
@@ -75,7 +79,8 @@ class Simulated:
 
     def _delivered(self, name: str, block: TruthBlock) -> Sequence[Sample]:
         """What comes through of one aiding sensor."""
-        return self._deliveries[name].of(self.aiding[name].sense(block))
+        sensor = self._own.get(name, self.aiding[name])
+        return self._deliveries[name].of(sensor.sense(block))
 
     def activity(self) -> str:
         """What the motion is doing."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
-from testbed.sensors import registry
+from testbed.sensors import custom, registry
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
 from testbed.sensors.barometer import Barometer, BarometerConfig
 from testbed.sensors.body_velocity import BodyVelocity, BodyVelocityConfig
@@ -62,6 +62,9 @@ Sensor: TypeAlias = Imu | AidingSensor
 
 def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site: Site) -> Sensor:
     """The sensor for one run. Raises UserError when its samples do not fall on ticks or no field model has the date."""
+    if custom.is_own(config):
+        own: Sensor = custom.made(name, config, tick_rate_hz, seed)
+        return own
     made = registry.of(config).sensor
     given = (name, config, tick_rate_hz, seed)
     local = isinstance(config, MagnetometerConfig | RangefinderConfig | OpticalFlowConfig)

@@ -1,6 +1,7 @@
 """Anybody's sensor: found, sensed, recorded, and aiding the filters."""
 
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -29,22 +30,83 @@ class HeightSample:
     sensor: str = "radar"
 
 
+@dataclass(frozen=True)
+class Timeless:
+    height: float
+
+
 class Radar:
     class Section(AidingTiming):
         noise_m: float = Field(0.5, ge=0, description="1 sigma")
+        how: str = ""
 
     def __init__(self, name, section, tick_rate_hz, seed):
+        self.how = section.how
+        if self.how == "init":
+            raise ValueError("no antenna")
         self.name, self.schedule = name, Schedule.of(name, section, tick_rate_hz)
         self.white = Process.white(stream(seed, name, "white"), [section.noise_m])
 
     def sense(self, truth):
         rows = self.schedule.rows(truth)
         noise = self.white.take(len(rows))[:, 0] if len(rows) else ()
+        if self.how == "write":
+            truth.h[:] = 0.0
+        if self.how in WRONG:
+            return WRONG[self.how]()
         return [
             HeightSample(float(truth.t[k]), float(truth.t[k]) + self.schedule.latency, float(truth.h[k] + e), self.name)
             for k, e in zip(rows, noise)
         ]
+
+
+def generated():
+    yield HeightSample(0.0, 0.0, 1.0)
+    raise ValueError("no echo")
+
+
+WRONG = {
+    "none": lambda: None,
+    "dict": lambda: [{"t": 0.0}],
+    "timeless": lambda: [Timeless(1.0)],
+    "nan": lambda: [HeightSample(float("nan"), 0.0, 1.0)],
+    "text": lambda: [HeightSample("now", 0.0, 1.0)],
+    "early": lambda: [HeightSample(2.0, 1.0, 1.0)],
+    "other": lambda: [HeightSample(0.0, 0.0, 1.0, "lidar")],
+    "words": lambda: [HeightSample(0.0, 0.0, "high")],
+    "matrix": lambda: [HeightSample(0.0, 0.0, np.eye(2))],
+    "mixed": lambda: [HeightSample(0.0, 0.0, 1.0), HeightSample(0.0, 0.0, np.zeros(2))],
+    "raise": lambda: np.linalg.inv(np.zeros((2, 2))),
+    "late": generated,
+}
+
+
+class Aiding(Radar):
+    @staticmethod
+    def aid(name, section, imu):
+        if section.how == "typo":
+            raise ValueError("no such aid")
+        return section
 """
+AT_REST = """
+title = "At rest, with a sensor of the user's"
+seed = 11
+duration_s = 2
+truth = { source = "kinematic", rate_hz = 50, start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 500 } }
+sensors.imu = { rate_hz = 50 }
+sensors.gnss = { rate_hz = 5 }
+sensors.magnetometer = { rate_hz = 5 }
+sensors.radar = { kind = "./radar.py:Radar", rate_hz = 5 }
+
+[[estimator]]
+name = "ins"
+aids = ["gnss", "magnetometer"]
+"""
+
+
+def at(text: str) -> str:
+    """Where a text stands in the file."""
+    return f"radar.py, line {RADAR[: RADAR.index(text)].count(chr(10)) + 1}"
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +115,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "radar.py").write_text(RADAR)
     text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[expect]")[0]
     (folder / "own.toml").write_text(f'{text}\n[sensors.radar]\nkind = "./radar.py:Radar"\nrate_hz = 5\n', "utf-8")
+    (folder / "rest.toml").write_text(AT_REST, "utf-8")
     return folder / "own.toml"
 
 
@@ -98,3 +161,42 @@ def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.Monk
     assert registry.of(own).sensor.__name__ == "Radar"
     assert (own.noise_m, own.kind, found.duration_s) == (2.0, "./radar.py:Radar", 7.0)
     assert (found.text, found.path, found.overrides) == (loaded.text, loaded.path, loaded.overrides)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("init", f"can't be made: ValueError: no antenna ({at('no antenna')})"),
+        ("write", f"ValueError: assignment destination is read-only ({at('truth.h[:]')})"),
+        ("raise", f"LinAlgError: Singular matrix ({at('linalg')})"),
+        ("late", f"ValueError: no echo ({at('no echo')})"),
+        ("none", "sense gave NoneType: give a list of samples"),
+        ("dict", "sense gave dict where a sample was expected"),
+        ("timeless", "sense gave Timeless, which lacks t, t_arrival, sensor"),
+        ("nan", "sense gave a sample whose t is nan"),
+        ("text", 'sense gave a sample whose t is "now"'),
+        ("early", "sense gave a sample that arrives at 1 s, before it is true at 2 s"),
+        ("other", 'sense gave a sample of sensor "lidar", not "radar"'),
+        ("words", 'sense gave a sample whose height is "high": it must be a number'),
+        ("matrix", "sense gave a sample whose height has shape (2, 2)"),
+        ("mixed", "sense gave a sample whose height has shape (2,)"),
+    ],
+)
+def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, says: str) -> None:
+    with pytest.raises(UserError) as told:
+        run(Scenario.load(scenario.with_name("rest.toml"), {"sensors.radar.how": how}))
+    assert re.match(rf"sensor radar: \./radar\.py:Radar:? {re.escape(says)}", str(told.value)), told.value
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("typo", f"ValueError: no such aid ({at('no such aid')})"),
+        ("", "aid gave Section, which lacks sensor, parts, states, blocks, measure"),
+    ],
+)
+def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says: str) -> None:
+    keys = {"sensors.radar.kind": "./radar.py:Aiding", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    with pytest.raises(UserError) as told:
+        run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": how}))
+    assert f"sensor radar: ./radar.py:Aiding: {'aid: ' if how else ''}{says}" in str(told.value)
