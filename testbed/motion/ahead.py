@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import multiprocessing
 import os
+import pickle
 import threading
 import traceback
 import warnings
@@ -122,6 +123,17 @@ def _fly(
         os._exit(0)  # without the parent's exit handlers, or its output buffers
 
 
+def _sendable(error: Exception) -> Exception:
+    """The same with where it was raised; what only this process can make, as JSBSim's own, as text."""
+    note = traceback.format_exc()
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        error = RuntimeError(f"{type(error).__name__}: {error}")
+    error.add_note(note)
+    return error
+
+
 def _share(make: Callable[[], MotionSource], shared: _Shared, ticks: int, blocks: Connection) -> None:
     """Share blocks and send (number, tick, rows, activity, failure) of each, until one is empty or nobody listens.
 
@@ -141,7 +153,6 @@ def _share(make: Callable[[], MotionSource], shared: _Shared, ticks: int, blocks
     except (BrokenPipeError, ConnectionResetError, EOFError):
         pass
     except Exception as error:
-        error.add_note(traceback.format_exc())
-        blocks.send(error)
+        blocks.send(_sendable(error))
     finally:
         os._exit(0)  # while the thread is there: what JSBSim does as one ends is no part of the flight

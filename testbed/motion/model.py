@@ -9,7 +9,8 @@ import struct
 import subprocess
 import sys
 from array import array
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import jsbsim
@@ -151,6 +152,19 @@ class Aircraft:
             raise UserError(f'{self._model}: has no property {name}: does it lack <system file="autopilot"/>?')
         return node
 
+    @contextmanager
+    def _flying(self) -> Iterator[None]:
+        """What JSBSim finds wrong with a model no sooner than as it flies is the user's to mend."""
+        try:
+            yield
+        except jsbsim.BaseError as error:
+            raise UserError(f"{self._model}: JSBSim can't fly it: {' '.join(str(error).split())}") from None
+
+    def _require_state(self) -> None:
+        if not all(map(math.isfinite, self.read())):
+            wrong = "does it lack lift, or are wing area, mass or inertia zero or below?"
+            raise UserError(f"{self._model}: can't be flown: its state is not finite at the start: {wrong}")
+
     def read(self) -> list[float]:
         """One row of `STATE`, in JSBSim's units."""
         return list(map(VALUE, self._nodes))
@@ -160,9 +174,10 @@ class Aircraft:
         run, nodes = self.fdm.run, self._nodes
         flown: list[float] = []
         read = flown.extend  # no list for each row, and packed all at once: every step of Python counts here
-        for _ in range(steps):
-            run()
-            read(map(VALUE, nodes))
+        with self._flying():
+            for _ in range(steps):
+                run()
+                read(map(VALUE, nodes))
         rows.frombytes(struct.pack(f"{len(flown)}d", *flown))
         return flown[-WIDTH:]
 
@@ -219,8 +234,13 @@ class Aircraft:
 
         Trim is found by flying: straight and level on the inner loops until everything is steady, engine speed and
         integrators too, which a static trim leaves out. Then attitude, airspeed and angle of attack found are put at
-        the start position and heading.
+        the start position and heading. Raises UserError of an aircraft that can't be flown.
         """
+        with self._flying():
+            self._start(start, wind)
+        self._require_state()
+
+    def _start(self, start: Start, wind: tuple[float, float]) -> None:
         fdm = self.fdm
         fuel = {name: fdm[name] for name in self._tanks}
         # JSBSim's engine start finds no steady state at high advance ratios, so the engine is started slowly.
@@ -243,8 +263,14 @@ class Aircraft:
     def stand(self, start: Start, launch: Launch, wind: tuple[float, float]) -> None:
         """Hold the aircraft still on its launcher, engine at idle, in a wind north, east [m/s].
 
-        The inner loops wait, and believe in the launch speed, so that they begin with it when it is let go.
+        The inner loops wait, and believe in the launch speed, so that they begin with it when it is let go. Raises
+        UserError of an aircraft that can't be flown.
         """
+        with self._flying():
+            self._stand(start, launch, wind)
+        self._require_state()
+
+    def _stand(self, start: Start, launch: Launch, wind: tuple[float, float]) -> None:
         fdm, place = self.fdm, (start.lat_deg, start.lon_deg, start.alt_m + launch.height_m)
         euler = (0.0, math.radians(launch.pitch_deg), math.radians(start.heading_deg))
         fdm["forces/hold-down"] = 1.0

@@ -87,6 +87,20 @@ def test_an_error_is_raised_where_the_rows_are_wanted(ahead):
     assert "in advance" in caught.value.__notes__[0]  # where it happened
 
 
+class Unsent(RuntimeError):
+    """As JSBSim's exceptions, which say that they are of a module that there is not."""
+
+
+Unsent.__module__ = "_no_such_module"
+
+
+def test_an_error_that_cannot_be_sent_comes_as_text(ahead):
+    source = ahead(Counting(last=10, error=Unsent("no axis type")))
+    with pytest.raises(RuntimeError, match="Unsent: no axis type") as caught:
+        source.advance(50)
+    assert "in advance" in caught.value.__notes__[0]
+
+
 def test_a_dead_process_is_noticed(ahead):
     source = ahead(Counting(), ticks=10**6)
     os.kill(source._process.pid, signal.SIGKILL)

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
+import shutil
 from array import array
+from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from testbed import Scenario, run
+from testbed.data import data_dir
+from testbed.errors import UserError
 from testbed.motion.aircraft import load
 from testbed.motion.flight import Flight
 from testbed.motion.legs import Leg
 from testbed.motion.model import FOOT, POUND, Aircraft
-from testbed.motion.modes import modes, modes_table
+from testbed.motion.modes import modes, modes_table, trim_and_modes
 from testbed.motion.sections import FlightTruth, Start
 
 LOITER = load("loiter")
@@ -293,3 +299,22 @@ def test_the_wing_flies_in_gusts(airspeed: float, gusts: str) -> None:
     assert np.std(flown.airspeed - airspeed) < 1.3
     assert np.degrees(np.abs(flown.omega_b).std(axis=0)).max() < 8.0
     assert np.abs(flown.controls[:, :3]).mean() < 0.3
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(("part", "instead", "says"), [
+    (r"<aerodynamics>.*</aerodynamics>", "", "JSBSim can't fly it: A proper axis type has NOT been selected"),
+    (r"(<wingarea[^>]*>)[^<]*", r"\1 0 ", "can't be flown: its state is not finite at the start"),
+    (r"(<ixx[^>]*>)[^<]*", r"\1 -1 ", "can't be flown: its state is not finite at the start"),
+])  # fmt: skip
+def test_an_aircraft_that_cannot_be_flown_is_named(tmp_path: Path, part: str, instead: str, says: str) -> None:
+    home = tmp_path / "broken"
+    shutil.copytree(data_dir("aircraft") / "loiter", home)
+    text = (home / "loiter.xml").read_text("utf-8")
+    (home / "loiter.xml").unlink()
+    (home / "broken.xml").write_text(re.sub(part, instead, text, count=1, flags=re.DOTALL), "utf-8")
+    with pytest.raises(UserError, match=re.escape(f"{home / 'broken.xml'}: {says}")):
+        trim_and_modes(str(home), 25.0, 300.0)
+    keys = {"truth.aircraft": str(home), "duration_s": 1, "expect": {}}
+    with pytest.raises(UserError, match=re.escape(f"{home / 'broken.xml'}: {says}")):
+        run(Scenario.load("u_turn", keys))
