@@ -5,6 +5,7 @@ Nothing heavy is imported before a command needs it, so that help and completion
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import re
@@ -66,6 +67,9 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point: a user's mistake ends with its message and exit code 2, never with a traceback."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal that is not UTF-8 lacks signs of ours
     try:
         with interrupts.heeded():
             app(_explicit(sys.argv[1:]))

@@ -107,6 +107,17 @@ def test_a_project_that_was_begun_passes_its_own_test(testbed: Testbed, tmp_path
     tests["test_mine_stays_near_an_ins"]()
 
 
+@pytest.mark.parametrize("said", [
+    {"PYTHONIOENCODING": "cp1252"},
+    {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
+])  # fmt: skip
+def test_a_terminal_that_is_not_utf8_lacks_signs_and_no_more(said: dict[str, str], tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "testbed", "init", "≤☃"]
+    ran = subprocess.run(words, env=os.environ | said, cwd=tmp_path, capture_output=True, timeout=60)
+    assert (ran.returncode, ran.stderr) == (0, b"")
+    assert (tmp_path / "≤☃/first.toml").is_file()
+
+
 def test_scenarios_lists_name_title_and_duration(testbed: Testbed) -> None:
     shown = testbed("scenarios")
     assert shown.code == 0
