@@ -46,18 +46,44 @@ def load(kind: str, folder: Path, group: str) -> Any:
 def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:
     """The module that ``kind`` names, and how; and the name of the class in it."""
     where, _, name = installed(group).get(kind, kind).rpartition(":")
+    wrong = _misnamed(where, name)
+    if wrong:
+        raise UserError(f"kind {shown(kind)}: {wrong}")
     try:
         module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
     except UserError:
         raise
     except ModuleNotFoundError as error:
         if error.name is not None and where.split(".")[0] != error.name.split(".")[0]:
-            raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}") from error
+            todo = _beside(folder / where, error.name) if where.endswith(".py") else ""
+            raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}{todo}") from error
         todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
         raise UserError(f"kind {shown(kind)}: there is no module {where}: {todo}") from None
     except (Exception, SystemExit) as error:
         raise UserError(f"kind {shown(kind)}: {where} can't be imported: {raised(error)}") from error
     return module, where, name
+
+
+def _misnamed(where: str, name: str) -> str:
+    """What is wrong with a name as such; empty when nothing is."""
+    if not where:
+        return 'names no module: give a file, such as "./filters.py:Mine", or an installed module'
+    if not name:
+        return f'names no class: give it as "{where}:Mine"'
+    if not where.endswith(".py") and ("/" in where or "\\" in where):
+        return f'is a path without .py: give it as "{where}.py:{name}"'
+    if where.startswith(".") and not where.endswith(".py"):
+        file = f"./{where.lstrip('.')}.py:{name}"
+        return f'has a dot in front: give the whole name of the module, or a file, such as "{file}"'
+    return ""
+
+
+def _beside(file: Path, missing: str) -> str:
+    """What to do about a module that a file imports, where that lies beside it; empty where it does not."""
+    beside = file.parent / missing.partition(".")[0]
+    if not (beside.is_dir() or beside.with_suffix(".py").is_file()):
+        return ""
+    return f": a file beside it is not found: install both as a package, or set PYTHONPATH={file.parent.resolve()}"
 
 
 def _file(path: Path) -> ModuleType:
