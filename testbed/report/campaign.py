@@ -68,6 +68,7 @@ OF_FAULTS: Mapping[str, str] = {
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})
 ERROR_AT, BOUND_AT = "outage_position_horizontal_at_{}s_m", "outage_bound_at_{}s_m"
 MEAN_ERROR = re.compile(r"(outage_)?(position|velocity)_(north|east|down)_mean_\w+")
+NARROW, LEGIBLE = 80, 12  # columns of a terminal, and of a name that is folded
 
 
 @dataclass(frozen=True, slots=True)
@@ -396,7 +397,10 @@ def _expected(result: CampaignResult, keys: Sequence[str]) -> Iterator[Text]:
 
 
 def tables(result: CampaignResult) -> list[Table]:
-    """The same for a console. Where it is narrow, names are folded and numbers are not."""
+    """The same for a console. Where it is narrow, names are folded and numbers are not, if that leaves names legible.
+
+    Else numbers are folded too, with their intervals below them.
+    """
     from rich import box
     from rich.markup import escape  # varied values and units may hold brackets
     from rich.table import Table
@@ -406,9 +410,22 @@ def tables(result: CampaignResult) -> list[Table]:
         table = Table(title=escape(text.title), box=box.SIMPLE, title_justify="left")
         head, *rows = text.rows
         grouped = any(not row[0] for row in rows)  # names stand in the first row of each group
+        widths = [max(map(len, column)) for column in zip(*text.rows, strict=True)]
+        parts = [
+            max(len(part) for cell in column for part in cell.split() or [""])
+            for column in zip(*text.rows, strict=True)
+        ]
+        least = [min(width, LEGIBLE) for width in widths[: text.words]]
+        folded = sum(least) + sum(widths[text.words :]) + 3 * len(head) > NARROW
         for k, name in enumerate(head):
             number = k >= text.words
-            table.add_column(escape(name), justify="right" if number else "left", no_wrap=number, overflow="fold")
+            table.add_column(
+                escape(name),
+                justify="right" if number else "left",
+                no_wrap=number and not folded,
+                overflow="fold",
+                min_width=parts[k] if number else least[k],
+            )
         for row, following in zip(rows, [*rows[1:], ["end"]][: len(rows)], strict=True):
             table.add_row(*map(escape, row), end_section=grouped and bool(following[0]))
         made.append(table)

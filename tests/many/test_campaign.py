@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import pytest
 from distributed import LocalCluster
+from rich.console import Console
 from scipy.stats import binomtest, chi2, ttest_1samp
 from typer.testing import CliRunner
 from worlds import browser, synthetic_run
@@ -749,6 +751,21 @@ def test_how_many_runs_keep_what_is_expected(tmp_path: Path) -> None:
     kept = json.loads((tmp_path / campaign_report.SUMMARY).read_text())["expected"]
     assert kept[1]["most"][2] is None
     assert "[expect] over the runs" in (tmp_path / REPORT).read_text("utf-8")
+
+
+def test_names_stay_legible_on_a_narrow_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wide = ("≤ 1.50e-05", "86.7 (69.3 to 96.2) %", "1.234e-05 (1.111e-05 to 1.999e-05)", "≤ 1.9e-05 (1.8e-05 to inf)")
+    rows = [["metric", "wind", "bound", "kept by", "median", "95 % of runs"], ["ins.nothing_of_the_kind", "5", *wide]]
+    monkeypatch.setattr(campaign_report, "texts", lambda result: [campaign_report.Text("[expect]", rows, 2)])
+    console = Console(width=80, file=io.StringIO())
+    (table,) = campaign_report.tables(made_up_campaign(tmp_path, ["0"]))
+    console.print(table)
+    lines = console.file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    first = lines[next(k for k, line in enumerate(lines) if "───" in line) + 1]
+    assert "ins.nothing_" in first
+    for part in " ".join(wide).split():
+        assert part in "\n".join(lines)
 
 
 def test_the_manual_has_a_section_for_each_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
