@@ -22,12 +22,16 @@ from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, M
 
 
 class External:
-    """Kind ``./external.py:External`` with the key ``command``, a list: the program and its arguments."""
+    """Kind ``./external.py:External`` with the key ``command``, a list: the program and its arguments.
+
+    Files in it are relative to the scenario, as the file in ``kind`` is.
+    """
 
     program = None
 
     def __init__(self, rig, command):
-        self.program = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        pipe = subprocess.PIPE
+        self.program = subprocess.Popen(command, cwd=rig.folder, stdin=pipe, stdout=pipe, text=True)
 
     def propagate(self, imu):
         rows = np.column_stack([imu.t, imu.dt, imu.dtheta, imu.dv]).tolist()
