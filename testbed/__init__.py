@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from testbed.errors import UserError
+
 if TYPE_CHECKING:
     from testbed.loop.loop import RunResult, run
     from testbed.many.campaign import CampaignResult, campaign
@@ -11,7 +13,17 @@ if TYPE_CHECKING:
     from testbed.scenario import Scenario
     from testbed.score.series import error_series
 
-__all__ = ["CampaignResult", "Checked", "RunResult", "Scenario", "campaign", "check", "error_series", "run"]
+__all__ = [
+    "CampaignResult",
+    "Checked",
+    "RunResult",
+    "Scenario",
+    "UserError",
+    "campaign",
+    "check",
+    "error_series",
+    "run",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -133,6 +133,12 @@ def test_version(testbed: Testbed) -> None:
     assert shown.out.split()[1][0].isdigit()
 
 
+def test_a_script_can_tell_its_mistakes_from_ours() -> None:
+    import testbed
+
+    assert testbed.UserError is UserError
+
+
 def test_start_up_imports_nothing_heavy() -> None:
     code = """
 import sys, testbed.__main__ as cli

@@ -226,7 +226,7 @@ def test_the_manual_lists_its_pages() -> None:
 def sections(section: type[Section] = Section) -> Iterator[type[Section]]:
     """All sections that a scenario may have; of those with others below them, these."""
     for below in section.__subclasses__():
-        known = vars(sys.modules[below.__module__]).get(below.__name__) is below  # not one of a test's
+        known = getattr(sys.modules.get(below.__module__), below.__name__, None) is below  # not one of a test's
         if known and re.match(r"testbed\.(motion|sensors|estimators|scenario)\b", below.__module__):
             yield from sections(below) if below.__subclasses__() else [below]
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -74,6 +75,13 @@ class RunResult:
     remarks: tuple[str, ...] = ()
     ended: Mapping[str, str] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """In a line, as the last of a notebook's cell is shown."""
+        parts = [repr(self.dataset.attrs.get("title")), f"{len(self.metrics)} metrics"]
+        parts += [f"in {self.path}"] if self.path else []
+        parts += [f"failure: {self.failure}"] if self.failure else []
+        return f"<RunResult {', '.join([*parts, *self.remarks])}>"
+
 
 def run(
     scenario: Scenario,
@@ -108,8 +116,8 @@ def run(
             ending.callback(far_end.close)
         scenario = located(scenario)
         seed = scenario.seed if seed is None else seed
-        if not 0 <= seed <= LARGEST_SEED:
-            raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}")
+        if not (isinstance(seed, Integral) and 0 <= seed <= LARGEST_SEED):
+            raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}, a whole number")
         shown = shown_estimator(_own(scenario, far_end), shown) if links or shown is not None else None
         setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
         own, helper = _own(scenario, far_end), None

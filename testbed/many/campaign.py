@@ -29,7 +29,7 @@ import numpy as np
 
 from nav.samples import Array
 from testbed.data import write_file
-from testbed.errors import UserError
+from testbed.errors import UserError, shown
 from testbed.many import pool, progress
 from testbed.many.draws import DRAW, require_draw
 from testbed.many.folder import claim, code, own, require_code, require_own_code, versions
@@ -131,6 +131,10 @@ class CampaignResult:
     failures: Sequence[Failure]
     statistics: Statistics
     draw: int = 0
+
+    def __repr__(self) -> str:
+        """In a line, as the last of a notebook's cell is shown."""
+        return f"<CampaignResult {len(self.outcomes)} runs, {len(self.failures)} failed, in {self.path}>"
 
     def frame(self) -> pandas.DataFrame:
         """One row for each run: the varied values, the seed and all metrics, NaN where a run has none of that name."""
@@ -290,6 +294,8 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
 def _combinations(plan: Plan) -> list[Combination]:
     """Every combination of varied values, each loaded and so checked. They differ in nothing else."""
     for key, listed in plan.vary.items():
+        if isinstance(listed, str):
+            raise UserError(f"--vary {key}: {shown(listed)} is one text: give a list of values, such as ['0', '5']")
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
         if not listed or len(set(listed)) < len(listed):

@@ -181,6 +181,7 @@ def test_links_show_the_estimator_that_was_asked_for() -> None:
     [
         ({"seed": -1}, [], "seed -1: must be from 0 to 9223372036854775807"),
         ({"seed": 2**63}, [], "seed 9223372036854775808: must be from 0"),
+        ({"seed": 1.5}, [], r"seed 1\.5: must be .*, a whole number"),
         ({"shown": "inz"}, [], "--estimator inz: the scenario has no such estimator: choose from ins"),
         ({}, ["estimator=[]", "expect={}"], r"no \[\[estimator\]\], so a link has nothing to show"),
         ({"out": Path("/proc/testbed")}, [], "can't be written"),
@@ -194,7 +195,10 @@ def test_a_refused_run_closes_its_links(options: dict[str, Any], overrides: list
 
 
 def test_the_largest_seed_flies() -> None:
-    assert run(Scenario.load("u_turn", ["duration_s=1"]), seed=2**63 - 1).dataset.attrs["seed"] == 2**63 - 1
+    flown = run(Scenario.load("u_turn", ["duration_s=1"]), seed=2**63 - 1)
+    assert flown.dataset.attrs["seed"] == 2**63 - 1
+    assert repr(flown).startswith("<RunResult 'A U-turn with all sensors healthy', ")
+    assert len(repr(flown).splitlines()) == 1
 
 
 def test_what_an_earlier_run_left_goes_when_the_next_one_starts(tmp_path: Path) -> None:

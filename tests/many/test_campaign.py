@@ -446,6 +446,7 @@ def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
     vary = {"sensors.gnss.rate_hz": ["1", "5"]}
     result = campaign(at_rest, 2, vary=vary, workers=threads, overrides=["duration_s=76"], out=str(tmp_path / "out"))
     frame, dataset = result.frame(), result.dataset()
+    assert repr(result) == f"<CampaignResult 4 runs, 0 failed, in {tmp_path / 'out'}>"
     assert list(frame["seed"]) == [11, 12, 11, 12]
     assert list(frame["sensors.gnss.rate_hz"]) == [1, 1, 5, 5]
     assert frame["ins.aligned_s"][3] == result.outcomes[3].metrics["ins.aligned_s"]
@@ -612,6 +613,7 @@ def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
         ({"sensors.gnss.rate_hz": []}, "each value once"),
         ({"sensors.gnss.rate_hz": ["5", "7"]}, "does not divide"),
         ({"sensors.gnss.speed": ["5"]}, "unknown key"),
+        ({"sensors.gnss.rate_hz": "1,5"}, '"1,5" is one text: give a list of values'),
     ],
 )
 def test_wrong_varied_values(at_rest: Path, tmp_path: Path, vary: dict[str, list[str]], message: str) -> None:
