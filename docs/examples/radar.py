@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
 from pydantic import Field
 
+from nav.aids.base import Measurement
+from nav.error_model import POS
 from testbed.noise import Process, stream
 from testbed.sensors.timing import AidingTiming, Schedule
 
@@ -14,6 +17,26 @@ class RadarSample:
     t_arrival: float
     height: float = field(metadata={"unit": "m", "meaning": "measured height above ground"})
     sensor: str = "radar"
+
+
+@dataclass(frozen=True)
+class RadarAid:
+    """What a filter is told of it: one measurement, of one axis, without error states of its own."""
+
+    sensor: str
+    sigma: float
+
+    parts = (("radar", 1),)
+    states = ()
+
+    def blocks(self):
+        return []
+
+    def measure(self, part, sample, at):
+        nu = np.array([sample.height - at.state.lla[2]])  # measured - predicted
+        H = np.zeros((1, len(at.x)))  # by the error states: position error is north, east, down
+        H[0, POS + 2] = -1.0
+        return Measurement(nu, H, np.array([self.sigma**2]))
 
 
 class Radar:
@@ -37,3 +60,7 @@ class Radar:
             for k, error in zip(rows, noise, strict=True)
             if truth.h[k] <= self.ceiling
         ]
+
+    @staticmethod
+    def aid(name, section, imu):
+        return RadarAid(name, section.noise_m)

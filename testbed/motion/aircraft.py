@@ -208,7 +208,9 @@ def load(name_or_path: str) -> Envelope:
     model, file = home / f"{home.name}.xml", home / "envelope.toml"
     for needed, what in ((model, "what JSBSim flies"), (file, "what guidance and filters must know")):
         if not needed.is_file():
-            raise UserError(f"{needed}: is missing: an aircraft's folder has {what} in it")
+            other = next((path.name for path in sorted(home.glob("*.xml")) if needed is model), None)
+            todo = f"; rename {other}, as it has the name of its folder" if other else ""
+            raise UserError(f"{needed}: is missing: an aircraft's folder has {what} in it{todo}")
     try:
         return Envelope.model_validate(tomllib.loads(file.read_text("utf-8")), strict=True)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

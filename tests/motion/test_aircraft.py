@@ -301,6 +301,12 @@ def test_the_wing_flies_in_gusts(airspeed: float, gusts: str) -> None:
     assert np.abs(flown.controls[:, :3]).mean() < 0.3
 
 
+def test_a_copy_whose_model_was_not_renamed_is_told_so(tmp_path: Path) -> None:
+    shutil.copytree(data_dir("aircraft") / "loiter", tmp_path / "mine")
+    with pytest.raises(UserError, match=r"mine\.xml: is missing: .*; rename loiter\.xml"):
+        load(str(tmp_path / "mine"))
+
+
 @pytest.mark.ci
 @pytest.mark.parametrize(("part", "instead", "says"), [
     (r"<aerodynamics>.*</aerodynamics>", "", "JSBSim can't fly it: A proper axis type has NOT been selected"),

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -200,3 +201,18 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": how}))
     assert f"sensor radar: ./radar.py:Aiding: {'aid: ' if how else ''}{says}" in str(told.value)
+
+
+@pytest.mark.ci
+def test_the_example_of_the_manual_aids_a_filter(scenario: Path, tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parents[2] / "docs/examples/radar.py", tmp_path)
+    shutil.copy(scenario, tmp_path)
+    aids = ["gnss", "magnetometer", "airspeed"]
+    keys = {"duration_s": 40, "sensors.radar.noise_m": 0.1}
+    without, beside = (
+        run(Scenario.load(tmp_path / "own.toml", {**keys, "estimator[0].aids": given})).dataset["estimators/ins"]
+        for given in (aids, [*aids, "radar"])
+    )
+    assert (beside["innovations/radar"]["outcome"] == 0).mean() > 0.98
+    sigma = [float(np.sqrt(one["covariance"].values[-1, 2, 2])) for one in (without, beside)]  # of height
+    assert sigma[1] < 0.5 * sigma[0]
