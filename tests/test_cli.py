@@ -329,6 +329,18 @@ def test_a_record_is_run_again(testbed: Testbed, tmp_path: Path) -> None:
     assert record.load(tmp_path / "third/run.nc").identical(other)
 
 
+@pytest.mark.ci
+def test_a_record_of_a_class_that_was_edited_is_run_again_with_a_remark(testbed: Testbed, tmp_path: Path) -> None:
+    assert testbed("init", "mine").code == 0
+    assert testbed("run", "mine/first.toml", *QUICK, "--out", "first").code == 0
+    assert "bits may differ" not in testbed("run", "first/run.nc", "--no-report", "--out", "second").err
+    file = tmp_path / "mine/filters.py"
+    file.write_text(file.read_text("utf-8") + "\nMORE = 1\n", "utf-8")
+    ended = testbed("run", "first/run.nc", "--no-report", "--out", "third")
+    assert ended.code == 0, ended.err
+    assert "first/run.nc: ./filters.py:Mine has been edited since: bits may differ" in ended.err
+
+
 def _spoilt(folder: Path, **attributes: str) -> Path:
     """A record some of whose attributes are not what a run writes."""
     import h5py

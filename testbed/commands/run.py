@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -166,6 +166,7 @@ def _again(run_file: Path, overrides: Sequence[str], anew: bool) -> _Flight:
     said = dataset.attrs
     try:
         versions, seed = [*json.loads(said["versions"]).items()], int(said["seed"])
+        own_code = dict(json.loads(said.get("own_code", "{}")))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run_file}: damaged record ({error}); run the scenario again") from None
     try:
@@ -176,6 +177,9 @@ def _again(run_file: Path, overrides: Sequence[str], anew: bool) -> _Flight:
     other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
     if other:
         remark(f"{run_file}: was made with {', '.join(other)}: bits may differ")
+    edited = _edited(scenario, own_code)
+    if edited:
+        remark(f"{run_file}: {edited} has been edited since: bits may differ")
     if said["format"] == format1.FORMAT:
         remark(f"{run_file}: is of format {said['format']!r}: {format1.CHANGED}")
     if not said["complete"]:
@@ -183,6 +187,12 @@ def _again(run_file: Path, overrides: Sequence[str], anew: bool) -> _Flight:
         remark(f"{run_file}: ends early; the rerun {ends}")
     name = run_file.resolve().parent.name if run_file.name == RECORD else run_file.stem
     return _Flight(scenario, RUNS / f"{name}_again", seed, director.recorded(dataset, scenario), flown)
+
+
+def _edited(scenario: Scenario, own_code: Mapping[str, str]) -> str:
+    """The kinds of the user's that are not of the code that a record was made with."""
+    now = {kind: code for own in scenario.own().values() for kind, code in own.items()}
+    return ", ".join(kind for kind, code in own_code.items() if now.get(kind, code) != code)
 
 
 def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) -> None:

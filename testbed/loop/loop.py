@@ -6,6 +6,7 @@ Data goes one way; what is heard from downstream are requests (`testbed.loop.req
 from __future__ import annotations
 
 import gc
+import json
 import math
 import time
 from collections import deque
@@ -161,6 +162,14 @@ def _leaves_to_compile(scenario: Scenario, setup: Setup) -> bool:
     return ours and open_loop and Ahead.possible() and not registry.is_kept(scenario.estimator)
 
 
+def _own_code(scenario: Scenario) -> dict[str, str]:
+    """What a record says of the code of the user's classes; nothing where there are none, or they have been edited."""
+    with suppress(UserError):
+        digests = {kind: code for own in scenario.own().values() for kind, code in own.items()}
+        return {"own_code": json.dumps(digests)} if digests else {}
+    return {}
+
+
 def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], setup: Setup) -> None:
     """Fly the beginning of a scenario with some of its estimators, and keep nothing."""
     beginning = {"duration_s": min(REHEARSAL_S, scenario.duration_s), "estimator": tuple(estimators)}
@@ -250,7 +259,7 @@ class _Passage:
         self.recorder = Recorder(setup.out / RECORD if setup.out else None, scenario, setup.seed)
         ending.callback(self.recorder.close)
         self.told = Listeners(setup.links, setup.progress, scenario.duration_s, self.recorder.event)
-        self.recorder.attributes |= self.feed.origin
+        self.recorder.attributes |= self.feed.origin | _own_code(scenario)
         self.watch = EventWatch.of(self._emit, self.feed.faults.truth, scenario)
         self.leg_names = scenario.leg_names
         plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)

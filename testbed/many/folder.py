@@ -12,12 +12,9 @@ from typing import Any
 
 import nav
 import testbed
-from testbed import plugins
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
-from testbed.estimators import custom
 from testbed.scenario import Scenario
-from testbed.sensors import registry as sensors
 
 SETUP = "setup.json"
 PRESENTATION = ("report", "mavlink")  # rooms that change no number
@@ -48,17 +45,10 @@ def require_code(begun_with: str) -> None:
 
 def own(scenarios: Sequence[Scenario]) -> dict[str, dict[str, str]]:
     """Digests of the user's classes in these scenarios, by kind. Raises UserError where one can't be had."""
-    estimators: dict[str, str] = {}
-    sensing: dict[str, str] = {}
-    for one in scenarios:
-        folder = one.path.parent if one.path else Path()
-        for section in one.estimator:
-            if isinstance(section, custom.CustomSection):
-                estimators[section.kind] = plugins.digest(section.kind, folder, custom.GROUP)
-        for sensor in one.sensors.values():
-            if sensor.kind not in sensors.BUILT_IN:
-                sensing[sensor.kind] = plugins.digest(sensor.kind, folder, sensors.GROUP)
-    return {"estimators": estimators, "sensors": sensing}
+    each = [one.own() for one in scenarios]
+    return {
+        what: {kind: code for one in each for kind, code in one[what].items()} for what in ("estimators", "sensors")
+    }
 
 
 def require_own_code(begun_with: Mapping[str, Mapping[str, str]], scenario: Scenario) -> None:

@@ -28,9 +28,10 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from testbed import plugins
 from testbed.data import data_dir
 from testbed.errors import UserError, shown
-from testbed.estimators import registry
+from testbed.estimators import custom, registry
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import DEFAULT_ESTIMATOR, EstimatorSection
 from testbed.motion import aircraft, legs, terrain
@@ -261,6 +262,16 @@ class Scenario(Section):
             case KinematicTruth():
                 return tuple(segment.leg for segment in self.truth.segments)
         return ()
+
+    def own(self) -> dict[str, dict[str, str]]:
+        """Digests of the code of the user's classes, by kind. Raises UserError where one can't be had as it is now."""
+        folder = self._path.parent if self._path else Path()
+        estimators = [one.kind for one in self.estimator if isinstance(one, custom.CustomSection)]
+        sensors: list[str] = [one.kind for one in self.sensors.values() if one.kind not in sensor_registry.BUILT_IN]
+        return {
+            "estimators": {kind: plugins.digest(kind, folder, custom.GROUP) for kind in estimators},
+            "sensors": {kind: plugins.digest(kind, folder, sensor_registry.GROUP) for kind in sensors},
+        }
 
     def site(self) -> Site:
         """Where and when the run starts. Raises UserError of a log that nobody has looked up yet."""
