@@ -145,15 +145,11 @@ def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, 
         raise UserError(f"{path}: has no inertial data: needed are {needed}; it has {there}")
 
 
-def require_one_clock(
-    path: Path, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None
-) -> None:
+def require_one_clock(path: Path, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> None:
     """Raise UserError when what a table has of a sensor was never heard while its first inertial unit was."""
     spans = {name: (float(imu.t[0]), float(imu.t[-1])) for name, imu in imus.items() if len(imu)}
     unit = next(iter(spans))
     spans |= {name: (own[0].t, own[-1].t) for name, own in samples.items() if own}
-    if reference is not None and len(reference.t):
-        spans["reference"] = (float(reference.t[0]), float(reference.t[-1]))
     begins, ends = spans[unit]
     apart = [name for name, (first, last) in spans.items() if first > ends or last < begins]
     if apart:

@@ -156,8 +156,8 @@ class CampaignResult:
             for name, why in one.ended.items():
                 seeds.setdefault((one.combination, name, why), []).append(one.seed)
         told = []
-        for (combination, name, why), own in seeds.items():
-            which = f"seed {own[0]}" if len(own) == 1 else f"{len(own)} runs, the first of seed {own[0]}"
+        for (combination, name, why), runs in seeds.items():
+            which = f"seed {runs[0]}" if len(runs) == 1 else f"{len(runs)} runs, the first of seed {runs[0]}"
             told.append(f"{self.combinations[combination]} {name} has ended in {which}: {why}".strip())
         return told
 

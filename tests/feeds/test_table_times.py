@@ -42,14 +42,12 @@ def read(made: Mapping[str, Any], folder: Path, changes: Mapping[str, Any] | Non
     return formats.read(folder / "a.npz", truth.columns)
 
 
-@pytest.mark.parametrize(
-    ("times", "apart"), [(["t"], "gnss, reference"), (["gt"], "gnss"), (["rt"], "reference"), (["gt", "rt"], "gnss")]
-)
-def test_sensors_of_clocks_that_differ_are_named_with_their_times(times: list[str], apart: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [["t"], ["gt"], ["gt", "rt"]])
+def test_sensors_of_clocks_that_differ_are_named_with_their_times(times: list[str], tmp_path: Path) -> None:
     made = table()
     for name in times:
         made[name] = made[name] + 1.7e9
-    with pytest.raises(UserError, match=f"no time in common with imu has {apart}") as caught:
+    with pytest.raises(UserError, match=r"no time in common with imu has gnss \(") as caught:
         read(made, tmp_path)
     assert "to 1700000060 s" in str(caught.value)
     assert "offset" in str(caught.value)

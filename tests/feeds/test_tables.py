@@ -40,7 +40,7 @@ def standing() -> dict[str, Any]:
     once = np.ones(len(t))
     return {
         "t": t, "w": np.zeros((len(t), 3)), "f": np.tile(force, (len(t), 1)),
-        "lat": 47 * once, "lon": 8 * once, "h": 500 * once, "v": np.zeros((len(t), 3)),
+        "lat": 47 + 1e-12 * t, "lon": 8 * once, "h": 500 * once, "v": np.zeros((len(t), 3)),
         "angles": np.tile(LYING, (len(t), 1)), "q": np.tile(quat_from_euler(*LYING), (len(t), 1)),
     }  # fmt: skip
 
