@@ -20,7 +20,7 @@ import numpy.typing as npt
 from nav._jit import inlined, njit
 from nav.aids import MagnetometerAid
 from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, airspeed, is_slow, sideslip, widened
-from nav.aids.barometer import PRESSURE_LIMITS, barometer
+from nav.aids.barometer import PRESSURE_LIMITS, barometer, thinness
 from nav.aids.base import Kind, PlainAid, well_within
 from nav.aids.gnss import gnss_position, gnss_velocity, is_whole, white
 from nav.aids.magnetometer import FIELD_LIMITS, magnetometer
@@ -450,7 +450,7 @@ def _measure(
     """
     if kind[0] == Kind.BAROMETER:
         nu, H = barometer(lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))
-        return True, nu, H, told[:1]
+        return True, nu, H, told[:1] * thinness(numbers[0]) ** 2
     if kind[0] == Kind.MAGNETOMETER:
         nu, H = magnetometer(q_nb, x, kind[2], kind[4], kind[3], kind[5], field[3:], numbers[:3])
         return is_near(lla, field), nu, H, told[:3]

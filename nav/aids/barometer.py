@@ -12,7 +12,7 @@ import numpy as np
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.claims import Following
-from nav.earth import pressure_altitude
+from nav.earth import PRESSURE_EXPONENT, SEA_LEVEL_PRESSURE, TROPOPAUSE_PRESSURE, pressure_altitude
 from nav.error_model import POS, Block, markov
 from nav.samples import Array, BarometerSample, Sample
 
@@ -26,10 +26,13 @@ PRESSURE_LIMITS = (1_000.0, 120_000.0)  # what an instrument could possibly repo
 class BarometerAid:
     """Pressure altitude with a walking bias, weather and geoid before the first GNSS height tells, and the airframe's
     wake, a first-order Markov error. With ``follow_s`` that is claimed to be less as long as it is (`nav.claims`).
+
+    Its noise is one of pressure, and as many more metres high up as air is thinner there (`thinness`). Bias and wake
+    are told as they are where it flies.
     """
 
     sensor: str = "barometer"
-    sigma: float = 0.5  # [m]
+    sigma: float = 0.5  # at sea level [m]
     bias_sigma: float = 300.0  # [m]
     bias_walk: float = 0.03  # [m/sqrt(s)]
     error_sigma: float = 0.0  # of the wake [m]
@@ -76,7 +79,7 @@ class BarometerAid:
         assert isinstance(sample, BarometerSample)
         bias, error = at.starts
         nu, H = barometer(at.state.lla, at.x, bias, error, pressure_altitude(sample.pressure))
-        return Measurement(nu, H, self._R)
+        return Measurement(nu, H, self._R * thinness(sample.pressure) ** 2)
 
 
 @dataclass
@@ -112,6 +115,17 @@ class Scatter:
 def problem(sample: BarometerSample) -> str:
     """See `nav.aids.problem`."""
     return range_problem("pressure", sample.pressure, PRESSURE_LIMITS)
+
+
+@njit
+def thinness(pressure: float) -> float:
+    """How many more metres a pascal is worth at a ``pressure`` p [Pa] than at sea level.
+
+    By the density of the standard atmosphere, rho_0 / rho = (p_0 / p) (T / T_0) with T / T_0 = (p / p_0)^(1 / 5.256) up
+    to the tropopause. Gravity, 0.3 % less at 10 km, is left out.
+    """
+    warmth = (max(pressure, TROPOPAUSE_PRESSURE) / SEA_LEVEL_PRESSURE) ** (1 / PRESSURE_EXPONENT)
+    return SEA_LEVEL_PRESSURE / pressure * warmth
 
 
 @njit

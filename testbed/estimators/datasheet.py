@@ -193,14 +193,20 @@ def _barometer(name: str, section: BarometerConfig) -> Aid:
 
 
 def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
-    """A magnetometer, with soft iron as states, or, of one that is doubted, as an anomaly."""
+    """A magnetometer, with soft iron as states, or, of one that is doubted, as an anomaly.
+
+    What the throttle changes of the field by the motor's current is neither: an error that comes and goes.
+    """
     m = section.errors()
     bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
+    motor = m.current * usual.current_change_a
     if not m.doubt:
-        return MagnetometerAid(name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron)
+        return MagnetometerAid(
+            name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron, error_sigma=motor
+        )  # fmt: skip
     iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
     return MagnetometerAid(
-        name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=iron, doubt=m.doubt,
+        name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=math.hypot(iron, motor), doubt=m.doubt,
         follow_s=section.follow_s,
     )  # fmt: skip
 

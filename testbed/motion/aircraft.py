@@ -71,13 +71,15 @@ class DescentFit(Section):
 class Usual(Section):
     """How it usually flies, which is all that a filter is told: how far scale errors, gusts and wiring count.
 
-    ``load_change_g`` is the change of load factor from one manoeuvre to the next.
+    ``load_change_g`` is the change of load factor from one manoeuvre to the next, ``current_change_a`` that of the
+    current with the throttle, 1 sigma.
     """
 
     airspeed_mps: float = Field(gt=0, le=100)
     turn_rate_radps: float = Field(gt=0, le=6)
     load_change_g: float = Field(gt=0, le=10)
     current_a: float = Field(ge=0, le=1000)
+    current_change_a: float = Field(default=0.0, ge=0, le=1000)
 
 
 UNKNOWN_BODY = Usual(airspeed_mps=25.0, turn_rate_radps=0.06, load_change_g=0.1, current_a=2.0)  # a small vehicle

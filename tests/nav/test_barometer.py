@@ -7,7 +7,7 @@ import pytest
 from worlds.ins import CONSUMER, FIELD_N, feed, flight, gnss, imu, magnetometer
 
 from nav.aids import BarometerAid, GnssAid, MagnetometerAid
-from nav.aids.barometer import Scatter
+from nav.aids.barometer import Scatter, thinness
 from nav.earth import isa_pressure
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
@@ -20,6 +20,14 @@ INSTALLED = BarometerAid(sigma=0.25, bias_walk=0.05, error_sigma=WAKE, error_cor
 
 def heard(t, h):
     return BarometerSample(t, t, isa_pressure(h))
+
+
+@pytest.mark.parametrize(
+    ("pressure", "density"), [(101325.0, 1.2250), (54048.0, 0.73643), (26500.0, 0.41351), (12112.0, 0.19476)]
+)
+def test_a_pascal_is_worth_more_metres_high_up(pressure, density):
+    """By the tables of the U.S. Standard Atmosphere 1976 at 0, 5, 10 and 15 km."""
+    assert thinness(pressure) == pytest.approx(1.2250 / density, rel=1e-3)
 
 
 @pytest.mark.parametrize("noise", [0.1, 2.0])
