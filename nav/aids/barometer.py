@@ -124,7 +124,7 @@ def thinness(pressure: float) -> float:
     By the density of the standard atmosphere, rho_0 / rho = (p_0 / p) (T / T_0) with T / T_0 = (p / p_0)^(1 / 5.256) up
     to the tropopause. Gravity, 0.3 % less at 10 km, is left out.
     """
-    warmth = (max(pressure, TROPOPAUSE_PRESSURE) / SEA_LEVEL_PRESSURE) ** (1 / PRESSURE_EXPONENT)
+    warmth: float = (max(pressure, TROPOPAUSE_PRESSURE) / SEA_LEVEL_PRESSURE) ** (1 / PRESSURE_EXPONENT)
     return SEA_LEVEL_PRESSURE / pressure * warmth
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -228,10 +228,9 @@ def _in_it_already(scenario: Scenario, log: Log) -> list[str]:
     return told
 
 
-def _losses(log: Log, names: Iterable[str]) -> list[str]:
+def _losses(log: Log, streams: Collection[str]) -> list[str]:
     """What is told of rows that were left out of streams that a run makes use of, where they are many."""
-    used = tuple(f"{name}: " for name in names)
-    return [note for note in log.notes if isinstance(note, Loss) and note.startswith(used)]
+    return [note for note in log.notes if isinstance(note, Loss) and note.stream in streams]
 
 
 def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:

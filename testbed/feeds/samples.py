@@ -78,8 +78,8 @@ def newly(
     if np.median(np.diff(first, append=len(t))) < 2:
         return t, dict(values)
     held = len(t) - len(first)
-    told = f"{name}: {held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
-    notes.append(left_out(told, held, len(t)))
+    told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
+    notes.append(left_out(name, told, held, len(t)))
     return t[first], {key: one[first] for key, one in values.items()}
 
 
@@ -93,7 +93,7 @@ def magnetometers(name: str, t: Array, field_b: Array, notes: list[str]) -> list
     there = field_b.any(axis=1)
     if not there.all():
         said = f"{np.sum(~there)} samples have no field at all" if there.any() else "it never has a field"
-        notes.append(left_out(f"{name}: {said}: left out", int(np.sum(~there)), len(t)))
+        notes.append(left_out(name, f"{said}: left out", int(np.sum(~there)), len(t)))
     rows = np.flatnonzero(there)
     return [MagnetometerSample(s, s, field_b[k].copy(), name) for k, s in zip(rows, t[rows].tolist(), strict=True)]
 

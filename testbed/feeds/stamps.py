@@ -34,14 +34,19 @@ CLOCK_OFF, CLOCK_ALIKE, CLOCK_S = 0.005, 0.2, 30.0
 
 
 class Loss(str):
-    """A note of rows that are left out: more than `MUCH` of a stream."""
+    """A note of rows that are left out: more than `MUCH` of a ``stream``."""
 
-    __slots__ = ()
+    stream: str
 
 
-def left_out(text: str, lost: int, rows: int) -> str:
-    """A note of ``lost`` of some ``rows`` that are left out."""
-    return Loss(text) if lost > MUCH * rows else text
+def left_out(stream: str, text: str, lost: int, rows: int) -> str:
+    """A note of ``lost`` of a stream's ``rows`` that are left out."""
+    note = f"{stream}: {text}"
+    if lost <= MUCH * rows:
+        return note
+    loss = Loss(note)
+    loss.stream = stream
+    return loss
 
 
 def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, Rows]:
@@ -56,7 +61,7 @@ def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, 
         nonlocal t, rows
         lost = int(np.sum(~kept))
         if lost:
-            notes.append(left_out(f"{name}: {lost} {why}", lost, len(kept)))
+            notes.append(left_out(name, f"{lost} {why}", lost, len(kept)))
             t, rows = t[kept], rows[kept]
 
     keep(np.isfinite(t), "times are no numbers, and left out")
@@ -149,8 +154,8 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     longest = max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
     part = slice(edges[longest], edges[longest + 1])
     left = len(t) - (part.stop - part.start)
-    told = f"{name}: time goes back {len(begins)} times: the longest part is kept, {left} rows are left out"
-    notes.append(left_out(told, left, len(t)))
+    told = f"time goes back {len(begins)} times: the longest part is kept, {left} rows are left out"
+    notes.append(left_out(name, told, left, len(t)))
     return t[part], rows[part]
 
 
@@ -248,7 +253,7 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     """
     unknown = int(np.sum(~np.isfinite(np.hstack([imu.dtheta, imu.dv])).all(axis=1)))
     if unknown:
-        notes.append(left_out(f"{name}: increments of {unknown} rows are no numbers, and unknown", unknown, len(imu)))
+        notes.append(left_out(name, f"increments of {unknown} rows are no numbers, and unknown", unknown, len(imu)))
     if len(imu) < 2:
         return imu
     period = _period(imu.dt)
@@ -261,11 +266,9 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     if not len(rows):
         return imu
     long = missing > GAP_PERIODS * period
-    lost = (
-        f"{name}: rows are missing in {len(rows)} places, {missing.sum():.3g} s in all: increments are unknown where "
-    )
-    lost += f"they are more than {GAP_PERIODS:g}, {long.sum()} times, and as those about them elsewhere"
-    notes.append(left_out(lost, round(float(missing.sum()) / period), len(imu)))
+    lost = f"rows are missing in {len(rows)} places, {missing.sum():.3g} s in all: increments are unknown where they "
+    lost += f"are more than {GAP_PERIODS:g}, {long.sum()} times, and as those about them elsewhere"
+    notes.append(left_out(name, lost, round(float(missing.sum()) / period), len(imu)))
     dt = imu.dt.copy()
     dt[rows] -= missing
     rates = [imu.dtheta / dt[:, None], imu.dv / dt[:, None]]
