@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from worlds.lanes import lanes
 
-from nav.aids import AirspeedAid, GnssAid
+from nav.aids import AirspeedAid, GnssAid, MagnetometerAid
 from nav.detection import Eraim, Glr, Mean, Reset, Sprt, WindowMean, exponential, plain
 from nav.earth import position_difference_n
 from nav.error_model import CROSS
@@ -410,3 +410,24 @@ def test_a_federation_in_a_run() -> None:
         "gnss_position", "gnss_velocity", "airspeed", "sideslip", "barometer", "magnetometer",
     }  # fmt: skip
     assert "wind" in result.dataset["estimators/fed"]
+
+
+def test_what_a_barometer_is_told_is_right_high_up() -> None:
+    """Its noise is one of pressure: of a pascal high up there are three times as many metres."""
+    metrics = run(Scenario.load("kinematic_u_flight", ["truth.start.alt_m=9000", "expect={}"])).metrics
+    assert 0.7 < metrics["ins.nis_mean.barometer"] < 1.4
+    assert metrics["ins.rejected_fraction.barometer"] < 0.01
+
+
+def test_a_compass_is_told_what_the_throttle_changes_of_a_motors_field() -> None:
+    for aircraft, change_a in (("flying_wing", 3.1), ("loiter", 0.0)):
+        told = [
+            f"truth.aircraft={aircraft}",
+            "truth.start.airspeed_mps=20",
+            "expect={}",
+            "sensors.magnetometer.current_ut_per_a=0.2",
+        ]
+        ins = lanes(Scenario.load("u_turn", told), 0)["ins"].horizon.estimator
+        assert isinstance(ins, Ins)
+        (compass,) = [one for one in ins.config.aids if isinstance(one, MagnetometerAid)]
+        assert compass.error_sigma == pytest.approx(0.2e-6 * change_a)
