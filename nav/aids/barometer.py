@@ -27,8 +27,8 @@ class BarometerAid:
     """Pressure altitude with a walking bias, weather and geoid before the first GNSS height tells, and the airframe's
     wake, a first-order Markov error. With ``follow_s`` that is claimed to be less as long as it is (`nav.claims`).
 
-    Its noise is one of pressure, and as many more metres high up as air is thinner there (`thinness`). The walk of the bias
-    and the wake are metres whatever the height.
+    Its noise is one of pressure, and as many more metres high up as air is thinner there (`thinness`). The walk of the
+    bias and the wake are metres whatever the height.
     """
 
     sensor: str = "barometer"
