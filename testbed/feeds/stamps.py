@@ -49,10 +49,13 @@ def left_out(stream: str, text: str, lost: int, rows: int) -> str:
     return loss
 
 
-def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, Rows]:
+def ordered(
+    name: str, stamps: npt.ArrayLike, notes: list[str], heard: tuple[float, float] | None = None
+) -> tuple[Array, Rows]:
     """Ascending times [s] of the stamps (N,) of a stream, and the rows that they belong to; what was odd to ``notes``.
 
-    ``notes`` gets a sentence for each kind of thing, beginning with the stream's ``name``.
+    ``notes`` gets a sentence for each kind of thing, beginning with the stream's ``name``. No silence in the time for
+    which another stream was ``heard`` [s], on the same clock, is too long.
     """
     t = np.array(stamps, float)
     rows: Rows = np.arange(len(t))
@@ -74,7 +77,8 @@ def ordered(name: str, stamps: npt.ArrayLike, notes: list[str]) -> tuple[Array, 
         notes.append(f"{name}: {moved} times are out of order, and put in order")
     t, rows = t[order], rows[order]
     keep(np.diff(t, prepend=-np.inf) > 0, "times come again, and are left out")
-    keep(_of_one_clock(t), f"times are {LONGEST_GAP_S:g} s and more from all others, a clock that was set: left out")
+    set_on = f"times are {LONGEST_GAP_S:g} s and more from all others, a clock that was set: left out"
+    keep(_of_one_clock(t, heard), set_on)
     _note_gaps(name, t, notes)
     return t, rows
 
@@ -159,8 +163,11 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     return t[part], rows[part]
 
 
-def _of_one_clock(t: Array) -> Mask:
-    """Which of ascending times (N,) are left where gaps are none: longer than `LONGEST_GAP_S` and than all else."""
+def _of_one_clock(t: Array, heard: tuple[float, float] | None) -> Mask:
+    """Which of ascending times (N,) are left where gaps are none: longer than `LONGEST_GAP_S` and than all else.
+
+    Where both what is before one and what is after it is of a time for which another stream was ``heard``, it is one.
+    """
     first, stop = 0, len(t)
     while stop - first > 1:
         steps = np.diff(t[first:stop])
@@ -168,6 +175,8 @@ def _of_one_clock(t: Array) -> Mask:
         if steps[worst] <= max(LONGEST_GAP_S, float(t[stop - 1] - t[first]) / 2):
             break
         cut = first + worst + 1
+        if heard and heard[0] - LONGEST_GAP_S <= t[cut - 1] and t[cut] <= heard[1] + LONGEST_GAP_S:
+            break
         first, stop = (first, cut) if cut - first > stop - cut else (cut, stop)
     kept: Mask = np.zeros(len(t), bool)
     kept[first:stop] = True

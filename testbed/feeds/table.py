@@ -102,7 +102,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     # Inertial units first: what is held on at their times is known by them.
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
-        t, values = _stream(table, name, kind, stream, notes)
+        heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
+        t, values = _stream(table, name, kind, stream, heard, notes)
         if kind == "imu":
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
@@ -231,9 +232,12 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def _stream(
-    table: Table, name: str, kind: str, stream: Stream, notes: list[str]
-) -> tuple[Array, dict[str, Array]]:  # fmt: skip
-    """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs."""
+    table: Table, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None, notes: list[str]
+) -> tuple[Array, dict[str, Array]]:
+    """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs.
+
+    ``heard`` is when the inertial unit was, as of `ordered`.
+    """
     where = f"truth.columns.{name}"
     if kind not in NEEDED:
         raise UserError(f"{where}: {unknown('kind', kind, list(NEEDED))}")
@@ -253,7 +257,7 @@ def _stream(
     blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
     apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]
-    t, kept = ordered(name, apart, notes)
+    t, kept = ordered(name, apart, notes, heard)
     return t, {key: array[rows[kept]] for key, array in values.items()}
 
 
