@@ -28,6 +28,7 @@ MUCH = 0.01  # of a stream's rows: who runs the log is told when more are left o
 EDGE_S = 1e-6  # times closer than this are one
 GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
 PIECE = 1.5  # usual increments: the longest that there may be
+ABOUT, SLOWER = 51, 1.2  # rows about one that tell what is usual there, where that is so much longer than elsewhere
 # A clock that is off by more than any quartz is by temperature runs by a wrong frequency. By how much must be alike in
 # half of what is seen, over as long as jitter of 0.1 s is small beside it.
 CLOCK_OFF, CLOCK_ALIKE, CLOCK_S = 0.005, 0.2, 30.0
@@ -119,10 +120,14 @@ def _astray(t: Array) -> Mask:
 
 
 def _wrap(before: float, after: float, usual: float) -> float:
-    """After how long [s] the counter began anew that stands just below that first and just above zero then, or 0."""
+    """After how long [s] the counter began anew that stands just below that first and just above zero then, or 0.
+
+    Or that comes back by so long from anywhere: times may have been moved, as to begin at zero.
+    """
     for wrap in WRAPS:
         near = max(WRAP_SHARE * wrap, _gap(usual))
-        if wrap - near < before <= wrap + EDGE_S and 0 <= after < near:
+        begins_anew = wrap - near < before <= wrap + EDGE_S and 0 <= after < near
+        if begins_anew or abs(before - after - wrap) < WRAP_SHARE * wrap:
             return wrap
     return 0.0
 
@@ -257,27 +262,34 @@ def spaced(name: str, stamps: Array, notes: list[str]) -> Array:
 def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     """Increments as a table has them, with others where rows are missing: of a step they are its last part alone.
 
-    A step is too long if no others, before it or after it, are as much shorter: times of rows may come early or late.
-    Up to `GAP_PERIODS` rows are as those about them, as no filter aligns on what has holes all the time; more are NaN.
+    A step is too long if no others, before it or after it, are as much shorter: times of rows may come early or late;
+    nor is one that is as long as most of those about it, of a unit that was slower for a while. Up to `GAP_PERIODS`
+    rows are as those about them, as no filter aligns on what has holes all the time; more are NaN.
     """
     unknown = int(np.sum(~np.isfinite(np.hstack([imu.dtheta, imu.dv])).all(axis=1)))
     if unknown:
         notes.append(left_out(name, f"increments of {unknown} rows are no numbers, and unknown", unknown, len(imu)))
     if len(imu) < 2:
         return imu
-    period = _period(imu.dt)
-    rows = 1 + np.flatnonzero(imu.dt[1:] > PIECE * period)
-    even = imu.t - period * np.arange(len(imu))
+    period = np.full(len(imu), _period(imu.dt))
+    if not (imu.dt[1:] > PIECE * period[1:]).any():
+        return imu
+    from scipy.ndimage import median_filter  # takes long to load, and most have no need of it
+
+    about = median_filter(imu.dt, ABOUT, mode="nearest")
+    period = np.where(about > SLOWER * period, about, period)
+    rows = 1 + np.flatnonzero(imu.dt[1:] > PIECE * period[1:])
+    even = imu.t - np.cumsum(period)
     near = np.arange(STRAY + 1)[:, None]
     later, earlier = even[np.minimum(rows + near, len(imu) - 1)], even[np.maximum(rows - 1 - near, 0)]
     missing = later.min(axis=0, initial=np.inf) - earlier.max(axis=0, initial=-np.inf)
-    rows, missing = rows[missing > period / 2], missing[missing > period / 2]
+    rows, missing = rows[missing > period[rows] / 2], missing[missing > period[rows] / 2]
     if not len(rows):
         return imu
-    long = missing > GAP_PERIODS * period
+    long = missing > GAP_PERIODS * period[rows]
     lost = f"rows are missing in {len(rows)} places, {missing.sum():.3g} s in all: increments are unknown where they "
     lost += f"are more than {GAP_PERIODS:g}, {long.sum()} times, and as those about them elsewhere"
-    notes.append(left_out(name, lost, round(float(missing.sum()) / period), len(imu)))
+    notes.append(left_out(name, lost, round(float(np.sum(missing / period[rows]))), len(imu)))
     dt = imu.dt.copy()
     dt[rows] -= missing
     rates = [imu.dtheta / dt[:, None], imu.dv / dt[:, None]]

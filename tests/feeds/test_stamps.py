@@ -32,6 +32,17 @@ def test_a_counter_that_wraps_goes_on(wrap: float) -> None:
     assert [note for note in notes if "began anew" in note]
 
 
+@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0])
+@pytest.mark.parametrize("moved", [4.0, -300.0, 1e6])
+def test_a_counter_that_wraps_goes_on_where_its_times_were_moved(wrap: float, moved: float) -> None:
+    """As less its first, or by an offset that a scenario gives."""
+    notes: list[str] = []
+    t, rows = ordered("gnss", (T + wrap - 4) % wrap - wrap + moved, notes)
+    assert np.allclose(t, T - 4 + moved, rtol=0, atol=1e-6)
+    assert len(rows) == len(T)
+    assert [note for note in notes if "began anew" in note]
+
+
 def test_disorder_and_repeats_are_mended_and_told() -> None:
     stamps = T.copy()
     stamps[[10, 11]] = stamps[[11, 10]]
@@ -84,9 +95,9 @@ def test_a_row_that_comes_late_does_not_cut_the_stream(late: int) -> None:
     assert len(notes) == 1
 
 
-@pytest.mark.parametrize("begins", [0.0, 0.3])
+@pytest.mark.parametrize("begins", [-3.0, 3.0])
 def test_a_clock_that_is_set_back_is_not_one_that_began_anew(begins: float) -> None:
-    """By the size of a counter, but from where none begins anew, or with a return to where it was."""
+    """By nearly the size of a counter, or with a return to where it was."""
     notes: list[str] = []
     t, _ = ordered("imu", np.where(LONG > 66.0, LONG - 65.536 + begins, LONG), notes)
     assert t[-1] < 70

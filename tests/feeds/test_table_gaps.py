@@ -44,3 +44,18 @@ def test_a_receiver_may_be_denied_for_hours(begins: float, ends: float, tmp_path
     log = read(tmp_path, table, gnss=GNSS)
     assert len(log.samples["gnss"]) == np.sum(~denied)
     assert not any("clock that was set" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("fast", [1500, 6000])
+@pytest.mark.parametrize("missing", [0, 1, 2])
+def test_increments_may_be_slower_for_a_while(fast: int, missing: int, tmp_path: Path) -> None:
+    """At 100 Hz, then at 50: none are missing but those that are."""
+    t = np.concatenate([np.arange(1, fast + 1) * 0.01, fast * 0.01 + np.arange(1, 1001) * 0.02])
+    dt = np.diff(t, prepend=0.0)
+    kept = ~np.isin(np.arange(len(t)), [fast + 500 + k for k in range(missing)])
+    table = {"t": t[kept], "w": np.outer(dt, [0.1, 0, 0])[kept], "f": np.outer(dt, [0, 0, -9.8])[kept]}
+    log = read(tmp_path, table, imu={**IMU, "form": "increments"})
+    imu = log.imus["imu"]
+    np.testing.assert_allclose(imu.dv[:, 2] / imu.dt, -9.8)
+    assert imu.dtheta[:, 0].sum() == pytest.approx(0.1 * t[-1])
+    assert any("rows are missing in 1 places" in note for note in log.notes) == (missing > 0)
