@@ -76,7 +76,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         notes.append(refused)
         solution = None
     log = Log(
-        path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution), found, notes,
+        path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution, notes), found, notes,
         date=_date(units), remark=doubt(solution, samples),
     )  # fmt: skip
     return at_pace(log, _pace(units))

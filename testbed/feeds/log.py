@@ -102,18 +102,25 @@ class Log:
         return None
 
 
-def beginning(imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None) -> float:
+def beginning(
+    imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples], reference: Reference | None, notes: list[str]
+) -> float:
     """When a log begins [s]: with its inertial units, or `LONGEST_WAIT_S` before at most, with what else is heard.
 
-    What was heard longer before says nothing of a flight of which nothing is known up to there.
+    What was heard longer before says nothing of a flight of which nothing is known up to there: told. Nor does a unit
+    that was over by so long before the first of them began.
     """
-    times = [float(imu.t[0]) for imu in imus.values() if len(imu)]
-    moves = min(times)
+    units = [imu for imu in imus.values() if len(imu)]
+    moves = min(float(imu.t[0]) for imu in units if imu.t[-1] >= units[0].t[0] - LONGEST_WAIT_S)
+    times = [moves]
     times += [own[0].t for own in samples.values() if own]
     if reference is not None and len(reference.t):
         times.append(float(reference.t[0]))
     earliest = min(times)
-    return earliest if moves - earliest <= LONGEST_WAIT_S else moves
+    if moves - earliest <= LONGEST_WAIT_S:
+        return earliest
+    notes.append(f"it begins with its IMU: what is heard up to {moves - earliest:.0f} s before is left out")
+    return moves
 
 
 def at_pace(log: Log, pace: float) -> Log:
@@ -146,12 +153,15 @@ def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, 
 
 
 def require_one_clock(path: Path, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> None:
-    """Raise UserError when what a table has of a sensor was never heard while its first inertial unit was."""
-    spans = {name: (float(imu.t[0]), float(imu.t[-1])) for name, imu in imus.items() if len(imu)}
-    unit = next(iter(spans))
-    spans |= {name: (own[0].t, own[-1].t) for name, own in samples.items() if own}
-    begins, ends = spans[unit]
-    apart = [name for name, (first, last) in spans.items() if first > ends or last < begins]
+    """Raise UserError when a sensor of a table is apart from its first inertial unit by more than that could be.
+
+    By more than `LONGEST_WAIT_S` and than it lasts: before that it may have been heard in another part of a flight.
+    """
+    unit, imu = next((name, imu) for name, imu in imus.items() if len(imu))
+    begins, ends = float(imu.t[0]), float(imu.t[-1])
+    spans = {unit: (begins, ends)} | {name: (own[0].t, own[-1].t) for name, own in samples.items() if own}
+    most = max(ends - begins, LONGEST_WAIT_S)
+    apart = [name for name, (first, last) in spans.items() if first - ends > most or begins - last > most]
     if apart:
         told = ", ".join(f"{name} from {spans[name][0]:.10g} to {spans[name][1]:.10g} s" for name in (unit, *apart))
         raise UserError(

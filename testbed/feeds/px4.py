@@ -65,7 +65,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     if solution is not None and (refused := refusal(solution, imus, samples)):
         notes.append(refused)
         solution = None
-    start = beginning(imus, samples, solution)
+    start = beginning(imus, samples, solution, notes)
     return Log(
         path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),
         remark=doubt(solution, samples),

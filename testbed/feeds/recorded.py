@@ -15,7 +15,7 @@ from nav.samples import Array, GnssSample, ImuSamples, Sample
 from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
-from testbed.feeds.log import SAMPLES, Log, Reference
+from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency
@@ -73,9 +73,17 @@ def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
         if kind == "imu" and there.t[-1] <= log.t0 + start_s:  # type: ignore[union-attr]
             lasts = f"it lasts {there.t[-1] - log.t0:.1f} s"  # type: ignore[union-attr]
             raise UserError(f"truth.start_s: {name} of {log.path} is over by then: {lasts}")
+        if kind == "imu" and there.t[0] > max(_end(log), log.t0 + start_s) + LONGEST_WAIT_S:  # type: ignore[union-attr]
+            late = f"begins {there.t[0] - _end(log):.10g} s after its first IMU ends"  # type: ignore[union-attr]
+            raise UserError(f"sensors.{name}: {late}: another clock: give its time a unit or an offset, or a start_s")
         if kind == "imu" and rate(log, name) < SLOWEST_IMU_HZ:
             slow = f"reports {rate(log, name):g} times a second: at least {SLOWEST_IMU_HZ:g} are needed"
             raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
+
+
+def _end(log: Log) -> float:
+    """When the first inertial unit of a log ends [s]."""
+    return float(next(imu.t[-1] for imu in log.imus.values() if len(imu)))
 
 
 def first_place(log: Log, start_s: float) -> Place:

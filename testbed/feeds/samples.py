@@ -24,6 +24,9 @@ from testbed.sensors.gnss import NO_FIX_DOP, without_fix
 
 UNKNOWN = np.full(3, np.nan)
 HELD_SHARE = 0.9  # of a sensor's rows that are at the times of an inertial unit, if it is told with that
+# What a slower clock makes: so many times that rows are held, and of these the share that are as long as the usual one,
+# to so much of it and a row at least.
+LEAST_HELD, ALIKE_SHARE, ALIKE = 20, 0.9, 0.25
 
 
 class Fixes:
@@ -68,14 +71,18 @@ def newly(
     """Times (N,) and quantities of a sensor without the rows that repeat the one before, of one that is only held.
 
     A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
-    it, to the last bit, usually comes more than once, at the unit's own times: by a receiver that stands still at its
-    own rate nothing is held, nor by a sensor of the unit's rate that sometimes says the same.
+    it, to the last bit, comes again about as often each time, as a slower clock makes it, at the unit's own times: by a
+    receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's rate that says the same by
+    chance, or since nothing changes.
     """
     if len(t) < 2 or not any(np.isin(t, imu.t).mean() > HELD_SHARE for imu in imus.values()):
         return t, dict(values)
     rows = np.column_stack([np.nan_to_num(one.reshape(len(t), -1), nan=np.inf) for one in values.values()])
     first = np.concatenate([[0], 1 + np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))])
-    if np.median(np.diff(first, append=len(t))) < 2:
+    counts = np.diff(first, append=len(t))
+    usual = float(np.median(counts))
+    alike = np.mean(np.abs(counts - usual) <= max(ALIKE * usual, 1.0))
+    if usual < 2 or len(first) < LEAST_HELD or alike < ALIKE_SHARE:
         return t, dict(values)
     held = len(t) - len(first)
     told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"

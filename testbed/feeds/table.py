@@ -113,7 +113,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
     require_one_clock(path, imus, samples)
-    start = beginning(imus, samples, reference)
+    start = beginning(imus, samples, reference, notes)
     return Log(
         path, "table", imus, samples, reference, start, found, notes, remark=_contradicted(reference, imus, samples)
     )

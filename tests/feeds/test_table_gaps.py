@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from testbed import Scenario, run
+from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.log import Log
 from testbed.motion.logged import LogTruth
@@ -59,3 +61,79 @@ def test_increments_may_be_slower_for_a_while(fast: int, missing: int, tmp_path:
     np.testing.assert_allclose(imu.dv[:, 2] / imu.dt, -9.8)
     assert imu.dtheta[:, 0].sum() == pytest.approx(0.1 * t[-1])
     assert any("rows are missing in 1 places" in note for note in log.notes) == (missing > 0)
+
+
+COARSE = np.round(9500 + 0.2 * np.random.default_rng(1).standard_normal(6000)) * 10
+STEPS = np.repeat(np.random.default_rng(2).standard_normal(3000), np.random.default_rng(3).geometric(0.4, 3000))[:6000]
+
+
+@pytest.mark.parametrize("values", [COARSE, STEPS, np.full(6000, 95e3), np.arange(6000) // 3000 * 20.0])
+def test_who_says_the_same_by_chance_is_heard_each_time(values: np.ndarray, tmp_path: Path) -> None:
+    """A barometer of little resolution, or one whose values do not change, at the rate of the unit."""
+    table = unit(np.arange(6000) / 100) | {"p": values}
+    log = read(tmp_path, table, barometer={"time": "t", "pressure": "p"})
+    assert len(log.samples["barometer"]) == 6000
+    assert not log.notes
+
+
+@pytest.mark.parametrize("hz", [8, 40, 49])
+def test_who_is_held_by_a_slower_clock_is_heard_at_its_own_rate(hz: int, tmp_path: Path) -> None:
+    """And is frozen for a while."""
+    t = np.arange(6000) / 100
+    own = np.floor(t * hz)
+    table = unit(t) | {"p": np.where((t > 20) & (t < 30), 0.0, np.sin(own))}
+    log = read(tmp_path, table, barometer={"time": "t", "pressure": "p"})
+    assert len(log.samples["barometer"]) == pytest.approx(50 * hz, abs=3)
+
+
+@pytest.mark.parametrize("begins", [-400.0, -5.0, 61.0, 600.0])
+def test_a_sensor_may_be_heard_before_the_unit_alone_or_after_it(begins: float, tmp_path: Path) -> None:
+    table = unit(np.arange(6000) / 100) | fixes(begins + np.arange(3.0))
+    log = read(tmp_path, table, gnss=GNSS)
+    assert len(log.samples["gnss"]) == 3
+    assert log.t0 == min(begins, 0.0)
+
+
+@pytest.mark.parametrize("moved", [-700.0, 1000.0, -1e6])
+def test_fixes_of_another_clock_are_refused(moved: float, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="no time in common with imu has gnss"):
+        read(tmp_path, unit(np.arange(6000) / 100) | fixes(moved + np.arange(3.0)), gnss=GNSS)
+
+
+TWO = """
+title = "two units"
+duration_s = 5
+[truth]
+source = "log"
+file = "a.npz"
+columns.imu = { time = "t", gyro = "w", accel = "f" }
+columns.spare = { kind = "imu", time = "t2", gyro = "w", accel = "f" }
+columns.gnss = { time = "gt", lat = "lat", lon = "lon", height = "h" }
+[[estimator]]
+name = "ins"
+aids = ["gnss"]
+[sensors.imu]
+[sensors.gnss]
+"""
+
+
+@pytest.mark.parametrize("moved", [100.0, 700.0, -700.0, 1.7e9, -1.7e9])
+def test_a_second_unit_may_have_been_heard_later(moved: float, tmp_path: Path) -> None:
+    """One that is years apart adds no years to go through; it is refused where it is made use of."""
+    t = np.arange(6000) / 100
+    table = unit(t) | fixes(np.arange(60.0)) | {"t2": t + moved}
+    log = read(tmp_path, table, gnss=GNSS, spare={**IMU, "kind": "imu", "time": "t2"})
+    assert list(log.imus) == ["imu", "spare"]
+    assert log.t0 == 0.0
+    (tmp_path / "a.toml").write_text(TWO)
+    assert len(run(Scenario.load(tmp_path / "a.toml")).dataset["truth/lat"]) == 1001
+    if moved != 100.0:
+        (tmp_path / "a.toml").write_text(TWO + '[sensors.spare]\nkind = "imu"\n')
+        with pytest.raises(UserError, match=r"sensors\.spare: "):
+            run(Scenario.load(tmp_path / "a.toml"))
+
+
+def test_a_log_that_begins_later_than_it_is_heard_says_so(tmp_path: Path) -> None:
+    log = read(tmp_path, unit(700 + np.arange(6000) / 100) | fixes(np.arange(750.0)), gnss=GNSS)
+    assert log.t0 == 700.0
+    assert "it begins with its IMU: what is heard up to 700 s before is left out" in log.notes
