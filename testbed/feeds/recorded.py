@@ -140,7 +140,7 @@ class Recorded:
         doubt = log.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
-        told = [doubt, *_losses(log, [*scenario.sensors, "reference"])]
+        told = [doubt, *_losses(log, [*scenario.sensors, *_references(truth)])]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
@@ -234,6 +234,12 @@ def _in_it_already(scenario: Scenario, log: Log) -> list[str]:
                 if getattr(section, key) not in (0.0, getattr(preset, key))
             ]
     return told
+
+
+def _references(truth: LogTruth) -> list[str]:
+    """The streams of a table that are known of the motion, where the run makes use of them."""
+    used = [name for name, stream in truth.columns.items() if (stream.kind or name) == "reference"]
+    return used if truth.reference == "solution" else []
 
 
 def _losses(log: Log, streams: Collection[str]) -> list[str]:

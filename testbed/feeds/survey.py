@@ -249,7 +249,8 @@ def _gained(dtheta: Array, dv: Array) -> Array:
 def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
 
-    0 is said where that is clearly nearer than what a grade has, which is taken off where nothing is known.
+    0 is said where that, or the next lag that is tried, fits best, and clearly better than what a grade has, which is
+    taken off where nothing is known.
     """
     t, v_n, place = fixes(own)
     if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
@@ -279,7 +280,7 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     best = int(np.argmin(costs))
     if 0 < best < len(LAGS) - 1 and clearer(best, 0):
         return float(LAGS[best])
-    return 0.0 if clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
+    return 0.0 if best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
 
 
 def _sphere(field: Array) -> tuple[float, float] | None:

@@ -53,11 +53,12 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "attitude": ANGLE,
 }
 STEEPEST = math.radians(91)  # a pitch; one that is in degrees and said to be in radians is soon more
+EDGE_RAD = 1e-3  # of a whole turn that is rounded
 LARGEST = {"lat": math.pi / 2, "lon": 4 * math.pi}  # that there may be of these, with a turn too many
 GARBAGE = 0.01  # share of rows that may be what no such quantity is
 ANGLES_ALIKE = 'offset would be added to roll, pitch and heading alike: of angles to other axes say frame = "flu-enu"'
 QUATERNION = (
-    "a quaternion has no unit, offset or axes: name its columns in the order w, x, y, z, such as"
+    "a quaternion has no offset or axes: name its columns in the order w, x, y, z, such as"
     ' column = ["q:3", "q:0", "q:1", "q:2"] of one that has w last, and say with frame what it turns between'
 )
 CODES = "and are taken to be without a fix: leave fix out where it is another code, as RTKLIB's Q or NMEA's quality"
@@ -155,10 +156,11 @@ def load(path: Path) -> Table:
         if head.startswith(PARQUET):
             frame = pandas.read_parquet(path, engine="pyarrow")
             return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
-        _require_fields(path, len(pandas.read_csv(path, skipinitialspace=True, index_col=False, nrows=0).columns))
+        named = len(pandas.read_csv(path, skipinitialspace=True, index_col=False, nrows=0).columns)
+        unnamed = 0 if _has_row_names(path, named) else False
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
-            frame = pandas.read_csv(path, skipinitialspace=True, index_col=False, low_memory=False)
+            frame = pandas.read_csv(path, skipinitialspace=True, index_col=unnamed, low_memory=False)
         return _sorted(path, ((str(name), frame[name].to_numpy()) for name in frame.columns))
     except UserError:
         raise
@@ -171,16 +173,27 @@ def load(path: Path) -> Table:
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
 
 
-def _require_fields(path: Path, most: int) -> None:
-    """Raise UserError when a row of a CSV has something after its last column: no telling which is which."""
-    with path.open("rb") as file:
-        for number, line in enumerate(file, 1):
-            if line.count(b",") >= most:
-                fields = next(csv.reader([line.decode(errors="replace")], skipinitialspace=True))
-                if any(one.strip() for one in fields[most:]):
-                    raise UserError(
-                        f"{path}: line {number} has {len(fields)} fields, and the first, which names them, {most}"
-                    )
+def _has_row_names(path: Path, most: int) -> bool:
+    """Whether all rows of a CSV have one field more than it has names: then the first has none, as R writes them.
+
+    Raises UserError when only some have something after the last column: no telling which is which.
+    """
+    with path.open(encoding="utf-8", errors="replace") as file:
+        if not any(line.count(",") >= most for line in file):
+            return False
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        rows = csv.reader(file, skipinitialspace=True)
+        next((fields for fields in rows if fields), None)  # the names
+        more: dict[int, int] = {}  # by how many fields, the first line with something in one that has no name
+        for fields in rows:
+            if fields:
+                more.setdefault(len(fields) if any(one.strip() for one in fields[most:]) else 0, rows.line_num)
+    if set(more) == {most + 1}:
+        return True
+    for count, line in more.items():
+        if count:
+            raise UserError(f"{path}: line {line} has {count} fields, and the first, which names them, {most}")
+    return False
 
 
 def _stacked(values: Any) -> Any:
@@ -300,7 +313,7 @@ def _require_unit(where: str, values: Array, unit: str, largest: float) -> None:
 def _attitude(where: str, values: Array, column: Column, notes: list[str]) -> Array:
     """Attitudes q_nb (N, 4) of angles (N, 3) or quaternions (N, 4) as the table has them."""
     if values.shape[1] == 4:
-        if column.unit or column.offset or column.axes != ("x", "y", "z"):
+        if column.offset or column.axes != ("x", "y", "z"):
             raise UserError(f"{where}: {QUATERNION}")
         length = np.linalg.norm(column.scale * values, axis=1, keepdims=True)
         if none := int(np.sum(length == 0)):
@@ -310,7 +323,9 @@ def _attitude(where: str, values: Array, column: Column, notes: list[str]) -> Ar
         raise UserError(f"{where}: {ANGLES_ALIKE}")
     order, signs = column.order
     roll, pitch, heading = (values[:, order] * signs * column.scale * ANGLE[column.unit or "rad"]).T
-    if np.mean(np.abs(pitch) > STEEPEST) > GARBAGE:
+    # As from 0 to a whole turn too, but no more of them: what is in degrees and said to be in radians is.
+    steep = np.abs(np.mod(pitch + math.pi, 2 * math.pi) - math.pi) > STEEPEST
+    if (column.unit or "rad") == "rad" and np.mean(steep | (np.abs(pitch) > 2 * math.pi + EDGE_RAD)) > GARBAGE:
         raise UserError(f'{where}: has a pitch of {np.nanmax(np.abs(pitch)):.3g} rad: unit = "deg"?')
     return _turned(quaternions(roll, pitch, heading), column.frame)
 

@@ -132,7 +132,8 @@ class Stream(Section):
             if column is None or not column.is_left_handed or column.axes == REVERSED:
                 continue
             others = ", ".join(f'"{axis[1:] if axis.startswith("-") else "-" + axis}"' for axis in column.axes)
-            said = f"say scale = {-column.scale:g} and axes = [{others}]"
+            offset = f", offset = {-column.offset:g}" if column.offset else ""
+            said = f"say scale = {-column.scale:g}{offset} and axes = [{others}]"
             raise ValueError(
                 f"{name}.axes: are left-handed: is a sign missing? Of values whose signs are all reversed {said}"
             )

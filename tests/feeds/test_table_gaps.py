@@ -126,7 +126,7 @@ def test_a_second_unit_may_have_been_heard_later(moved: float, tmp_path: Path) -
     assert list(log.imus) == ["imu", "spare"]
     assert log.t0 == 0.0
     (tmp_path / "a.toml").write_text(TWO)
-    assert len(run(Scenario.load(tmp_path / "a.toml")).dataset["truth/lat"]) == 1001
+    assert len(run(Scenario.load(tmp_path / "a.toml")).dataset["truth/lat"]) == 51
     if moved != 100.0:
         (tmp_path / "a.toml").write_text(TWO + '[sensors.spare]\nkind = "imu"\n')
         with pytest.raises(UserError, match=r"sensors\.spare: "):
