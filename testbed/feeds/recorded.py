@@ -70,20 +70,25 @@ def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
             raise UserError(f"sensors.{name}: {log.path} has no {kind} of that name: it has {known}")
         if kind != "imu" and not isinstance(there[0], SAMPLES.get(kind, object)):  # type: ignore[index]
             raise UserError(f"sensors.{name}: {log.path} has something else than a {kind} under that name")
+        if isinstance(there, ImuSamples):
+            _require_near(log, name, there, start_s)
         if kind == "imu" and there.t[-1] <= log.t0 + start_s:  # type: ignore[union-attr]
             lasts = f"it lasts {there.t[-1] - log.t0:.1f} s"  # type: ignore[union-attr]
             raise UserError(f"truth.start_s: {name} of {log.path} is over by then: {lasts}")
-        if kind == "imu" and there.t[0] > max(_end(log), log.t0 + start_s) + LONGEST_WAIT_S:  # type: ignore[union-attr]
-            late = f"begins {there.t[0] - _end(log):.10g} s after its first IMU ends"  # type: ignore[union-attr]
-            raise UserError(f"sensors.{name}: {late}: another clock: give its time a unit or an offset, or a start_s")
         if kind == "imu" and rate(log, name) < SLOWEST_IMU_HZ:
             slow = f"reports {rate(log, name):g} times a second: at least {SLOWEST_IMU_HZ:g} are needed"
             raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
 
 
-def _end(log: Log) -> float:
-    """When the first inertial unit of a log ends [s]."""
-    return float(next(imu.t[-1] for imu in log.imus.values() if len(imu)))
+def _require_near(log: Log, name: str, imu: ImuSamples, start_s: float) -> None:
+    """Raise UserError when a unit was over before the log begins, or begins long after its first unit: another clock.
+
+    What it did not feel until then, all that time, would be told as unknown, in steps of its own.
+    """
+    ends = float(next(own.t[-1] for own in log.imus.values() if len(own)))
+    if imu.t[-1] < log.t0 or imu.t[0] > max(ends, log.t0 + start_s) + LONGEST_WAIT_S:
+        told = f"was heard from {imu.t[0]:.10g} to {imu.t[-1]:.10g} s of a log from {log.t0:.10g} to {ends:.10g} s"
+        raise UserError(f"sensors.{name}: {told}: give its time a unit, or an offset, which is added to it")
 
 
 def first_place(log: Log, start_s: float) -> Place:

@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nav.samples import ImuSamples
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.log import Log
+from testbed.feeds.samples import Fixes
+from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth
 
 IMU: dict[str, Any] = {"time": "t", "gyro": "w", "accel": "f"}
@@ -129,7 +132,7 @@ def test_a_second_unit_may_have_been_heard_later(moved: float, tmp_path: Path) -
     assert len(run(Scenario.load(tmp_path / "a.toml")).dataset["truth/lat"]) == 51
     if moved != 100.0:
         (tmp_path / "a.toml").write_text(TWO + '[sensors.spare]\nkind = "imu"\n')
-        with pytest.raises(UserError, match=r"sensors\.spare: "):
+        with pytest.raises(UserError, match=r"sensors\.spare: was heard from "):
             run(Scenario.load(tmp_path / "a.toml"))
 
 
@@ -137,3 +140,40 @@ def test_a_log_that_begins_later_than_it_is_heard_says_so(tmp_path: Path) -> Non
     log = read(tmp_path, unit(700 + np.arange(6000) / 100) | fixes(np.arange(750.0)), gnss=GNSS)
     assert log.t0 == 700.0
     assert "it begins with its IMU: what is heard up to 700 s before is left out" in log.notes
+
+
+@pytest.mark.filterwarnings("ignore:All-NaN slice")  # of a receiver without velocity, by numpy
+def test_losses_are_told_of_what_a_run_makes_use_of(tmp_path: Path) -> None:
+    """A reference by its own name, and no sensor that it leaves alone."""
+    twice = np.concatenate([np.arange(60.0), np.arange(20.0)])
+    known = fixes(np.arange(60.0)) | {f"r{name}": values for name, values in fixes(twice).items()}
+    np.savez(tmp_path / "a.npz", **unit(np.arange(6000) / 100), **known, t2=np.arange(60.0))
+    again = 'time = "rgt", lat = "rlat", lon = "rlon", height = "rh" }\n'
+    streams = f'columns.known = {{ kind = "reference", {again}columns.other = {{ kind = "gnss", {again}'
+    spare = 'columns.spare = { kind = "imu", time = "t2", gyro = "w", accel = "f" }\n'
+    (tmp_path / "a.toml").write_text(TWO.replace(spare, streams))
+
+    def told(**changes: Any) -> list[str]:
+        remarks = run(Scenario.load(tmp_path / "a.toml", changes)).remarks
+        return [name for name in ("known", "other") for one in remarks if f"{name}: time goes back" in one]
+
+    assert told() == ["known"]
+    assert told(**{"truth.reference": "gnss"}) == []
+    assert told(**{"truth.reference": "gnss", "sensors.other.kind": "gnss"}) == ["other"]
+
+
+def latency_of(late: float, period: float) -> float | None:
+    """The latency found of a receiver that is so late, of a vehicle that goes to and fro."""
+    t, turn = np.arange(1, 30_001) / 100, 2 * np.pi / period
+    push = np.column_stack([8 * np.sin(turn * (t - 0.005)), 0 * t, np.full(len(t), -9.8)])
+    at = np.arange(0, 300, 0.2)
+    told = Fixes(at, np.full(len(at), 0.8), np.full(len(at), 0.1), np.full(len(at), 500.0))
+    told.v_n = np.column_stack([-8 / turn * np.cos(turn * (at - late)), 0 * at, 0 * at])
+    told.v_n += 0.05 * np.random.default_rng(1).standard_normal((len(at), 3))
+    return latency(ImuSamples(t, np.full(len(t), 0.01), np.zeros((len(t), 3)), 0.01 * push), told.samples("gnss"))
+
+
+@pytest.mark.parametrize("period", [2.0, 5.0])
+@pytest.mark.parametrize(("late", "found"), [(0.0, 0.0), (0.1, 0.1), (0.4, 0.4), (0.65, None), (0.7, None)])
+def test_a_latency_beyond_those_that_are_tried_is_not_none(late: float, found: float | None, period: float) -> None:
+    assert latency_of(late, period) == (None if found is None else pytest.approx(found, abs=0.011))
