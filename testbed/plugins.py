@@ -11,7 +11,7 @@ import sysconfig
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -19,8 +19,9 @@ from typing import Any
 
 from testbed.errors import UserError, printable, shown, unknown
 
-# Packages that are not the user's to edit, and where our own are.
-_INSTALLED = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+# Where Python's own modules are, and our own, and folders of packages that are not the user's to edit.
+_STDLIB = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
+_PACKAGES = {"site-packages", "dist-packages"}
 _HERE = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "nav")
 
 
@@ -112,7 +113,7 @@ def raised(error: BaseException) -> str:
     """What was raised and where, on one line: in the user's code if it can be told, not in what that calls."""
     found = traceback.extract_tb(error.__traceback__)
     frames = [frame for frame in found if not _lies(Path(frame.filename), _HERE)]
-    theirs = [frame for frame in frames if not _lies(Path(frame.filename), _INSTALLED)]
+    theirs = [frame for frame in frames if not _is_installed(Path(frame.filename))]
     last = (theirs or frames)[-1:]
     at = f" ({Path(last[0].filename).name}, line {last[0].lineno})" if last else ""
     return f"{type(error).__name__}: {printable(str(error))}{at}"
@@ -122,51 +123,78 @@ def _lies(path: Path, places: Sequence[Path]) -> bool:
     return any(place in path.parents for place in places)
 
 
+def _is_installed(path: Path) -> bool:
+    return _lies(path, _STDLIB) or not _PACKAGES.isdisjoint(path.parts)
+
+
 # --- what it is made of
 
-_OURS = ("nav", "testbed")  # which the digest of the code has
+_NOT_THEIRS = {*sys.stdlib_module_names, "nav", "testbed"}  # the digest of the code has the last two
 _SEEN: dict[str, tuple[object, str]] = {}  # by module: its spec, which a reload makes anew, and the digest of its file
 
 
 def digest(kind: str, folder: Path, group: str) -> str:
     """What tells the class that ``kind`` names from what it was before: the digest of its file and of those it imports.
 
-    Of these there are all of its own package, and all others but installed packages; what they read nobody watches.
-    Raises UserError as `load` does, and where a module was edited that this process goes on with as it was.
+    Of these there are those of its own package, and those in the folder where its file or package lies, or below, but
+    no installed ones; what they read nobody watches. Raises UserError as `load` does, and where a module was edited
+    that this process goes on with as it was.
     """
     load(kind, folder, group)
     found = hashlib.sha256()
-    for content in _contents(_named(kind, folder, group)[0]):
-        found.update(hashlib.sha256(content).digest())
+    for name, file, content in _files(_named(kind, folder, group)[0]):
+        now = hashlib.sha256(content)
+        if _remembered(name, now.hexdigest()) != now.hexdigest():
+            raise UserError(f"{file}: has been edited since it was imported: start Python anew to fly what it says now")
+        found.update(now.digest())
     return found.hexdigest()
 
 
 @cache
 def _looked_at(module: ModuleType) -> None:
     """Remember the files of a module as it was imported."""
-    for _ in _contents(module):
-        pass
+    for name, _, content in _files(module):
+        _remembered(name, hashlib.sha256(content).hexdigest())
 
 
-def _contents(module: ModuleType) -> Iterator[bytes]:
-    """The files of a module and of all that it imports, in the order of their import statements."""
-    home = module.__name__.partition(".")[0]
+def _remembered(name: str, now: str) -> str:
+    """The digest of a module's file when it was first looked at: ``now`` where it is not imported, or was anew."""
+    module = sys.modules.get(name)
+    if module is None:
+        return now
+    spec, before = _SEEN.get(name, (None, ""))
+    if spec is module.__spec__:
+        return before
+    _SEEN[name] = module.__spec__, now
+    return now
+
+
+def _files(module: ModuleType) -> Iterator[tuple[str, Path, bytes]]:
+    """A module and all of the user's that it imports, in the order of their import statements: name, file, content."""
+    home, first = module.__name__.partition(".")[0], _source(module.__name__)
+    if first is None:
+        return
+    root = first.parents[module.__name__.count(".") + (first.name == "__init__.py")].resolve()
     waiting, known = [module.__name__], {module.__name__}
     while waiting:
         name = waiting.pop(0)
         file = _source(name)
-        if file is None:
+        if file is None or not (name.partition(".")[0] == home or _is_beside(file, root)):
             continue
         try:
             content = file.read_bytes()
         except OSError:  # it has gone since, or is in an archive
             continue
-        _require_same(name, file, content)
-        yield content
-        for other in _imports(name, file, content):
-            if other not in known and _is_own(other.partition(".")[0], home):
-                known.add(other)
-                waiting.append(other)
+        yield name, file, content
+        others = dict.fromkeys(_imports(name, file, content))
+        waiting += [one for one in others if one not in known and one.partition(".")[0] not in _NOT_THEIRS]
+        known.update(others)
+
+
+def _is_beside(file: Path, root: Path) -> bool:
+    """Whether a module lies in a folder or below, and is not of an installed package."""
+    folder = file.parent.resolve()
+    return folder.is_relative_to(root) and not _is_installed(folder / file.name)
 
 
 def _source(name: str) -> Path | None:
@@ -176,22 +204,17 @@ def _source(name: str) -> Path | None:
 
 
 def _spec(name: str) -> ModuleSpec | None:
-    """Where a module is found, imported already or not; None where it is not."""
+    """Where a module is found; None where it is not. Nothing is imported for that: it would run."""
+    above = name.rpartition(".")[0]
     try:
-        return sys.modules[name].__spec__ if name in sys.modules else importlib.util.find_spec(name)
-    except Exception:  # no module, but a class in one, or a package that can't be imported
+        if sys.modules.get(name) is not None:
+            return sys.modules[name].__spec__
+        package = _spec(above) if above else None
+        if above and (package is None or package.submodule_search_locations is None):
+            return None
+        return PathFinder.find_spec(name, package.submodule_search_locations if package else None)
+    except Exception:  # a package without __init__.py in one that was never imported, or no module at all
         return None
-
-
-def _is_own(top: str, home: str) -> bool:
-    """Whether a package is that of the class, or at least not installed."""
-    if top in sys.stdlib_module_names or top in _OURS:
-        return False
-    spec = _spec(top)
-    if top == home or spec is None:
-        return top == home
-    places = [*(spec.submodule_search_locations or ()), *([spec.origin] if spec.has_location and spec.origin else [])]
-    return not any(_lies(Path(place).resolve(), _INSTALLED) for place in places)
 
 
 def _imports(name: str, file: Path, content: bytes) -> Iterator[str]:
@@ -216,16 +239,3 @@ def _imports(name: str, file: Path, content: bytes) -> Iterator[str]:
     for one in named:
         parts = one.split(".")
         yield from (".".join(parts[: k + 1]) for k in range(len(parts)))
-
-
-def _require_same(name: str, file: Path, content: bytes) -> None:
-    """Raises UserError when an imported module is no longer what its file says."""
-    module = sys.modules.get(name)
-    if module is None:
-        return
-    now = hashlib.sha256(content).hexdigest()
-    spec, before = _SEEN.get(name, (None, ""))
-    if spec is not module.__spec__:
-        _SEEN[name] = module.__spec__, now
-    elif before != now:
-        raise UserError(f"{file}: has been edited since it was imported: start Python anew to fly what it says now")

@@ -1,6 +1,8 @@
 """Classes of the user's: found by their files and modules, and what is wrong with a name of one."""
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -39,3 +41,67 @@ def test_a_name_that_is_none_is_told_with_what_to_do(kind: str, says: str, tmp_p
     with pytest.raises(UserError) as told:
         plugins.load(kind, tmp_path, GROUP)
     assert says in str(told.value)
+
+
+FILTER = """
+from helper import OFFSET
+
+
+class Mine:
+    pass
+
+
+if __name__ == "__main__":
+    from tools.main import main
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A file, a module beside it, and a package that it imports when it is run as a program."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "tools").mkdir()
+    (tmp_path / "tools/__init__.py").touch()
+    (tmp_path / "tools/main.py").write_text("import sys\nsys.exit(3)\n")
+    (tmp_path / "helper.py").write_text("OFFSET = 1.0\n")
+    (tmp_path / "mine.py").write_text(FILTER)
+    before = set(sys.modules)
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+
+
+def _digest(folder: Path) -> str:
+    return plugins.digest("./mine.py:Mine", folder, GROUP)
+
+
+def test_what_a_class_never_ran_is_not_run(project: Path) -> None:
+    before = _digest(project)
+    assert not [name for name in sys.modules if name.partition(".")[0] == "tools"]
+    (project / "tools/main.py").write_text("")
+    assert _digest(project) != before
+
+
+@pytest.mark.parametrize("where", ["elsewhere", "project/.venv/lib/site-packages", "project/dist-packages"])
+def test_of_packages_elsewhere_nothing_is_watched(
+    where: str, project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, _, rest = where.partition("/")
+    folder = project / rest if first == "project" else tmp_path_factory.mktemp(first)
+    folder.mkdir(parents=True, exist_ok=True)
+    monkeypatch.syspath_prepend(folder)
+    (folder / "big.py").write_text("A = 1\n")
+    (project / "mine.py").write_text(f"import big\n{FILTER}")
+    before = _digest(project)
+    (folder / "big.py").write_text("A = 2\n")
+    assert _digest(project) == before
+
+
+def test_a_class_and_what_it_imports_can_be_edited_while_nobody_asks_what_it_was(project: Path) -> None:
+    """As in a notebook: it goes on with what is imported, which a campaign alone refuses."""
+    plugins.load("./mine.py:Mine", project, GROUP)
+    (project / "helper.py").write_text("OFFSET = 2.0\n")
+    (project / "mine.py").write_text(f"{FILTER}\nMORE = 1\n")
+    plugins.load("./mine.py:Mine", project, GROUP)
+    with pytest.raises(UserError, match=r"helper.py: has been edited since it was imported: start Python anew"):
+        _digest(project)
