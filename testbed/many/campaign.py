@@ -23,7 +23,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from testbed.report.campaign import Statistics
 
 HISTORY_HZ = 1.0  # rate at which a run's errors are kept
+
+_Own: TypeAlias = Mapping[str, Mapping[str, str]]  # the user's classes in all combinations, as `own` tells them
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,7 @@ class _Task:
     scenario: Scenario
     truth: Path | None  # the flight that all runs share; a worker that can't see it flies it again
     code: str
-    own: Mapping[str, Mapping[str, str]]  # the user's classes
+    own: _Own
 
 
 def campaign(
@@ -268,13 +270,15 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     require_draw(plan.draw, plan.runs if plan.draw else 0)
     total = len(combinations) * plan.runs
     folder = plan.out.absolute()
-    claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan))
+    mine = own([one.scenario for one in combinations])
+    claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan, mine))
     stored = _load_all(folder, combinations, plan)
     failures: list[Failure] = []
     if len(stored) < total:
         teller = _Teller(tell, total, len(stored))
         with pool.opened(total - len(stored), workers) as crew:
-            tasks = _tasks(plan, combinations, share_truth(folder, [c.scenario for c in combinations]), set(stored))
+            truth = share_truth(folder, [c.scenario for c in combinations])
+            tasks = _tasks(plan, combinations, truth, mine, set(stored))
             for done in crew.work(_fly, tasks, teller.standing):
                 flown = _flown(done)
                 if isinstance(flown, Failure):
@@ -313,12 +317,11 @@ def _combinations(plan: Plan) -> list[Combination]:
 
 
 def _tasks(
-    plan: Plan, combinations: Sequence[Combination], truth: Path | None, stored: Set[tuple[int, int]]
+    plan: Plan, combinations: Sequence[Combination], truth: Path | None, mine: _Own, stored: Set[tuple[int, int]]
 ) -> Iterator[_Task]:
     """The runs that are not there yet. There may be millions: they are made as they are flown."""
     now = code()
     for i, combination in enumerate(combinations):
-        mine = own([combination.scenario])
         for seed in plan.seeds(combination.scenario):
             if (i, seed) not in stored:
                 yield _Task(i, seed, combination.scenario, truth, now, mine)
@@ -327,7 +330,7 @@ def _tasks(
 # --- the folder
 
 
-def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
+def _setup(scenarios: Sequence[Scenario], plan: Plan, mine: _Own) -> dict[str, Any]:
     """Everything that decides the numbers, apart from the seeds."""
     flown = {one.truth.aircraft for one in scenarios if isinstance(one.truth, FlightTruth)}
     return {
@@ -335,7 +338,7 @@ def _setup(scenarios: Sequence[Scenario], plan: Plan) -> dict[str, Any]:
         "overrides": list(plan.overrides),
         "varied values": {key: list(values) for key, values in plan.vary.items()},
         "code": code(),
-        **own(scenarios),
+        **mine,
         "aircraft": [aircraft.digest(name) for name in sorted(flown)],
         "logs": log_digests(scenarios),
         "versions": versions(),

@@ -599,6 +599,18 @@ def test_a_run_after_an_edit_is_none_of_the_campaign(own: Path) -> None:
     assert "has been edited meanwhile" in flown.message
 
 
+def test_a_class_that_is_edited_before_it_flies_is_not_flown(
+    own: Path, threads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder is of the class as it was when it was made."""
+    file = own.parent / "classes.py"
+    monkeypatch.setattr(campaigns, "share_truth", lambda *_: file.write_text(file.read_text() + "#") and None)
+    out, vary = own.parent / "out", {"estimator[1].kind": ["./classes.py:Mine", "own_package.classes:Mine"]}
+    flown = campaign(own, 1, vary=vary, workers=threads, out=out)
+    assert [one.combination for one in flown.outcomes] == [1]
+    assert ["edited meanwhile" in one.message for one in flown.failures] == [True]
+
+
 def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="can't write here"):
