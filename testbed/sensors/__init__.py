@@ -62,11 +62,7 @@ Sensor: TypeAlias = Imu | AidingSensor
 
 def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site: Site) -> Sensor:
     """The sensor for one run. Raises UserError when its samples do not fall on ticks or no field model has the date."""
-    if custom.is_own(config):
-        own: Sensor = custom.made(name, config, tick_rate_hz, seed)
-        return own
-    made = registry.of(config).sensor
-    given = (name, config, tick_rate_hz, seed)
     local = isinstance(config, MagnetometerConfig | RangefinderConfig | OpticalFlowConfig)
-    sensor: Sensor = made(*given, site) if local else made(*given)
+    given = (name, config, tick_rate_hz, seed, *([site] if local else []))
+    sensor: Sensor = custom.made(*given) if custom.is_own(config) else registry.of(config).sensor(*given)
     return sensor

@@ -25,24 +25,26 @@ def is_own(section: Section) -> bool:
     return getattr(section, "kind", None) not in registry.BUILT_IN
 
 
-def made(name: str, section: Section, tick_rate_hz: float, seed: int) -> Any:
-    """The user's sensor of a section. Raises UserError where its class does."""
+def made(name: str, section: Section, *given: Any) -> Any:
+    """The user's sensor of a section, and what else its kind is given. Raises UserError where its class does."""
     try:
-        return registry.of(section).sensor(name, section, tick_rate_hz, seed)
+        return registry.of(section).sensor(name, section, *given)
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"{_called(name, section)} can't be made: {plugins.raised(error)}") from error
 
 
 def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any:
-    """What a sensor of the user's says that it is to filters. Raises UserError where that is no aid."""
+    """What a sensor of the user's says that it is to filters, None where nothing. Raises UserError where no aid."""
     try:
         found = maker(name, section, imu)
     except UserError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"{_called(name, section)}: aid: {plugins.raised(error)}") from error
+    if found is None:
+        return None
     missing = [one for one in AID if not hasattr(found, one)]
     if missing:
         raise UserError(f"{_called(name, section)}: aid gave {_type(found)}, which lacks {', '.join(missing)}")
@@ -52,7 +54,7 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
 
 
 class Guard:
-    """A sensor of the user's, which sees truth and can't write to it. Of what it gives only samples come through."""
+    """A sensor of the user's, which is handed a copy of truth. Of what it gives only samples come through."""
 
     def __init__(self, name: str, section: Section, sensor: Any) -> None:
         self._name, self._called, self._sensor = name, _called(name, section), sensor
@@ -62,13 +64,13 @@ class Guard:
     def sense(self, truth: TruthBlock) -> list[Any]:
         """The samples inside a block. Raises UserError where there are none such, or it raises."""
         try:
-            given = self._sensor.sense(_read_only(truth))
+            given = self._sensor.sense(_copy(truth))
             if not isinstance(given, Iterable):
                 raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
-            samples = list(given)
+            samples = [_timed(sample) for sample in given]
         except UserError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise UserError(f"{self._called}: {plugins.raised(error)}") from error
         for sample in samples:
             wrong = self._wrong(sample)
@@ -116,13 +118,16 @@ class Guard:
         return ""
 
 
-def _read_only(truth: TruthBlock) -> TruthBlock:
-    """The same rows as views that can't be written to: everybody else sees them too."""
-    columns = {}
-    for name in COLUMNS:
-        columns[name] = getattr(truth, name).view()
-        columns[name].flags.writeable = False
-    return TruthBlock(truth.tick, **columns)
+def _copy(truth: TruthBlock) -> TruthBlock:
+    """The same rows, which nobody else sees."""
+    return TruthBlock(truth.tick, **{name: getattr(truth, name).copy() for name in COLUMNS})
+
+
+def _timed(sample: Any) -> Any:
+    """The same, with numbers as its times where they are arrays without dimensions."""
+    times = {name: getattr(sample, name, None) for name in ("t", "t_arrival")}
+    changes = {name: value[()] for name, value in times.items() if isinstance(value, np.ndarray) and not value.ndim}
+    return dataclasses.replace(sample, **changes) if changes else sample
 
 
 def _called(name: str, section: Section) -> str:

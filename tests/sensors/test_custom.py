@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from testbed.noise import Process, stream
+from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig
 from testbed.sensors.timing import AidingTiming, Schedule
 
 
@@ -45,6 +46,8 @@ class Radar:
         self.how = section.how
         if self.how == "init":
             raise ValueError("no antenna")
+        if self.how == "init exit":
+            raise SystemExit(4)
         self.name, self.schedule = name, Schedule.of(name, section, tick_rate_hz)
         self.white = Process.white(stream(seed, name, "white"), [section.noise_m])
 
@@ -53,10 +56,13 @@ class Radar:
         noise = self.white.take(len(rows))[:, 0] if len(rows) else ()
         if self.how == "write":
             truth.h[:] = 0.0
+        if self.how == "exit":
+            raise SystemExit(3)
+        as_given = np.asarray if self.how == "array" else float
         if self.how in WRONG:
             return WRONG[self.how]()
         return [
-            HeightSample(float(truth.t[k]), float(truth.t[k]) + self.schedule.latency, float(truth.h[k] + e), self.name)
+            HeightSample(as_given(truth.t[k]), as_given(truth.t[k] + self.schedule.latency), truth.h[k] + e, self.name)
             for k, e in zip(rows, noise)
         ]
 
@@ -87,7 +93,13 @@ class Aiding(Radar):
     def aid(name, section, imu):
         if section.how == "typo":
             raise ValueError("no such aid")
-        return section
+        if section.how == "aid exit":
+            raise SystemExit(5)
+        return None if section.how == "none aided" else section
+
+
+class Compass(Magnetometer):
+    Section = MagnetometerConfig
 """
 AT_REST = """
 title = "At rest, with a sensor of the user's"
@@ -168,7 +180,8 @@ def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.Monk
     ("how", "says"),
     [
         ("init", f"can't be made: ValueError: no antenna ({at('no antenna')})"),
-        ("write", f"ValueError: assignment destination is read-only ({at('truth.h[:]')})"),
+        ("exit", f"SystemExit: 3 ({at('SystemExit(3)')})"),
+        ("init exit", f"can't be made: SystemExit: 4 ({at('SystemExit(4)')})"),
         ("raise", f"LinAlgError: Singular matrix ({at('linalg')})"),
         ("late", f"ValueError: no echo ({at('no echo')})"),
         ("none", "sense gave NoneType: give a list of samples"),
@@ -193,6 +206,7 @@ def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, sa
     ("how", "says"),
     [
         ("typo", f"ValueError: no such aid ({at('no such aid')})"),
+        ("aid exit", f"SystemExit: 5 ({at('SystemExit(5)')})"),
         ("", "aid gave Section, which lacks sensor, parts, states, blocks, measure"),
     ],
 )
@@ -201,6 +215,31 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": how}))
     assert f"sensor radar: ./radar.py:Aiding: {'aid: ' if how else ''}{says}" in str(told.value)
+
+
+def test_what_it_writes_into_truth_nobody_else_sees(scenario: Path) -> None:
+    own = run(Scenario.load(scenario.with_name("rest.toml"), {"sensors.radar.how": "write"})).dataset
+    assert abs(own["sensors/radar/height"].values).max() < 10.0
+    assert (own["truth/h"].values > 490.0).all()
+
+
+def test_times_may_be_arrays_without_dimensions(scenario: Path) -> None:
+    own, plain = (
+        run(Scenario.load(scenario.with_name("rest.toml"), {"sensors.radar.how": how})) for how in ("array", "")
+    )
+    assert own.dataset["sensors/radar"].identical(plain.dataset["sensors/radar"])
+
+
+def test_one_that_says_it_aids_nothing_aids_nothing(scenario: Path) -> None:
+    keys = {"sensors.radar.kind": "./radar.py:Aiding", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": "none aided"}))
+    assert not [one for one in result.dataset.groups if one.endswith("innovations/radar")]
+
+
+def test_one_with_the_keys_of_a_magnetometer_is_told_where_it_is(scenario: Path) -> None:
+    keys = {"sensors.radar": {"kind": "./radar.py:Compass", "rate_hz": 5}}
+    result = run(Scenario.load(scenario.with_name("rest.toml"), keys))
+    assert result.dataset["sensors/radar/field_b"].values.shape[1:] == (3,)
 
 
 @pytest.mark.ci
