@@ -63,6 +63,7 @@ Sensor: TypeAlias = Imu | AidingSensor
 def build(name: str, config: SensorConfig, tick_rate_hz: float, seed: int, site: Site) -> Sensor:
     """The sensor for one run. Raises UserError when its samples do not fall on ticks or no field model has the date."""
     local = isinstance(config, MagnetometerConfig | RangefinderConfig | OpticalFlowConfig)
-    given = (name, config, tick_rate_hz, seed, *([site] if local else []))
-    sensor: Sensor = custom.made(*given) if custom.is_own(config) else registry.of(config).sensor(*given)
+    given = (tick_rate_hz, seed, *([site] if local else []))
+    own = custom.is_own(config)
+    sensor: Sensor = custom.made(name, config, *given) if own else registry.of(config).sensor(name, config, *given)
     return sensor
