@@ -18,9 +18,12 @@ FLOAT = np.dtype(float)
 NUMBERS = ("t", "lat", "lon", "h")
 ALL = sum(Status)
 LENGTH = 1e-3  # by which that of a quaternion may be off 1: angles are wrong by as much
-# Names in the record beside the further states of an estimate: columns, dimensions and groups.
-TAKEN = {*NUMBERS, *VECTORS, "time", "status", "sigma_position_n", "sigma_velocity_n", "sigma_attitude_n",
-         "ned", "body", "quaternion", "error", "error_column", "innovations"}  # fmt: skip
+# Dimensions in the record that have labels (`testbed.record.columns`), and times: no column or group can be called so.
+DIMENSIONS = {"time", "sample_time", "ned", "body", "north_east", "cross", "fix_part", "body_xy", "quaternion",
+              "inertial_quaternion", "surface", "command", "error", "error_column", "element"}  # fmt: skip
+# What else the record has beside the further states of an estimate: columns and groups.
+TAKEN = {*DIMENSIONS, *NUMBERS, *VECTORS, "status", "innovations",
+         "sigma_position_n", "sigma_velocity_n", "sigma_attitude_n"}  # fmt: skip
 
 
 class Unfit(Exception):
@@ -76,13 +79,17 @@ class Given:
         return reports
 
     def _report(self, given: UpdateReport, of: str) -> UpdateReport:
-        changes: dict[str, Any] = {
-            name: _number(getattr(given, name), f"{of} {name}") for name in ("t", "nis", "threshold", "weight")
-        }
+        changes: dict[str, Any] = {}
+        for name in ("t", "nis", "threshold", "weight"):
+            value = getattr(given, name)
+            unknown = value is None and name in ("nis", "threshold")
+            changes[name] = math.nan if unknown else _number(value, f"{of} {name}")
         for name in ("sensor", "reason"):
             if not _is_text(getattr(given, name)):
                 raise Unfit(f"{of} {name} is {_told(getattr(given, name))}, not a text")
         _require_name(given.aid, f"{of} aid")
+        if given.aid in DIMENSIONS:
+            raise Unfit(f"{of} aid can't be called {given.aid}: the record has {given.aid} already")
         innovation = changes["innovation"] = _array(given.innovation, f"{of} innovation")
         if innovation.ndim != 1:
             raise Unfit(f"{of} innovation has shape {innovation.shape}, not (m,)")

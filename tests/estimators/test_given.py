@@ -11,6 +11,8 @@ import pytest
 from nav.samples import BarometerSample, Estimate, ImuSamples, Outcome, Status, UpdateReport
 from testbed import Scenario, run
 from testbed.estimators.custom import Adapter
+from testbed.estimators.given import DIMENSIONS
+from testbed.record import columns
 from testbed.record.reader import load
 from testbed.score.accuracy import column
 
@@ -75,6 +77,7 @@ def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
         ({"extra": {"b": (np.array(["a"]), np.ones(1))}}, "estimate: extra: b, value is an array of <U1 of shape"),
         ({"extra": {3: pair(1)}}, "estimate: extra: a name is 3, not a text that can be a name"),
         ({"extra": {"a/b": pair(1)}}, 'estimate: extra: a name is "a/b", not a text that can be a name: no slash'),
+        ({"extra": {"wind": pair(2), "north_east": pair(1)}}, "extra: north_east can't be a name: the record has"),
         ({"extra": {"h": pair(1)}}, "estimate: extra: h can't be a name: the record has h already"),
         ({"extra": {"gyro_bias": pair(3)}}, "estimate: extra: gyro_bias can't be a name: the record has gyro_bias"),
         ({"extra": {"position_n": pair(3)}}, "extra: position_n can't be a name: the record has sigma_position_n"),
@@ -117,7 +120,10 @@ def test_unknown_is_no_mistake() -> None:
         ({"outcome": "fused"}, 'update: a report\'s outcome is "fused", not a nav.samples.Outcome'),
         ({"outcome": 99}, "update: a report's outcome is 99, not a nav.samples.Outcome"),
         ({"t": None}, "update: a report's t is None, not a number"),
-        ({"nis": None}, "update: a report's nis is None, not a number"),
+        ({"weight": None}, "update: a report's weight is None, not a number"),
+        ({"nis": "1"}, 'update: a report\'s nis is "1", not a number'),
+        ({"aid": "time"}, "update: a report's aid can't be called time: the record has time already"),
+        ({"aid": "ned"}, "update: a report's aid can't be called ned: the record has ned already"),
         ({"sensor": 3}, "update: a report's sensor is 3, not a text"),
         ({"reason": "\ud800"}, "update: a report's reason is "),
         ({"aid": "mine/x y:z"}, 'update: a report\'s aid is "mine/x y:z", not a text that can be a name: no slash'),
@@ -139,6 +145,16 @@ def test_reports_in_any_wrapping() -> None:
         assert report.innovation.shape == (3,)
         assert report.outcome is Outcome.FUSED
     assert reported(None) == ([], "")
+
+
+def test_what_no_test_was_made_of_is_unknown() -> None:
+    (report,), failure = reported(dataclasses.replace(REPORT, nis=None, threshold=None))
+    assert failure == ""
+    assert np.isnan([report.nis, report.threshold]).all()
+
+
+def test_the_names_of_all_dimensions_are_taken() -> None:
+    assert {"time", "sample_time", *columns.AXES} == DIMENSIONS
 
 
 def test_lengths_stay_as_they_were() -> None:
