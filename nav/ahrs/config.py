@@ -44,14 +44,8 @@ class AnyMotion:
     airspeed_error_s: float = 1.0  # how long ``airspeed_sigma`` has one sign
     # Of the rate of turn that is an error, by misalignment and scale, over a second; more where a part is told so.
     gyro_share: float = 3e-3
-    turning_speed: float = 20.0  # rms axis of the velocity that turns with the body, where airspeed does not tell [m/s]
-    turning_speed_s: float = 300.0  # how long it lasts
-    turn_memory_s: float = 12.0  # time over which its rate is taken
-    turn_smoothing_s: float = 4.0  # of the rate that tells a turn from a swing
-    turn_shares: tuple[float, float] = (
-        0.1,
-        0.3,
-    )  # of its square in that of all rates: up to here a swing, from here a turn
+    unknown_speed: float = 15.0  # at which the body may be turning where airspeed does not tell [m/s]
+    turn_memory_s: float = 8.0  # time over which a turn is told from a swing
 
     field_tolerance: float = 0.1  # of the size of the magnetic field: further off it tells no heading
     dip_tolerance: float = 6 * DEG
