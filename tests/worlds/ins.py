@@ -109,9 +109,11 @@ def _between(truth, k, tau):
 
 
 def barometer(truth, rng, bias=0.0, sigma=0.5, rate_hz=10.0):
+    """Its noise is one of pressure: ``sigma`` [m] of 12.013 Pa each, as at sea level."""
     rows = np.arange(0, len(truth.t), int(RATE_HZ / rate_hz))
     return [
-        BarometerSample(truth.t[k], truth.t[k], isa_pressure(truth.h[k] + bias + sigma * rng.normal())) for k in rows
+        BarometerSample(truth.t[k], truth.t[k], isa_pressure(truth.h[k] + bias) - 12.013 * sigma * rng.normal())
+        for k in rows
     ]
 
 
