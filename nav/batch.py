@@ -450,7 +450,8 @@ def _measure(
     """
     if kind[0] == Kind.BAROMETER:
         nu, H = barometer(lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))
-        return True, nu, H, told[:1] * thinness(numbers[0]) ** 2
+        thin = thinness(numbers[0])
+        return True, nu, H, told[:1] * (thin * thin)
     if kind[0] == Kind.MAGNETOMETER:
         nu, H = magnetometer(q_nb, x, kind[2], kind[4], kind[3], kind[5], field[3:], numbers[:3])
         return is_near(lla, field), nu, H, told[:3]

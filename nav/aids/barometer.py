@@ -79,7 +79,8 @@ class BarometerAid:
         assert isinstance(sample, BarometerSample)
         bias, error = at.starts
         nu, H = barometer(at.state.lla, at.x, bias, error, pressure_altitude(sample.pressure))
-        return Measurement(nu, H, self._R * thinness(sample.pressure) ** 2)
+        thin = thinness(sample.pressure)
+        return Measurement(nu, H, self._R * (thin * thin))  # no power, which has other bits here than in a kernel
 
 
 @dataclass
