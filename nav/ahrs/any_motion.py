@@ -12,10 +12,20 @@ of correlation time tau, driven by accelerations of the spectral density S, so t
     v(t + T) - r v(t) = noise of variance S tau (1 - r^2) / 2
 
 An estimate of v, driven by f, is an error state: delta v' = g [phi_E, -phi_N]. S follows the variance of the smoothed
-specific force in the last seconds, about its mean, so that a tilt does not make itself believed an acceleration; where
-airspeed tells nothing, a lasting turn may hide more. The magnetic
-field turns the heading alone; it is used while its size and dip are those of the last minutes. At rest the gyros show
-their biases. All that is found is corrected at once.
+specific force in the last seconds, about its mean, so that a tilt does not make itself believed an acceleration.
+
+In a lasting turn that is not enough: its acceleration has one size and turns with the body, as what biased gyros make
+of the horizon does. Where airspeed does not tell it, it is that of a velocity c which turns with the body, of unknown
+size,
+
+    c' = psi' (down x c) - c / tau_c + noise,    acceleration psi' (down x c)
+
+with psi' the mean rate about the vertical of the last seconds, as far as it is a turn and no swing. What is wrong in an
+estimate of c are error states too: a turn that is begun with a horizon well known tells c, and c then levels in the
+turn.
+
+The magnetic field turns the heading alone; it is used while its size and dip are those of the last minutes. At rest the
+gyros show their biases. All that is found is corrected at once.
 
 The idea that accelerations average out along an attitude by gyros is that of Laidig and Seel 2023, VQF: highly accurate
 IMU orientation estimation with bias estimation and magnetic disturbance rejection; here as error states.
@@ -29,7 +39,7 @@ from dataclasses import replace
 import numpy as np
 
 from nav.ahrs.config import MAGNETIC_HEADING, AhrsConfig, AnyMotion
-from nav.ahrs.further import FurtherStates
+from nav.ahrs.further import RIGHT, FurtherStates
 from nav.ahrs.state import BIAS, PHI, STATES, State
 from nav.alignment import usable
 from nav.kalman import update
@@ -59,13 +69,28 @@ class AnyMotionLevelling:
         # Density over variance: twice that of white noise, smoothed.
         self._lasting_s = 4 * told.acceleration_smoothing_s
 
-    def tilt_variance(self, f_n: Array, rate: float, compensated: bool) -> float:
-        """Of a first levelling by a mean specific force (3,), turning at ``rate`` [rad/s]; NaN when it shows none."""
+    def tilt_variance(self, f_n: Array) -> float:
+        """Of a first levelling by a mean specific force (3,), beside a turn's; NaN when it shows none."""
         force = math.sqrt(f_n @ f_n) / self._g
         if not FORCE[0] <= force <= FORCE[1]:
             return math.nan
-        turning = 0.0 if compensated else self.told.unknown_speed * rate / self._g
-        return min(math.hypot(self.config.tilt_sigma, force - 1, turning), MOST_TILT) ** 2
+        return min(math.hypot(self.config.tilt_sigma, force - 1), MOST_TILT) ** 2
+
+    def begin(self, s: State, f_0: Array, omega_b: Array, compensated: bool) -> None:
+        """Begin with an attitude that a mean specific force (3,) [m/s^2] has levelled at a mean rate (3,) [rad/s].
+
+        Its covariance is that without a turn. What a turn accelerates was taken for tilt: phi_N = -(psi' / g) c_N, and
+        phi_E the same of c_E; how much of the rate is a turn's and no swing's, so short a time does not tell.
+        """
+        m, level, own, speed = s.in_motion, slice(PHI, PHI + 2), self._further.turning, self.told.turning_speed
+        m.turn_rate = m.steady_rate = float(dcm_from_quat(s.q_nb)[2] @ omega_b)
+        m.swing, m.swing_square = 0.0, max(0.0, float(omega_b @ omega_b) - m.steady_rate**2)
+        m.excess = float(f_0 @ f_0) - self._g**2
+        m.turning_n[:] = 0.0
+        tilt = max(-MOST_TILT, min(self.turn_rate(s, compensated) * speed / self._g, MOST_TILT))
+        if not compensated:
+            s.P[level, level] += min(abs(m.turn_rate) * speed / self._g, MOST_TILT) ** 2 * np.eye(2)
+        s.P[level, own] = s.P[own, level] = -tilt * speed * np.eye(2)
 
     def miss(self, s: State, dtheta: Array, dv: Array, dt: Array) -> None:
         """Count those of N increments that are not usable."""
@@ -86,11 +111,11 @@ class AnyMotionLevelling:
         return 0.5 * share**2 * float(s.sums[1].sum())
 
     def level_measurement(
-        self, H: Array, omega_b: Array, compensated: bool, acceleration: float, T: float
+        self, H: Array, omega_b: Array, compensated: bool, acceleration: float, turn_rate: float, T: float
     ) -> tuple[Array, Array]:
-        """``H`` (2, n) with the velocity's columns and R (2,) of the mean horizontal specific force over ``T`` [s].
+        """``H`` (2, n) with the velocities' columns and R (2,) of the mean horizontal specific force over ``T`` [s].
 
-        ``acceleration`` [m/s^2] is what is expected of it, as `acceleration` says.
+        ``acceleration`` [m/s^2] is what is expected of it, and ``turn_rate`` [rad/s] as the methods of that name say.
         """
         told, tau = self.told, self.told.velocity_correlation_s
         kept = math.exp(-T / tau)
@@ -99,38 +124,65 @@ class AnyMotionLevelling:
         if compensated:
             variance += self.config.airspeed_sigma**2 * float(omega_b @ omega_b) * told.airspeed_error_s * T
         H[:, self._velocity] += np.eye(2) * ((1 - kept) / T)
+        H[:, self._further.turning] = -turn_rate * RIGHT
         return H, np.full(2, variance / T**2)
 
-    def watch(self, s: State, f_n: Array, omega_b: Array, T: float) -> None:
-        """Follow the specific force ``f_n`` (3,) [m/s^2] and the rate ``omega_b`` (3,) [rad/s]."""
+    def watch_turn(self, s: State, f_n: Array, omega_b: Array, T: float) -> None:
+        """Follow the rate ``omega_b`` (3,) [rad/s], and the size of the specific force ``f_n`` (3,) [m/s^2]."""
+        m, memory = s.in_motion, -math.expm1(-T / self.told.turn_memory_s)
+        rate = float(dcm_from_quat(s.q_nb)[2] @ omega_b)
+        m.turn_rate += memory * (rate - m.turn_rate)
+        m.swing = rate - m.turn_rate
+        m.steady_rate -= math.expm1(-T / self.told.turn_smoothing_s) * (rate - m.steady_rate)
+        m.swing_square += memory * (max(0.0, float(omega_b @ omega_b) - m.steady_rate**2) - m.swing_square)
+        m.excess += memory * (float(f_n @ f_n) - self._g**2 - m.excess)
+
+    def turn_share(self, s: State, compensated: bool) -> float:
+        """How far the body turns, and does not swing as a hand does, from 0 to 1; 0 where airspeed tells of it.
+
+        By the share of the square of its mean rate about the vertical in the mean square of its rate about any axis.
+        """
+        m, (none, full) = s.in_motion, self.told.turn_shares
+        square = m.steady_rate**2
+        if compensated or not square > 0.0:
+            return 0.0
+        return max(0.0, min((square / (square + m.swing_square) - none) / (full - none), 1.0))
+
+    def turn_rate(self, s: State, compensated: bool) -> float:
+        """At which a velocity turns with the body [rad/s], as far as what it accelerates shows."""
+        rate = s.in_motion.turn_rate * self.turn_share(s, compensated)
+        usual = (self.told.turning_speed * rate) ** 2
+        return rate * math.sqrt(self._shows(s) / usual) if usual > self._shows(s) else rate
+
+    def _shows(self, s: State) -> float:
+        """Square of the horizontal acceleration that the size of the specific force leaves room for [m^2/s^4].
+
+        Whatever the attitude |f|^2 = g^2 + a^2, of which a bias b of the accelerometers may hide 2 g b.
+        """
+        return max(0.0, s.in_motion.excess) + 2 * self._g * self.config.imu.accel_bias_sigma
+
+    def watch(self, s: State, f_n: Array, T: float) -> None:
+        """Follow the horizontal specific force ``f_n`` (2,) [m/s^2], less what a turn explains."""
         m, told = s.in_motion, self.told
-        smoothing, memory, turning = (
-            -math.expm1(-T / time)
-            for time in (told.acceleration_smoothing_s, told.acceleration_memory_s, told.turn_memory_s)
+        smoothing, memory = (
+            -math.expm1(-T / time) for time in (told.acceleration_smoothing_s, told.acceleration_memory_s)
         )
-        m.force_n += smoothing * (f_n[:2] - m.force_n)
+        m.force_n += smoothing * (f_n - m.force_n)
         m.mean_force_n += memory * (m.force_n - m.mean_force_n)
         beside = m.force_n - m.mean_force_n
         m.force_variance += memory * (0.5 * float(beside @ beside) - m.force_variance)
-        m.turn_rate += turning * (float(dcm_from_quat(s.q_nb)[2] @ omega_b) - m.turn_rate)
-        m.rate_square += turning * (float(omega_b @ omega_b) - m.rate_square)
-        m.excess += turning * (float(f_n @ f_n) - self._g**2 - m.excess)
 
     def acceleration(self, s: State, compensated: bool) -> float:
         """What to expect of horizontal acceleration, rms of an axis [m/s^2]: what varies, and unless airspeed tells it
-        what a lasting turn may hide.
+        what a turn makes where its rate is not the mean one, as at its beginning.
 
-        A turn of the rate w at the speed v accelerates by a = v w in a direction that lasts for 1 / w: a density of
-        2 a^2 / w. It is believed in by the share of w^2 in the mean square of the rate: a hand swings, and does not
-        turn. Nor does it accelerate by more than shows in the size of the specific force, whatever the attitude:
-        |f|^2 = g^2 + a^2, of which a bias b of the accelerometers may hide 2 g b.
+        At the speed v such a difference w accelerates by a = v w, for as long as the mean is taken over (tau): a
+        density of 2 a^2 tau, believed in as the turn is. It is no more than shows in the size of the specific force,
+        whatever the attitude: |f|^2 = g^2 + a^2, of which a bias b of the accelerometers may hide 2 g b.
         """
         m = s.in_motion
-        hidden = 0.0
-        if not compensated and m.rate_square > 0:
-            shows = abs(m.excess) + 2 * self._g * self.config.imu.accel_bias_sigma
-            square = min((self.told.unknown_speed * m.turn_rate) ** 2, shows)
-            hidden = 2 * square * abs(m.turn_rate) / m.rate_square
+        square = min((self.told.turning_speed * m.swing) ** 2, self._shows(s))
+        hidden = 2 * square * self.told.turn_memory_s * self.turn_share(s, compensated) ** 2
         return math.sqrt(m.force_variance + hidden / self._lasting_s)
 
     def unexplained(self, s: State, f_n: Array, T: float) -> Array:
@@ -138,12 +190,17 @@ class AnyMotionLevelling:
         left: Array = f_n + s.in_motion.velocity_n * (-math.expm1(-T / self.told.velocity_correlation_s) / T)
         return left
 
-    def move(self, s: State, f_n: Array, T: float) -> None:
-        """Take velocity and its error states over a period with the mean horizontal specific force (2,)."""
-        s.in_motion.velocity_n += f_n * T
+    def move(self, s: State, f_n: Array, turn_rate: float, T: float) -> None:
+        """Take velocities and their error states over a period with the mean horizontal specific force (2,)."""
+        m, own = s.in_motion, self._further.turning
+        m.velocity_n += f_n * T
+        turned = (m.turn_rate + m.swing) * T
+        turn = math.cos(turned) * np.eye(2) + math.sin(turned) * RIGHT
+        m.turning_n = turn @ m.turning_n * math.exp(-T / self.told.turning_speed_s)
         gain = np.zeros_like(s.P)
-        self._further.drive(gain)
+        self._further.drive(gain, turn_rate)
         whole = np.eye(len(s.x)) + T * gain
+        whole[own, own] = turn
         s.x[:] = whole @ s.x
         s.P[:] = whole @ s.P @ whole.T
 
@@ -238,5 +295,6 @@ class AnyMotionLevelling:
         s.q_nb[:] = quat_normalise(quat_multiply(quat_from_rotvec(s.x[PHI : PHI + 3]), s.q_nb))
         s.gyro_bias -= s.x[BIAS:STATES]
         s.in_motion.velocity_n -= s.x[self._velocity]
+        s.in_motion.turning_n -= s.x[self._further.turning]
         s.x[:STATES] = 0.0
-        s.x[self._velocity] = 0.0
+        s.x[self._velocity] = s.x[self._further.turning] = 0.0

@@ -44,9 +44,12 @@ class AnyMotion:
     airspeed_error_s: float = 1.0  # how long ``airspeed_sigma`` has one sign
     # Of the rate of turn that is an error, by misalignment and scale, over a second; more where a part is told so.
     gyro_share: float = 3e-3
-    unknown_speed: float = 15.0  # at which the body may be turning where airspeed does not tell [m/s]
-    turn_memory_s: float = 8.0  # time over which a turn is told from a swing
-
+    turning_speed: float = 20.0  # rms axis of the velocity that turns with the body, where airspeed does not tell [m/s]
+    turning_speed_s: float = 300.0  # how long it lasts
+    turn_memory_s: float = 12.0  # time over which its rate is taken
+    turn_smoothing_s: float = 4.0  # of the rate that tells a turn from a swing
+    # Of the square of that rate in that of all rates: up to the first it is a swing, from the second on a turn.
+    turn_shares: tuple[float, float] = (0.1, 0.3)
     field_tolerance: float = 0.1  # of the size of the magnetic field: further off it tells no heading
     dip_tolerance: float = 6 * DEG
     disturbance_s: float = 10.0  # how long what disturbs the field lasts

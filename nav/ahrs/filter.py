@@ -11,7 +11,7 @@ from nav import aids
 from nav.ahrs import steps as kernels
 from nav.ahrs.any_motion import AnyMotionLevelling
 from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig, limited
-from nav.ahrs.further import FurtherStates
+from nav.ahrs.further import RIGHT, FurtherStates
 from nav.ahrs.state import BIAS, CORRECTIONS, FIXED, LEVELLINGS, PERIOD_END, PHI, STATES, State, fresh, propagate
 from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import Mask
@@ -310,8 +310,7 @@ class Ahrs:
         f_0, compensated = self._steady_force(s, t)
         no_field = "magnetometer" in self._aids and not s.field_n.any()
         if self._any_motion is not None:
-            rate = math.sqrt(s.angle @ s.angle) / float(s.elapsed[1])
-            tilt_variance = self._any_motion.tilt_variance(f_0, rate, compensated)
+            tilt_variance = self._any_motion.tilt_variance(f_0)
         else:
             unaccelerated = abs(math.sqrt(f_0 @ f_0) - self._g) <= config.motion.acceleration_limit
             tilt_variance = config.tilt_sigma**2 if unaccelerated else math.nan
@@ -328,7 +327,8 @@ class Ahrs:
         s.P[:] = self._initial_covariance()
         if self._any_motion is not None:
             s.P[PHI, PHI] = s.P[PHI + 1, PHI + 1] = tilt_variance
-            s.P[PHI + 2, PHI + 2] += float(np.square(self.heading_measurement[0][0, :2]).sum()) * tilt_variance
+            self._any_motion.begin(s, f_0, s.angle / float(s.elapsed[1]), compensated)
+            s.P[PHI + 2, PHI + 2] += float(np.square(self.heading_measurement[0][0, :2]).sum() * s.P[PHI, PHI])
             s.field_n[:] = 0.0
             s.in_motion.fields = 0
         s.turned[:] = 0.0
@@ -368,13 +368,16 @@ class Ahrs:
             return
         f_n, compensated = self._steady_force(s, t)
         omega_b = s.angle / T - s.gyro_bias
-        how.watch(s, f_n, omega_b, T)
+        how.watch_turn(s, f_n, omega_b, T)
+        turn_rate = how.turn_rate(s, compensated)
+        level_n = f_n[:2] - turn_rate * (RIGHT @ s.in_motion.turning_n)
+        how.watch(s, level_n, T)
         acceleration = how.acceleration(s, compensated)
         s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
         s.counts[LEVELLINGS] += 1
-        H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, T)
-        reports.append(_fuse(s, H, R, how.unexplained(s, f_n[:2], T), t, "accelerometer", LEVEL))
-        how.move(s, f_n[:2], T)
+        H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, turn_rate, T)
+        reports.append(_fuse(s, H, R, how.unexplained(s, level_n, T), t, "accelerometer", LEVEL))
+        how.move(s, level_n, turn_rate, T)
         if s.in_motion.fields and self._field_n is not None:
             field_n = s.field_n / s.in_motion.fields
             z = math.remainder(_azimuth(field_n) - _azimuth(self._field_n), 2 * math.pi)
@@ -387,16 +390,23 @@ class Ahrs:
         s.counts[CORRECTIONS] += 1
 
     def level_measurement(
-        self, q_nb: Array, omega_b: Array, compensated: bool, acceleration: float = 0.0, T: float = 1.0
+        self,
+        q_nb: Array,
+        omega_b: Array,
+        compensated: bool,
+        acceleration: float = 0.0,
+        turn_rate: float = 0.0,
+        T: float = 1.0,
     ) -> tuple[Array, Array]:
         """H (2, n) and R (2,) of a levelling at the attitude ``q_nb`` and the rate ``omega_b``, with the acceleration
         taken off or without.
 
-        In any motion also by the horizontal ``acceleration`` expected [m/s^2], rms of an axis, over ``T`` [s].
+        In any motion also by the horizontal ``acceleration`` expected [m/s^2], rms of an axis, and by the rate of a
+        turn about the vertical [rad/s], over ``T`` [s].
         """
         H, R = kernels.level_measurement(q_nb, omega_b, compensated, *self._model)
         if self._any_motion is not None:
-            return self._any_motion.level_measurement(H, omega_b, compensated, acceleration, T)
+            return self._any_motion.level_measurement(H, omega_b, compensated, acceleration, turn_rate, T)
         return H, R
 
     def _update_magnetometer(self, sample: MagnetometerSample) -> list[UpdateReport]:

@@ -1,4 +1,4 @@
-"""Error states after the six, as far as they are asked for: gyro axes, accelerometer biases, gusts, velocity."""
+"""Error states after the six, as far as they are asked for: gyro axes, accelerometer biases, gusts, velocities."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ NAMES = (
     [f"accel_bias {axis}" for axis in "xyz"],
     ["gust north", "gust east"],
     ["velocity north", "velocity east"],
+    ["turning velocity north", "turning velocity east"],
 )
+RIGHT = np.array([[0.0, -1.0], [1.0, 0.0]])  # of a horizontal vector, a quarter of a turn on
+
 VELOCITY_SIGMA = 1.0  # of it at the start [m/s]
 
 
@@ -43,7 +46,8 @@ class FurtherStates:
 
         s_m^2 (1 + r) / (1 - r) = p = 2 s^2 tau / T,    so  r = (p - s_m^2) / (p + s_m^2)
 
-    Velocity (2,) is that of `nav.ahrs.any_motion`, which moves it itself.
+    Velocity (2,), and velocity (2,) that turns with the body, are those of `nav.ahrs.any_motion`, which moves them
+    itself; the latter fades as gusts do.
     """
 
     def __init__(self, config: AhrsConfig) -> None:
@@ -51,12 +55,15 @@ class FurtherStates:
         power = 2 * config.gust_sigma**2 * ratio
         variance = power * (1 + ratio * math.expm1(-1 / ratio))
         self._g = float(gravity(config.lat, config.h))
-        velocity = 0.0 if config.any_motion is None else VELOCITY_SIGMA
-        sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance), velocity
+        told = config.any_motion
+        velocity, turning, forgotten = (
+            (0.0, 0.0, 0.0) if told is None else (VELOCITY_SIGMA, told.turning_speed, 1 / told.turning_speed_s)
+        )
+        sigmas = config.gyro_misalignment_sigma, config.accel_bias_sigma, math.sqrt(variance), velocity, turning
         sizes = [len(names) if sigma > 0 else 0 for names, sigma in zip(NAMES, sigmas, strict=True)]
         edges = STATES + np.cumsum([0, *sizes])
         # where they lie in the state
-        self.misalignment, self.accel_bias, self.gust, self.velocity = (
+        self.misalignment, self.accel_bias, self.gust, self.velocity, self.turning = (
             slice(*edges[k : k + 2].tolist()) for k in range(len(NAMES))
         )
         self.count = sum(sizes)
@@ -65,7 +72,7 @@ class FurtherStates:
         self.names = [name for names, size in zip(NAMES, sizes, strict=True) for name in names[:size]]
         self.sigma = np.repeat(sigmas, sizes)  # (k,) at the start
         fading = -math.log((power - variance) / (power + variance)) / config.period_s if sizes[2] else 0.0
-        self.decay_rate = np.repeat([0.0, 0.0, fading, 0.0], sizes)  # (k,) [1/s]
+        self.decay_rate = np.repeat([0.0, 0.0, fading, 0.0, forgotten], sizes)  # (k,) [1/s]
 
     def turn(self, whole: Array, turned: Array, yaw_rate: float) -> None:
         """Put what the misaligned gyros make of ``yaw_rate`` [rad/s] into the transition ``whole`` (n, n).
@@ -74,11 +81,13 @@ class FurtherStates:
         """
         misaligned(whole, turned, yaw_rate, self.places[0])
 
-    def drive(self, F: Array) -> None:
-        """Put what tilt makes of the velocity into the system matrix ``F`` (n, n) [1/s]."""
+    def drive(self, F: Array, turn_rate: float) -> None:
+        """Put what tilt, and a turn about the vertical [rad/s], make of the velocities into ``F`` (n, n) [1/s]."""
         if self.velocity.stop > self.velocity.start:
             north, east = range(self.velocity.start, self.velocity.stop)
             F[north, PHI + 1], F[east, PHI] = self._g, -self._g
+            F[self.velocity, self.turning] = -turn_rate * RIGHT
+            F[self.turning, self.turning] += turn_rate * RIGHT
 
 
 @inlined

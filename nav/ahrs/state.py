@@ -26,13 +26,16 @@ class InMotion:
     velocity_n: Array = dataclasses.field(
         default_factory=lambda: np.zeros(2)
     )  # north and east, beside what airspeed tells
+    turning_n: Array = dataclasses.field(default_factory=lambda: np.zeros(2))  # the velocity that turns with the body
     force_n: Array = dataclasses.field(
         default_factory=lambda: np.zeros(2)
     )  # horizontal specific force, smoothed [m/s^2]
     mean_force_n: Array = dataclasses.field(default_factory=lambda: np.zeros(2))  # its mean of the last seconds
     force_variance: float = 0.0  # about that mean, of one axis
     turn_rate: float = 0.0  # about the vertical, mean of the last seconds [rad/s]
-    rate_square: float = 0.0  # of the rate about any axis, mean of the last seconds
+    swing: float = 0.0  # rate about the vertical, less that mean [rad/s]
+    steady_rate: float = 0.0  # about the vertical, smoothed [rad/s]
+    swing_square: float = 0.0  # of the rate about any axis, less that of the smoothed one, mean of the last seconds
     excess: float = 0.0  # of the square of the specific force over that of gravity, mean of the last seconds [m^2/s^4]
     fields: int = 0  # samples in `State.field_n` since the period began
     sensor: str = ""  # whose they are

@@ -178,8 +178,9 @@ def _of_ahrs(dataset: xarray.DataTree, name: str, way: _Way, ahrs: Ahrs) -> Visi
         C_nb = dcm_from_quat(q_nb)
         F[k, :3, :STATES] = transition(C_nb, earth_n, 1.0) - np.eye(3, STATES)
         further.turn(F[k], C_nb, way.omega_b[k, 2])
-        further.drive(F[k])
-        levelling = (*ahrs.level_measurement(q_nb, way.omega_b[k], compensated, float(seen[k])), level[k])
+        turn_rate = 0.0 if compensated else float(C_nb[2] @ way.omega_b[k])
+        further.drive(F[k], turn_rate)
+        levelling = *ahrs.level_measurement(q_nb, way.omega_b[k], compensated, float(seen[k]), turn_rate), level[k]
         measurements.append(_stacked([levelling, (*ahrs.heading_measurement, heading[k])], n))
     names = [f"phi {axis}" for axis in ("north", "east", "down")] + [f"gyro_bias {axis}" for axis in "xyz"]
     names += further.names

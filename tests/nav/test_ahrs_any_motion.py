@@ -13,7 +13,7 @@ from nav.ahrs import Ahrs, AhrsConfig
 from nav.earth import earth_rate_n, gravity
 from nav.error_model import ImuModel
 from nav.horizon import FusionHorizon
-from nav.samples import ImuSamples, MagnetometerSample, Outcome, Status
+from nav.samples import AirspeedSample, ImuSamples, MagnetometerSample, Outcome, Status
 
 DEG = math.pi / 180
 LAT, DT = 0.9, 0.01
@@ -288,3 +288,40 @@ def test_after_a_gap_it_is_right_in_five_seconds(gap_s):
         assert np.abs(off[2]) < 20 * DEG
     aligning = [one.t for one in told[0] if Status.ALIGNING in one.status and one.t > 5]
     assert bool(aligning) == (gap_s > 1.0)
+
+
+def circling(straight_s, seconds, bias=(0.0, 0.0, 0.0)):
+    """A wing at 25 m/s that banks into a circle of 400 m within three seconds, and stays in it."""
+    t = np.arange(round((straight_s + seconds) / DT) + 1) * DT
+    rate = 25.0 / 400.0 * np.clip((t - straight_s + 3.0) / 3.0, 0.0, 1.0)
+    heading = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * DT)]) + 0.5
+    attitude = Rotation.from_euler("ZYX", np.column_stack([heading, np.full(len(t), 0.05), np.arctan(25.0 * rate / G)]))
+    velocity = 25.0 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(t))])
+    return made(t, attitude, np.diff(velocity, axis=0) / DT, bias)
+
+
+FINE = replace(
+    BLIND, imu=ImuModel(gyro_noise=5e-3 * DEG, accel_noise=2e-3, gyro_bias_sigma=40 / 3600 * DEG, accel_bias_sigma=0.0)
+)
+
+
+@pytest.mark.parametrize(("straight_s", "worst_deg"), [(60.0, 1.0), (0.0, 2.5)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_circle_that_never_ends_does_not_tilt_the_horizon(straight_s, worst_deg, sign):
+    """Nothing tells the speed of a wing without a pitot tube: what its circle accelerates is taken for no tilt, and not
+    for biases of the gyros; begun in the circle, the first levelling is off by the whole bank, and is found so."""
+    motion = circling(straight_s, 400.0, bias=np.array([40, -30, 35]) * sign / 3600 * DEG)
+    t, phi, covariance, found, _ = track(motion, FINE)
+    late = t > straight_s + 60
+    assert np.abs(phi[late, :2]).max() < worst_deg * DEG
+    assert np.all(np.abs(phi[late]) < 3.5 * np.sqrt(covariance.diagonal(axis1=1, axis2=2)[late]))
+    assert np.abs(found[-1].gyro_bias).max() < 120 / 3600 * DEG
+
+
+def test_airspeed_tells_the_circle_better():
+    """What turns with the body is left to airspeed where there is one."""
+    motion = circling(60.0, 200.0)
+    told = replace(FINE, aids=("airspeed",), airspeed_sigma=0.3)
+    samples = [AirspeedSample(now, now, 25.0) for now in motion.imu.t[::20].tolist()]
+    t, phi, _, _, _ = track(motion, told, samples)
+    assert np.abs(phi[t > 30, :2]).max() < 0.4 * DEG

@@ -177,7 +177,9 @@ def test_an_ahrs_never_sees_its_heading_without_a_magnetometer() -> None:
     )
     found = seen(Scenario.load("kinematic_u_flight", [*overridden(estimators), "duration_s=60"]))
     assert list(found) == ["plain", "magnetic", "gyros", "any"]
-    assert found["any"].names[-2:] == ["velocity north", "velocity east"]
+    assert found["any"].names[-4:] == [
+        f"{of} {axis}" for of in ("velocity", "turning velocity") for axis in ("north", "east")
+    ]
     for name in ("plain", "magnetic", "any"):
         assert found[name].names[:3] == ["phi north", "phi east", "phi down"]
         assert (found[name].seen_from()[:2] < 8).all()  # 2 s of alignment, and a segment
