@@ -173,6 +173,7 @@ class Px4(threading.Thread):
 
     def run(self) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as link:
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a byte at a time is one
             for _ in range(TRIES):
                 try:
                     link.connect(("127.0.0.1", self.port))
