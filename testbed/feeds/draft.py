@@ -126,7 +126,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
         lines.append(f"date = {date.isoformat()}")
     else:
         lines.append("# date = 2024-06-01  # the log doesn't say: give it, for the magnetic field")
-    place = os.path.relpath(log.path.resolve(), out.resolve().parent)
+    place = _seen_from(out, log.path)
     kept = {} if truth is None else _kept(truth, out)
     lines += ["", "[truth]", 'source = "log"', f"file = {json.dumps(place)}"]
     lines += [f"{key} = {_inline(value)}" for key, value in ({"rate_hz": ROWS_HZ} | kept).items()]
@@ -139,7 +139,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     elif not is_placed(log):
         lines.append(f"start = {_inline(ASSUMED)}  # assumed: the log doesn't say where: give it")
     if truth is not None and truth.columns:
-        lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth).items()]
+        lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth, out).items()]
     for name, keys in own.items():
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
     main = next(iter(log.imus))
@@ -179,13 +179,21 @@ def _kept(truth: LogTruth, out: Path) -> dict[str, Any]:
     said = truth.model_dump(exclude_unset=True, include={"aircraft", "rate_hz", "start_s", "terrain"})
     ground = said.get("terrain", {})
     if ground.get("file") not in (None, JACKSBORO):
-        ground["file"] = os.path.relpath(Path(ground["file"]).resolve(), out.resolve().parent)
+        ground["file"] = _seen_from(out, ground["file"])
     return {key: value for key, value in said.items() if value is not None}
 
 
-def _columns(truth: LogTruth) -> Mapping[str, Any]:
-    """What the scenario said of a table's columns, without what it left out."""
-    return {name: stream.model_dump(exclude_unset=True) for name, stream in truth.columns.items()}
+def _columns(truth: LogTruth, out: Path) -> Mapping[str, Any]:
+    """What the scenario said of a table's columns, without what it left out, files as seen from ``out``."""
+    said = {name: stream.model_dump(exclude_unset=True) for name, stream in truth.columns.items()}
+    for stream in said.values():
+        if stream.get("file") is not None:
+            stream["file"] = _seen_from(out, stream["file"])
+    return {name: {key: one for key, one in stream.items() if one is not None} for name, stream in said.items()}
+
+
+def _seen_from(out: Path, file: str | Path) -> str:
+    return os.path.relpath(Path(file).resolve(), out.resolve().parent)
 
 
 def _inline(value: Any) -> str:

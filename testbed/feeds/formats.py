@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeAlias
 
 from testbed.errors import UserError
 from testbed.feeds.log import Log
+from testbed.feeds.text import is_table
 from testbed.motion.logged import LogTruth, Stream
 
 LARGEST_BYTES = 1 << 30
@@ -46,17 +47,20 @@ def open_log(truth: LogTruth) -> Log:
 
     Raises UserError when there is no such file, it is none of the known formats, or damaged.
     """
-    path = Path(truth.file)
-    try:
-        stat = path.stat()
-    except OSError as error:
-        raise UserError(f"truth.file: {path}: {error.strerror}") from None
+    states = []
+    for key, file in truth.files.items():
+        try:
+            stat = Path(file).stat()
+        except OSError as error:
+            raise UserError(f"truth.{key}: {file}: {error.strerror}") from None
+        states.append((stat.st_size, stat.st_mtime_ns))
     asked = truth.model_dump_json(include={"source", "file", "columns"})  # what the log is read by
-    return _read_once(asked, stat.st_size, stat.st_mtime_ns)
+    return _read_once(asked, tuple(states))
 
 
 @lru_cache(maxsize=2)
-def _read_once(truth: str, size: int, changed_ns: int) -> Log:
+def _read_once(truth: str, states: tuple[tuple[int, int], ...]) -> Log:
+    """``states`` of its files are sizes and times of change: another one is read anew."""
     asked = LogTruth.model_validate_json(truth)
     return read(Path(asked.file), asked.columns)
 
@@ -88,15 +92,10 @@ def known(path: Path) -> Format:
     for one in FORMATS:
         if head.startswith(one.begins) or (one.line and b"\n" + one.line in head):
             return one
-    if _is_text(head):
+    if is_table(head):
         return CSV
     if head[8:9] in (b"\xfd", b"\xfe"):
         what = "a telemetry log, which has no inertial data at their rate"
         raise UserError(f"{path}: is {what}: give the log that the autopilot kept on board")
     names = ", ".join(one.name for one in (*FORMATS, CSV))
     raise UserError(f"{path}: is no log of a known format: these are {names}")
-
-
-def _is_text(head: bytes) -> bool:
-    """Whether a file begins as a text of several columns does."""
-    return b"," in head and all(byte >= 32 or byte in b"\t\r\n" for byte in head)

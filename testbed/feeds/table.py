@@ -1,10 +1,9 @@
-"""A table as a log: .npz, .csv, .mat or .parquet. The scenario says what each column is (`testbed.motion.logged`)."""
+"""A table as a log: .npz, .mat, .parquet or text. The scenario says what each column is (`testbed.motion.logged`)."""
 
 from __future__ import annotations
 
-import csv
 import math
-import warnings
+import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -15,6 +14,8 @@ import numpy as np
 from nav.earth import isa_pressure
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, shown, unknown
+from testbed.feeds import text
+from testbed.feeds.formats import known
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.reference import doubt, silence
 from testbed.feeds.rest import tilted
@@ -24,6 +25,7 @@ from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
 PARQUET = b"PAR1"
+DATE = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d")  # as ISO 8601 has it, with a time of day
 LONGEST_SHOWN = 20  # of what is no number
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -88,11 +90,19 @@ class Table(NamedTuple):
 
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
-    """Read a table by the ``columns`` of its sensors. Raises UserError when it, or what is said of it, is wrong."""
-    table = load(path)
-    found = {name: len(values) for name, values in table.numbers.items()}
+    """Read a table, and those of sensors that have their own, by their ``columns``.
+
+    Raises UserError when one, or what is said of it, is wrong.
+    """
+    files = {name: path if stream.file is None else Path(stream.file) for name, stream in columns.items()}
+    of_files = {file: load(file) for file in dict.fromkeys([path, *files.values()])}
+    found = {
+        name if file == path else f"{name} of {file.name}": len(values)
+        for file, table in of_files.items()
+        for name, values in table.numbers.items()
+    }
     if not columns:
-        there = ", ".join(f"{name} {values.shape}" for name, values in table.numbers.items())
+        there = ", ".join(f"{name} {values.shape}" for name, values in of_files[path].numbers.items())
         raise UserError(
             f"{path}: is a table: say in [truth.columns.<sensor>] what its columns are. It has {there or 'none'}"
         )
@@ -104,7 +114,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = _stream(table, name, kind, stream, heard, notes)
+        t, values = _stream(of_files[files[name]], name, kind, stream, heard, notes)
         if kind == "imu":
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
@@ -140,7 +150,9 @@ def _contradicted(
 
 
 def load(path: Path) -> Table:
-    """The columns of a file. Raises UserError when it can't be read."""
+    """The columns of a file. Raises UserError when it can't be read, or is a log of another format."""
+    if (found := known(path)).module != "table":
+        raise UserError(f"{path}: is {found.name}, and no table")
     with path.open("rb") as file:
         head = file.read(16)
     try:
@@ -151,17 +163,12 @@ def load(path: Path) -> Table:
             from scipy.io import loadmat
 
             return _sorted(path, _flat(loadmat(path, simplify_cells=True)))
-        import pandas
-
         if head.startswith(PARQUET):
+            import pandas
+
             frame = pandas.read_parquet(path, engine="pyarrow")
             return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
-        named = len(pandas.read_csv(path, skipinitialspace=True, index_col=False, nrows=0).columns)
-        unnamed = 0 if _has_row_names(path, named) else False
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
-            frame = pandas.read_csv(path, skipinitialspace=True, index_col=unnamed, low_memory=False)
-        return _sorted(path, ((str(name), frame[name].to_numpy()) for name in frame.columns))
+        return _sorted(path, text.columns(path))
     except UserError:
         raise
     except ImportError:
@@ -171,29 +178,6 @@ def load(path: Path) -> Table:
         raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
     except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
-
-
-def _has_row_names(path: Path, most: int) -> bool:
-    """Whether all rows of a CSV have one field more than it has names: then the first has none, as R writes them.
-
-    Raises UserError when only some have something after the last column: no telling which is which.
-    """
-    with path.open(encoding="utf-8", errors="replace") as file:
-        if not any(line.count(",") >= most for line in file):
-            return False
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        rows = csv.reader(file, skipinitialspace=True)
-        next((fields for fields in rows if fields), None)  # the names
-        more: dict[int, int] = {}  # by how many fields, the first line with something in one that has no name
-        for fields in rows:
-            if fields:
-                more.setdefault(len(fields) if any(one.strip() for one in fields[most:]) else 0, rows.line_num)
-    if set(more) == {most + 1}:
-        return True
-    for count, line in more.items():
-        if count:
-            raise UserError(f"{path}: line {line} has {count} fields, and the first, which names them, {most}")
-    return False
 
 
 def _stacked(values: Any) -> Any:
@@ -206,12 +190,27 @@ def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
     """Those that hold numbers, as floats, and the others."""
     numbers, others = {}, {}
     for name, values in columns:
-        array = np.asarray(values)
+        array = _seconds(np.asarray(values))
         if array.ndim in (1, 2) and array.dtype.kind in "fiub":
             numbers[name] = array.astype(float)
         elif array.ndim:
             others[name] = _instead(array)
     return Table(path, numbers, others)
+
+
+def _seconds(array: Any) -> Any:
+    """Dates and times of day, which are UTC where they don't say, as seconds since 1970; any other column as it is."""
+    import pandas
+
+    said = next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
+    if array.ndim != 1 or not (array.dtype.kind == "M" or DATE.match(said)):
+        return array
+    try:
+        times = pandas.to_datetime(pandas.Series(array), format="ISO8601", utc=True)
+    except ValueError:
+        return array
+    since = times - pandas.Timestamp(0, tz="UTC")
+    return since.dt.total_seconds().to_numpy()
 
 
 def _instead(array: Any) -> str:

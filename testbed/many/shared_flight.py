@@ -37,7 +37,7 @@ def share_truth(folder: Path, scenarios: Sequence[Scenario]) -> Path | None:
 
 def log_digests(scenarios: Sequence[Scenario]) -> list[str]:
     """What tells the logs, tables of wind and maps of these scenarios, if any, from others."""
-    files = {Path(one.truth.file) for one in scenarios if isinstance(one.truth, LogTruth)}
+    files = {Path(file) for one in scenarios if isinstance(one.truth, LogTruth) for file in one.truth.files.values()}
     winds = [one.truth.wind.file for one in scenarios if isinstance(one.truth, FlightTruth)]
     grounds = [one.truth.terrain.file for one in scenarios]
     files |= {Path(file) for file in (*winds, *grounds) if file}

@@ -83,6 +83,9 @@ class Stream(Section):
     """
 
     kind: str | None = Field(default=None, description="of the sensor; none: its name")
+    file: str | None = Field(
+        default=None, description="the table that its columns are in, seen from this file; none: that of `truth.file`"
+    )
     time: Column = Field(description="time, at which a sample is valid, or was told of after the sensor's latency")
     form: Literal["averaged", "instantaneous", "increments"] = Field(
         default="averaged",
@@ -146,7 +149,7 @@ class LogTruth(Section):
     source: Literal["log"]
     file: str = Field(
         description="the log, seen from this file: ArduPilot .bin or .log, PX4 .ulg, run.nc, or a table: "
-        ".npz, .csv, .mat, .parquet"
+        ".npz, .mat, .parquet, or text such as .csv"
     )
     aircraft: str | None = Field(
         default=None, description="an aircraft that flies as this one did, for what estimators expect; none: any body"
@@ -163,3 +166,9 @@ class LogTruth(Section):
     columns: dict[str, Stream] = Field(
         default_factory=dict, description="of a table: the columns of each sensor, by name, and of the `reference`"
     )
+
+    @property
+    def files(self) -> dict[str, str]:
+        """All that it is in, by the keys that name them."""
+        own = {f"columns.{name}.file": stream.file for name, stream in self.columns.items() if stream.file is not None}
+        return {"file": self.file, **own}

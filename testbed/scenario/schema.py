@@ -370,7 +370,8 @@ def _see_files(truth: dict[str, Any], path: Path | None) -> None:
     folder = path.parent if path else Path()
     if isinstance(named := truth.get("aircraft"), str):
         truth["aircraft"] = _aircraft(named, path)
-    for table in (truth if truth.get("source") == "log" else None, truth.get("wind"), truth.get("terrain")):
+    streams = truth["columns"].values() if isinstance(truth.get("columns"), dict) else ()
+    for table in (truth if truth.get("source") == "log" else None, *streams, truth.get("wind"), truth.get("terrain")):
         if isinstance(table, dict) and isinstance(file := table.get("file"), str) and file != terrain.JACKSBORO:
             table["file"] = str(folder / file)
 

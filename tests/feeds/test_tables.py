@@ -354,10 +354,11 @@ def test_a_column_that_holds_text_is_told(mangle: Callable[[list[str]], None], s
         of_text(tmp_path, [HEADER, *rows])
 
 
-def test_a_column_of_dates_is_told(tmp_path: Path) -> None:
+def test_a_column_of_spans_of_time_is_told(tmp_path: Path) -> None:
+    """Of dates it is known what they are, of these not since when."""
     table = standing()
-    table["t"] = table["t"].astype("datetime64[s]")
-    with pytest.raises(UserError, match=r"imu\.time: t of .*npz holds datetime64\[s\]: give seconds as numbers"):
+    table["t"] = table["t"].astype("timedelta64[s]")
+    with pytest.raises(UserError, match=r"imu\.time: t of .*npz holds timedelta64\[s\]: give seconds as numbers"):
         read(tmp_path, table)
 
 

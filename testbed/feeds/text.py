@@ -1,0 +1,150 @@
+"""A table that is text: what parts its fields, which line names them, and its columns."""
+
+from __future__ import annotations
+
+import csv
+import re
+import warnings
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from testbed.errors import UserError
+
+COMMENTS = ("#", "%")
+MARKS = (";", "\t", ",")  # that part fields, the first that a row has; else spaces do
+SPACES = " "
+QUOTED = re.compile(r'"[^"]*"')
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+MISSING = ("", "NA", "N/A", "null")  # in place of numbers
+
+
+class Layout(NamedTuple):
+    """How a text is a table: the mark between its fields, or `SPACES`, and what its numbers have for a point.
+
+    ``above`` lines come before that of the ``names``, or without these before the first row, which has ``width``
+    fields. Names behind the mark of a comment, a field of its own, are ``hidden``.
+    """
+
+    mark: str
+    decimal: str
+    above: int
+    names: list[str]
+    width: int
+    hidden: bool = False
+
+
+def layout(lines: Iterable[str]) -> Layout:
+    """How a text is to be read: its first line has the names, unless it is numbers, or a comment that has not as many.
+
+    ``lines`` are at least those up to the second that is no comment.
+    """
+    comment = 0, ""  # the last one before the first other line, with its number
+    plain: list[tuple[int, str]] = []  # the first two of these
+    for number, raw in enumerate(lines):
+        line = raw.strip("\ufeff\r\n")
+        if line.startswith(COMMENTS) and not plain:
+            comment = number, line
+        elif line.strip():
+            plain.append((number, line))
+        if len(plain) == 2:
+            break
+    if not plain:
+        return Layout(",", ".", comment[0], _fields(comment[1], ","), 0)
+    (number, first), (_, row) = plain[0], plain[-1]
+    mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES)
+    fields = _fields(row, mark)
+    decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, fields)) else "."
+    width, top = len(fields), _fields(first, mark)
+    for names, hidden in ((_fields(comment[1], mark), False), (_fields(comment[1][1:], mark), True)):
+        if comment[1] and len(names) == len(top) > 1:
+            return Layout(mark, decimal, comment[0], names, width, hidden)
+    if _are_numbers(top, decimal):
+        return Layout(mark, decimal, number, [], width)
+    return Layout(mark, decimal, number, top, width)
+
+
+def is_table(head: bytes) -> bool:
+    """Whether a file begins as a text of several columns does: with commas, or with numbers."""
+    if any(byte < ord(" ") and byte not in b"\t\r\n" for byte in head):
+        return False
+    lines = [line for line in head.decode(errors="replace").splitlines() if line.strip() and line[0] not in COMMENTS]
+    found = layout(lines)
+    return b"," in head or (found.width > 1 and _are_numbers(_fields(lines[:2][-1], found.mark), found.decimal))
+
+
+def columns(path: Path) -> Iterator[tuple[str, Any]]:
+    """Name and values of each column of a text; those without names are numbered from 0.
+
+    Raises UserError where rows have more fields than there are names.
+    """
+    import pandas
+
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        found = layout(file)
+    index: int | bool | None = False
+    if found.names and found.mark == SPACES:
+        index = None  # one field more than there are names is a name of the row, as R writes it
+        if not 0 <= found.width - len(found.names) <= 1:
+            told = f"names {len(found.names)} columns, and the row after it has {found.width} fields"
+            raise UserError(f"{path}: line {found.above + 1} {told}: names with spaces need quotes, or other marks")
+    elif found.names:
+        index = 0 if _has_row_names(path, found) else False
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
+        frame = pandas.read_csv(
+            path,
+            sep=r"\s+" if found.mark == SPACES else found.mark,
+            decimal=found.decimal,
+            skiprows=found.above + found.hidden,
+            header=0 if found.names and not found.hidden else None,
+            names=found.names if found.hidden else None,
+            skipinitialspace=True,
+            index_col=index,
+            low_memory=False,
+        )
+    return ((str(name), frame[name].to_numpy()) for name in frame.columns)
+
+
+def _fields(line: str, mark: str) -> list[str]:
+    """The fields of a line; what spaces part may be parted by several, or by tabs."""
+    parts = re.sub(r"\s+", " ", line.strip()) if mark == SPACES else line
+    return [one.strip() for one in next(csv.reader([parts], delimiter=mark, skipinitialspace=True), [])]
+
+
+def _are_numbers(fields: list[str], decimal: str) -> bool:
+    """Whether fields are a row of numbers: no names, as the numbers of columns counted from 0 are."""
+    given = [one for one in fields if one not in MISSING]
+    counted = [str(k) for k in range(len(given))]
+    return bool(given) and given != counted and all(_is_number(one.replace(decimal, ".")) for one in given)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _has_row_names(path: Path, found: Layout) -> bool:
+    """Whether all rows have one field more than there are names: then the first has none, as R writes them.
+
+    Raises UserError when only some have something after the last column: no telling which is which.
+    """
+    most = len(found.names)
+    with path.open(encoding="utf-8", errors="replace") as file:
+        if not any(line.count(found.mark) >= most for line in file):
+            return False
+    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+        rows = csv.reader(file, delimiter=found.mark, skipinitialspace=True)
+        more: dict[int, int] = {}  # by how many fields, the first line with something in one that has no name
+        for fields in rows:
+            if fields and rows.line_num > found.above + 1:
+                more.setdefault(len(fields) if any(one.strip() for one in fields[most:]) else 0, rows.line_num)
+    if set(more) == {most + 1}:
+        return True
+    for count, line in more.items():
+        if count:
+            raise UserError(f"{path}: line {line} has {count} fields, and the first, which names them, {most}")
+    return False

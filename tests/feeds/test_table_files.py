@@ -1,0 +1,198 @@
+"""Tables of text as other programs write them, and sensors that have files of their own."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from nav.rotation import euler_from_quat
+from testbed import Scenario, run
+from testbed.errors import UserError
+from testbed.feeds import draft, formats
+from testbed.feeds.survey import survey
+from testbed.feeds.table import load
+from testbed.many.shared_flight import log_digests
+from testbed.motion.logged import LogTruth
+
+T = np.arange(1, 1501) / 50
+IMU = np.column_stack([T, np.zeros((1500, 3)), np.tile([0.0, 0.0, -9.8 / 50], (1500, 1))])  # increments
+FIXES = np.column_stack([T[::10], np.tile([47.0, 8.0, 500.0, 0.0, 0.0, 0.0], (150, 1))])
+NAMES = ["t", "gx", "gy", "gz", "fx", "fy", "fz"]
+
+
+def rows(table: Any, mark: str, decimal: str = ".") -> list[str]:
+    return [mark.join(f"{one:.9f}".replace(".", decimal) for one in row) for row in table]
+
+
+@pytest.mark.parametrize(
+    ("mark", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), (" ", "."), ("   ", ".")]
+)
+@pytest.mark.parametrize(
+    ("above", "named"),
+    [
+        ([], NAMES),
+        (["a flight", "of an hour"], NAMES),
+        ([], [f"# {NAMES[0]}", *NAMES[1:]]),
+        ([], [f"%{NAMES[0]}", *NAMES[1:]]),
+        ([], None),
+        (["a remark"], None),
+    ],
+)
+def test_a_text_tells_how_it_is_to_be_read(
+    mark: str, decimal: str, above: list[str], named: list[str] | None, tmp_path: Path
+) -> None:
+    """Marks and decimal points of all kinds, names in the first line or in a comment, or none."""
+    head = [f"# {line}" for line in above] + ([mark.join(named)] if named else [])
+    (tmp_path / "imu.txt").write_text("\n".join([*head, "", *rows(IMU, mark, decimal), ""]))
+    found = load(tmp_path / "imu.txt").numbers
+    first = [name for name in found if "t" in name] if named else ["0"]
+    assert list(found) == (first + NAMES[1:] if named else [str(k) for k in range(7)])
+    np.testing.assert_allclose(np.column_stack(list(found.values())), IMU, atol=1e-9)
+
+
+def test_numbers_that_count_the_columns_are_names(tmp_path: Path) -> None:
+    """As a data frame without names is written, with and without its index."""
+    for index in ("", ",0,1,2"):
+        lines = [index or "0,1,2", *(f"{k}," * bool(index) + f"{k / 10},1.5,2.5" for k in range(20))]
+        (tmp_path / "a.csv").write_text("\n".join(lines))
+        assert load(tmp_path / "a.csv").numbers["0"].tolist() == [k / 10 for k in range(20)]
+
+
+def test_rows_of_text_parted_by_spaces_may_have_names(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("\n".join(['"t" "a"', *(f'"{k}" {k / 10} 1.5' for k in range(20))]))
+    assert load(tmp_path / "a.txt").numbers["t"].tolist() == [k / 10 for k in range(20)]
+
+
+def test_names_with_spaces_between_spaces_are_told(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("\n".join(["time gyro x gyro y", *(f"{k / 10} 1.5 2.5" for k in range(20))]))
+    with pytest.raises(UserError, match=r"line 1 names 5 columns, and the row after it has 3 fields"):
+        load(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("words", ["Dear diary, we flew", "we flew\nand landed", "1 fish 2 fish\n3 fish"])
+def test_prose_is_no_table(words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text(words)
+    with pytest.raises(UserError):
+        formats.read(tmp_path / "a.txt", {})
+
+
+COLUMNS = {
+    "imu": {
+        "time": "0",
+        "form": "increments",
+        "gyro": {"column": ("1", "2", "3"), "unit": "rad"},
+        "accel": {"column": ("4", "5", "6"), "unit": "m/s"},
+    },
+    "gnss": {
+        "file": "fixes.txt",
+        "time": "0",
+        "lat": {"column": "1", "unit": "deg"},
+        "lon": {"column": "2", "unit": "deg"},
+        "height": "3",
+        "velocity": ("4", "5", "6"),
+    },
+}
+SCENARIO = """
+title = "files of a toolbox"
+duration_s = 25.0
+date = 2024-06-01
+[truth]
+source = "log"
+file = "imu.txt"
+[truth.columns.imu]
+time = "0"
+form = "increments"
+gyro = { column = ["1", "2", "3"], unit = "rad" }
+accel = { column = ["4", "5", "6"], unit = "m/s" }
+[truth.columns.gnss]
+file = "fixes.txt"
+time = "0"
+lat = { column = "1", unit = "deg" }
+lon = { column = "2", unit = "deg" }
+height = "3"
+velocity = ["4", "5", "6"]
+[sensors.imu]
+kind = "imu"
+grade = "mems-hobby"
+[sensors.gnss]
+[[estimator]]
+name = "ahrs"
+kind = "ahrs"
+aids = []
+heading_deg = 0.0
+"""
+
+
+def write(folder: Path, fixes: Any = FIXES) -> Path:
+    """The files of two sensors, without names, and their scenario."""
+    (folder / "imu.txt").write_text("\n".join(rows(IMU, " ")))
+    (folder / "fixes.txt").write_text("\n".join(rows(fixes, "  ")))
+    (folder / "flight.toml").write_text(SCENARIO)
+    return folder / "flight.toml"
+
+
+def test_each_sensor_may_have_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen from the scenario, wherever it is called from: a navigation toolbox's own files are a flight."""
+    (tmp_path / "flight").mkdir()
+    scenario = Scenario.load(write(tmp_path / "flight"))
+    assert isinstance(scenario.truth, LogTruth)
+    log = formats.open_log(scenario.truth)
+    assert len(log.imus["imu"]) == 1500
+    assert len(log.samples["gnss"]) == 150
+    assert log.messages["1"] == 1500
+    assert log.messages["1 of fixes.txt"] == 150
+    monkeypatch.chdir(tmp_path)
+    flown = run(Scenario.load(Path("flight/flight.toml"))).dataset
+    assert len(flown["sensors/gnss/time"]) == 125
+    assert abs(euler_from_quat(flown["estimators/ahrs/q_nb"].values[-1])[:2]).max() < 0.01
+
+
+def test_a_file_of_a_sensor_that_has_changed_is_another_log(tmp_path: Path) -> None:
+    scenario = Scenario.load(write(tmp_path))
+    assert isinstance(scenario.truth, LogTruth)
+    before = len(formats.open_log(scenario.truth).samples["gnss"]), log_digests([scenario])
+    write(tmp_path, FIXES[:100])
+    after = len(formats.open_log(scenario.truth).samples["gnss"]), log_digests([scenario])
+    assert (before[0], after[0]) == (150, 100)
+    assert len(before[1]) == 2
+    assert before[1] != after[1]
+
+
+def test_a_draft_keeps_the_files(tmp_path: Path) -> None:
+    (tmp_path / "drafts").mkdir()
+    out = tmp_path / "drafts" / "draft.toml"
+    truth = Scenario.load(write(tmp_path)).truth
+    assert isinstance(truth, LogTruth)
+    out.write_text(draft.scenario(survey(formats.open_log(truth)), out, truth, dt.date(2024, 6, 1)))
+    drafted = Scenario.load(out)
+    assert isinstance(drafted.truth, LogTruth)
+    assert Path(drafted.truth.columns["gnss"].file or "").resolve() == tmp_path / "fixes.txt"
+    assert len(formats.open_log(drafted.truth).samples["gnss"]) == 150
+
+
+def test_what_is_wrong_with_a_sensors_file_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    (tmp_path / "fixes.txt").unlink()
+    truth = Scenario.load(path).truth
+    assert isinstance(truth, LogTruth)
+    with pytest.raises(UserError, match=r"truth\.columns\.gnss\.file: .*fixes\.txt: No such file"):
+        formats.open_log(truth)
+    (tmp_path / "fixes.txt").write_bytes(b"\xa3\x95" + bytes(100))
+    with pytest.raises(UserError, match=r"fixes\.txt: is ArduPilot DataFlash, and no table"):
+        formats.open_log(truth)
+
+
+def test_dates_are_times(tmp_path: Path) -> None:
+    """As ISO 8601 has them, of any zone: UTC where they say none."""
+    start = dt.datetime(2024, 6, 1, 12, tzinfo=dt.UTC)
+    said = [(start + dt.timedelta(seconds=k / 50)).isoformat() for k in range(100)]
+    for cut, end in ((None, ""), (-6, ""), (-6, "Z")):
+        lines = ["t,a", *(f"{one[:cut]}{end},1.5" for one in said)]
+        (tmp_path / "a.csv").write_text("\n".join(lines))
+        np.testing.assert_allclose(
+            load(tmp_path / "a.csv").numbers["t"], start.timestamp() + np.arange(100) / 50, atol=1e-6
+        )
