@@ -39,6 +39,7 @@ from nav.velocity_matching import VelocityMatching
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REST_SPEED = 0.5  # slower than this is standing [m/s]
 COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
+COURSE_SIGMA_LIMIT = math.radians(40.0)  # beyond which, by wind, it does not: filters are linear
 HEADING_SIGMA_LIMIT = math.radians(10.0)  # no gyrocompassing with gyros that leave more than this
 DIFFERENCE_S, USUAL_ACCELERATION = 1.0, 3.0  # of positions that tell a velocity; of small vehicles [s, m/s^2]
 WITHOUT_VELOCITY_S = 10.0  # so long must it take then: as long as errors of such velocities are small beside gravity's
@@ -287,9 +288,9 @@ class Alignment:
             return _Heading(
                 field_b, field_n, self.aids.field**2 / self._fields, self._magnetometer(field_b, field_bias)
             )
-        if speed >= COURSE_SPEED:
+        if speed >= COURSE_SPEED and self.aids.wind <= COURSE_SIGMA_LIMIT * speed:
             course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
-            return _Heading(np.array([1.0, 0.0, 0.0]), course, 0.0, heading_sigma=min(1.0, self.aids.wind / speed))
+            return _Heading(np.array([1.0, 0.0, 0.0]), course, 0.0, heading_sigma=self.aids.wind / speed)
         at_rest = max(speed, float(np.linalg.norm(first.v_n))) <= REST_SPEED
         earth_n = earth_rate_n(fix.lat)
         left = math.hypot(self.imu.gyro_bias_sigma, self.imu.gyro_drift_sigma) / abs(float(earth_n[0]))

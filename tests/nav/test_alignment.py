@@ -4,9 +4,12 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pymap3d
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from worlds.ins import CONSUMER, DEG, FIELD_N, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
+from worlds.ins import CONSUMER, DEG, FIELD_N, Flight, at_rest, barometer, error, feed, flight, gnss, imu, magnetometer
+from worlds.motion import RATE_HZ
 
 from nav.aids import GnssAid, MagnetometerAid
 from nav.alignment import AidSigmas, Alignment
@@ -14,9 +17,25 @@ from nav.error_model import CROSS, ImuModel
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import FixType, GnssSample, ImuSamples, Status
+from testbed.motion.table import increments
 
 COMPASS, NOTHING = MagnetometerAid(), np.zeros((3, 3))
 NAVIGATION = ImuModel(0.002 * DEG / 60, 1e-4, 0.003 * DEG / 3600, 3e-4)
+
+
+def driven(duration_s):
+    """From rest to 16 m/s in four seconds, over a hill, and U-turns of ten seconds."""
+    t = np.arange(duration_s * RATE_HZ + 1) / RATE_HZ
+    speed = 4.0 * np.minimum(t, 4.0)
+    heading = -0.3 + np.cumsum(np.where((t > 24) & (t % 30 > 20), math.pi / 10, 0.0)) / RATE_HZ
+    pitch = math.radians(10.0) * np.clip((t - 4.0) / 4.0, 0.0, 1.0) * np.clip((12.0 - t) / 4.0, 0.0, 1.0)
+    level = np.cos(pitch)
+    v_n = speed[:, None] * np.column_stack([level * np.cos(heading), level * np.sin(heading), -np.sin(pitch)])
+    moved = np.concatenate([[np.zeros(3)], np.cumsum((v_n[1:] + v_n[:-1]) / (2 * RATE_HZ), axis=0)])
+    lat, lon, h = pymap3d.ned2geodetic(*moved.T, 48 * DEG, 11 * DEG, 400.0, deg=False)
+    q_nb = Rotation.from_euler("ZY", np.column_stack([heading, pitch])).as_quat(scalar_first=True)
+    rows = t, lat, lon, h, v_n, q_nb
+    return Flight(*rows, *increments(*rows))
 
 
 def align(
@@ -124,6 +143,30 @@ def test_course_in_flight_without_magnetometer():
     assert 10 * DEG < sigma[8] < 40 * DEG
     assert abs(wrong[8]) < 2 * sigma[8]
     assert (np.abs(wrong[6:8]) < 3.5 * sigma[6:8]).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_vehicle_that_sets_off_is_not_aligned_by_a_course_that_may_be_anything(seed):
+    """At 8 m/s wind may turn the heading by a radian, and what accelerates by 4 m/s^2 is tilted by 20 deg with it: one of
+    these was 8 m off for a minute, one of another simulator 2 km. It waits until it is faster."""
+    truth, rng = driven(90), np.random.default_rng(5000 + seed)
+    model = replace(CONSUMER, gyro_bias_sigma=0.2 * DEG, accel_bias_sigma=0.16)
+    increments_, *_ = imu(truth, CONSUMER, rng)
+    increments_.dv[:] += 0.16 / RATE_HZ
+    increments_.dtheta[:] += 0.2 * DEG / RATE_HZ
+    settings = InsConfig(model, (GnssAid(),))
+    times = [*range(1, 90)]
+    _, found = FusionHorizon(Ins(settings, None)).track(
+        increments_, gnss(truth, rng, 5.0, sigma_p=5.0, sigma_v=0.05), times
+    )
+    aligned = [one for one in found if not one.status & Status.ALIGNING]
+    assert 3 <= aligned[0].t <= 5
+    sigma = math.sqrt(aligned[0].covariance[8, 8])
+    assert abs(error(aligned[0], truth)[8]) < 2 * sigma < 80 * DEG
+    late = np.array([error(one, truth) for one in aligned if one.t > 30])
+    assert np.hypot(*late[:, :2].T).max() < 3
+    assert np.abs(late[:, 6:8]).max() < 0.5 * DEG
+    assert np.abs(late[:, 8]).max() < 3 * DEG
 
 
 def test_at_rest_with_magnetometer():
