@@ -147,8 +147,8 @@ def test_course_in_flight_without_magnetometer():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_vehicle_that_sets_off_is_not_aligned_by_a_course_that_may_be_anything(seed):
-    """At 8 m/s wind may turn the heading by a radian, and what accelerates by 4 m/s^2 is tilted by 20 deg with it: one of
-    these was 8 m off for a minute, one of another simulator 2 km. It waits until it is faster."""
+    """At 8 m/s wind may turn the heading by a radian, and what accelerates by 4 m/s^2 is tilted by 20 deg with it: one
+    of these was 8 m off for a minute, one of another simulator 2 km. It waits until it is faster."""
     truth, rng = driven(90), np.random.default_rng(5000 + seed)
     model = replace(CONSUMER, gyro_bias_sigma=0.2 * DEG, accel_bias_sigma=0.16)
     increments_, *_ = imu(truth, CONSUMER, rng)
