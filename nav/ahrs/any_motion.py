@@ -181,7 +181,8 @@ class AnyMotionLevelling:
         whatever the attitude: |f|^2 = g^2 + a^2, of which a bias b of the accelerometers may hide 2 g b.
         """
         m = s.in_motion
-        square = min((self.told.turning_speed * m.swing) ** 2, self._shows(s))
+        speed_square = max(self.told.turning_speed**2, float(m.turning_n @ m.turning_n))
+        square = min(speed_square * m.swing**2, self._shows(s))
         hidden = 2 * square * self.told.turn_memory_s * self.turn_share(s, compensated) ** 2
         return math.sqrt(m.force_variance + hidden / self._lasting_s)
 
@@ -194,8 +195,7 @@ class AnyMotionLevelling:
         """Take velocities and their error states over a period with the mean horizontal specific force (2,)."""
         m, own = s.in_motion, self._further.turning
         m.velocity_n += f_n * T
-        turned = (m.turn_rate + m.swing) * T
-        turn = math.cos(turned) * np.eye(2) + math.sin(turned) * RIGHT
+        turn = _turn((m.turn_rate + m.swing) * T)
         m.turning_n = turn @ m.turning_n * math.exp(-T / self.told.turning_speed_s)
         gain = np.zeros_like(s.P)
         self._further.drive(gain, turn_rate)
@@ -203,6 +203,12 @@ class AnyMotionLevelling:
         whole[own, own] = turn
         s.x[:] = whole @ s.x
         s.P[:] = whole @ s.P @ whole.T
+
+    def bridge(self, s: State) -> None:
+        """Turn the velocity that turns with the body over a period that is missing, as its attitude was."""
+        turned = float(dcm_from_quat(s.q_nb)[2] @ (s.angle - s.gyro_bias * float(s.elapsed[1])))
+        s.in_motion.turning_n = _turn(turned) @ s.in_motion.turning_n
+        _turn_blocks(s, turned, self._further.turning)
 
     def _undisturbed(self, s: State, seen: Array, T: float) -> bool:
         """Whether a field (2,), level and down, is the usual one, which follows it slowly then; or has come to be."""
@@ -213,11 +219,11 @@ class AnyMotionLevelling:
             m.field = seen
         m.field_s = min(m.field_s + T, told.field_memory_s)
         share = T / m.field_s
-        if self._alike(seen, m.field, s):
+        if self._alike(seen, m.field):
             m.other_s = 0.0
             m.field = m.field + share * (seen - m.field)
             return True
-        if m.other_s > 0 and self._alike(seen, m.other, s):
+        if m.other_s > 0 and self._alike(seen, m.other):
             m.other = m.other + share * (seen - m.other)
         else:
             m.other, m.other_s = seen, 0.0
@@ -226,8 +232,8 @@ class AnyMotionLevelling:
             m.field, m.other_s = m.other, 0.0
         return False
 
-    def _alike(self, seen: Array, usual: Array, s: State) -> bool:
-        """Whether two fields are of the same size and dip, as nearly as the tilt is known."""
+    def _alike(self, seen: Array, usual: Array) -> bool:
+        """Whether two fields are of the same size and dip."""
         (size, dip), (usual_size, usual_dip) = ((math.hypot(*one), math.atan2(one[1], one[0])) for one in (seen, usual))
         told = self.told
         return (
@@ -291,10 +297,29 @@ class AnyMotionLevelling:
             update(s.x, s.P, H, R, nu - H @ s.x, math.inf)
 
     def feed_back(self, s: State) -> None:
-        """Take what was found out of attitude, gyros and velocity."""
+        """Take what was found out of attitude, gyros and velocities; what is known along n turns with the heading."""
+        m, turned = s.in_motion, float(s.x[PHI + 2])
         s.q_nb[:] = quat_normalise(quat_multiply(quat_from_rotvec(s.x[PHI : PHI + 3]), s.q_nb))
         s.gyro_bias -= s.x[BIAS:STATES]
-        s.in_motion.velocity_n -= s.x[self._velocity]
-        s.in_motion.turning_n -= s.x[self._further.turning]
+        m.velocity_n -= s.x[self._velocity]
+        m.turning_n -= s.x[self._further.turning]
         s.x[:STATES] = 0.0
         s.x[self._velocity] = s.x[self._further.turning] = 0.0
+        turn = _turn(turned)
+        m.velocity_n, m.turning_n = turn @ m.velocity_n, turn @ m.turning_n
+        m.force_n, m.mean_force_n = turn @ m.force_n, turn @ m.mean_force_n
+        _turn_blocks(s, turned, slice(PHI, PHI + 2), self._velocity, self._further.turning)
+
+
+def _turn(angle: float) -> Array:
+    """What turns a horizontal vector by an angle [rad] to the right, (2, 2)."""
+    return math.cos(angle) * np.eye(2) + math.sin(angle) * RIGHT
+
+
+def _turn_blocks(s: State, angle: float, *blocks: slice) -> None:
+    """Turn errors of horizontal vectors by an angle [rad] to the right."""
+    whole = np.eye(len(s.x))
+    for block in blocks:
+        whole[block, block] = _turn(angle)
+    s.x[:] = whole @ s.x
+    s.P[:] = whole @ s.P @ whole.T

@@ -286,6 +286,8 @@ class Ahrs:
                 self._level_in_motion(s, self._any_motion, t, reports)
             elif self._any_motion.lost(s):
                 self._begin_levelling(s)
+            else:
+                self._any_motion.bridge(s)
         elif s.in_motion.missing_s > 0.0:
             self._begin_levelling(s)
         else:

@@ -290,13 +290,14 @@ def test_after_a_gap_it_is_right_in_five_seconds(gap_s):
     assert bool(aligning) == (gap_s > 1.0)
 
 
-def circling(straight_s, seconds, bias=(0.0, 0.0, 0.0)):
-    """A wing at 25 m/s that banks into a circle of 400 m within three seconds, and stays in it."""
+def circling(straight_s, seconds, bias=(0.0, 0.0, 0.0), speed=25.0, radius=400.0):
+    """A wing that banks into a circle [m/s, m] within three seconds, and stays in it."""
     t = np.arange(round((straight_s + seconds) / DT) + 1) * DT
-    rate = 25.0 / 400.0 * np.clip((t - straight_s + 3.0) / 3.0, 0.0, 1.0)
+    rate = speed / radius * np.clip((t - straight_s + 3.0) / 3.0, 0.0, 1.0)
     heading = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * DT)]) + 0.5
-    attitude = Rotation.from_euler("ZYX", np.column_stack([heading, np.full(len(t), 0.05), np.arctan(25.0 * rate / G)]))
-    velocity = 25.0 * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(t))])
+    bank = np.arctan(speed * rate / G)
+    attitude = Rotation.from_euler("ZYX", np.column_stack([heading, np.full(len(t), 0.05), bank]))
+    velocity = speed * np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(t))])
     return made(t, attitude, np.diff(velocity, axis=0) / DT, bias)
 
 
@@ -325,3 +326,26 @@ def test_airspeed_tells_the_circle_better():
     samples = [AirspeedSample(now, now, 25.0) for now in motion.imu.t[::20].tolist()]
     t, phi, _, _, _ = track(motion, told, samples)
     assert np.abs(phi[t > 30, :2]).max() < 0.4 * DEG
+
+
+@pytest.mark.parametrize("compass", [True, False])
+@pytest.mark.parametrize("speed", [20.0, 40.0])
+def test_a_heading_that_is_corrected_turns_what_is_known_along_it(speed, compass):
+    """Begun at 45 deg of bank the field is levelled askew, and the heading found by and by: the velocity that turns
+    with the body pointed elsewhere then, 2 deg of tilt with a compass at 20 m/s, and at 40 m/s 4."""
+    motion = circling(0.0, 240.0, speed=speed, radius=speed**2 / G)
+    told = replace(TOLD if compass else BLIND, imu=replace(FINE.imu, gyro_bias_sigma=0.2 * DEG, accel_bias_sigma=0.05))
+    t, phi, covariance, *_ = track(motion, told, fields(motion) if compass else ())
+    late, claimed = t > 30, covariance.diagonal(axis1=1, axis2=2)[:, :2]
+    assert rms(phi[late, :2]) < 1.0 * DEG
+    assert np.mean(phi[late, :2] ** 2 / claimed[late]) < 1.5
+
+
+def test_over_a_gap_in_a_circle_its_velocity_turns_on():
+    """As the attitude does; left as it was it is 23 deg astray after a second, and tilts the horizon by as much as it
+    says of the circle."""
+    motion = circling(0.0, 140.0, speed=20.0, radius=50.0)
+    gap = (motion.imu.t > 100.0) & (motion.imu.t < 101.0)
+    motion.imu.dtheta[gap] = motion.imu.dv[gap] = np.nan
+    t, phi, *_ = track(motion, FINE)
+    assert np.abs(phi[(t > 101.5) & (t < 121), :2]).max() < 4 * DEG
