@@ -56,8 +56,9 @@ def layout(lines: Iterable[str]) -> Layout:
     fields = _fields(row, mark)
     decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, fields)) else "."
     width, top = len(fields), _fields(first, mark)
+    first_names = not _are_numbers(top, decimal) and _are_numbers(fields, decimal)
     for names, hidden in ((_fields(comment[1], mark), False), (_fields(comment[1][1:], mark), True)):
-        if comment[1] and len(names) == len(top) > 1:
+        if comment[1] and len(names) == len(top) > 1 and not first_names:
             return Layout(mark, decimal, comment[0], names, width, hidden)
     if _are_numbers(top, decimal):
         return Layout(mark, decimal, number, [], width)

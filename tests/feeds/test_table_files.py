@@ -54,6 +54,12 @@ def test_a_text_tells_how_it_is_to_be_read(
     np.testing.assert_allclose(np.column_stack(list(found.values())), IMU, atol=1e-9)
 
 
+def test_names_below_a_comment_with_as_many_commas_are_the_names(tmp_path: Path) -> None:
+    for comment in ("# flown, on a day, of May", "#flown,on a day,of May"):
+        (tmp_path / "a.csv").write_text("\n".join([comment, "t,a,b", *(f"{k / 10},1.5,2.5" for k in range(20))]))
+        assert list(load(tmp_path / "a.csv").numbers) == ["t", "a", "b"]
+
+
 def test_numbers_that_count_the_columns_are_names(tmp_path: Path) -> None:
     """As a data frame without names is written, with and without its index."""
     for index in ("", ",0,1,2"):
