@@ -50,6 +50,7 @@ class AnyMotion:
     turn_smoothing_s: float = 4.0  # of the rate that tells a turn from a swing
     # Of the square of that rate in that of all rates: up to the first it is a swing, from the second on a turn.
     turn_shares: tuple[float, float] = (0.1, 0.3)
+
     field_tolerance: float = 0.1  # of the size of the magnetic field: further off it tells no heading
     dip_tolerance: float = 6 * DEG
     disturbance_s: float = 10.0  # how long what disturbs the field lasts

@@ -200,11 +200,11 @@ def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
 
 def _seconds(array: Any) -> Any:
     """Dates and times of day, which are UTC where they don't say, as seconds since 1970; any other column as it is."""
-    import pandas
-
     said = next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
     if array.ndim != 1 or not (array.dtype.kind == "M" or DATE.match(said)):
         return array
+    import pandas
+
     try:
         times = pandas.to_datetime(pandas.Series(array), format="ISO8601", utc=True)
     except ValueError:
