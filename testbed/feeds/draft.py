@@ -187,9 +187,9 @@ def _columns(truth: LogTruth, out: Path) -> Mapping[str, Any]:
     """What the scenario said of a table's columns, without what it left out, files as seen from ``out``."""
     said = {name: stream.model_dump(exclude_unset=True) for name, stream in truth.columns.items()}
     for stream in said.values():
-        if stream.get("file") is not None:
+        if "file" in stream:
             stream["file"] = _seen_from(out, stream["file"])
-    return {name: {key: one for key, one in stream.items() if one is not None} for name, stream in said.items()}
+    return said
 
 
 def _seen_from(out: Path, file: str | Path) -> str:
