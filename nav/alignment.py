@@ -34,7 +34,7 @@ from nav.rotation import (
     quat_rotate,
 )
 from nav.samples import Array, GnssSample, ImuSamples
-from nav.velocity_matching import VelocityMatching
+from nav.velocity_matching import Matched, VelocityMatching
 
 RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REST_SPEED = 0.5  # slower than this is standing [m/s]
@@ -49,6 +49,7 @@ UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its fiel
 FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
+FEW, CLEARLY = 5, 0.9  # pairs, and the share of pushes that is explained, where nothing else is asked for a heading
 LONGEST_S = 6.0  # beyond which gyros drift too far within a pair of vectors for matching
 NORTH = np.array([1.0, 0.0, 0.0])
 ACCELERATION_ERROR = 0.1  # of such a pair: latency, scale and tilt of what manoeuvres [m/s^2]
@@ -130,11 +131,13 @@ class Alignment:
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
         self._places: list[GnssSample] = []  # of a receiver that tells no velocity, the last ones
-        self._matching = VelocityMatching(
+        self._biases = (
             math.hypot(imu.gyro_bias_sigma, imu.gyro_drift_sigma),
             math.hypot(imu.accel_bias_sigma, imu.accel_drift_sigma),
         )
-        self._compassing = False
+        self._matching = VelocityMatching(*self._biases)
+        self._by_accelerations = self._compassing = False
+        self.matched: Matched | None = None  # by accelerations, at the last fix
         self._restart(None)
 
     @classmethod
@@ -157,6 +160,13 @@ class Alignment:
         made.names = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=False))
         made.names |= dict(zip(_MAGNETOMETER, magnetometer.states, strict=True))
         return made
+
+    def by_accelerations(self) -> Alignment:
+        """One for the same sensors that finds the heading by accelerations alone, soon, where they tell it clearly."""
+        other = Alignment(self.imu, self.aids, self.arm_b, DIFFERENCE_S)
+        other.names = self.names
+        other._matching, other._by_accelerations = VelocityMatching(*self._biases, FEW, CLEARLY), True
+        return other
 
     def _restart(self, fix: GnssSample | None) -> None:
         self._first = fix
@@ -220,7 +230,7 @@ class Alignment:
             self._restart(fix)
             return None
         field_bias = self._field_bias(field_n)
-        heading = self._heading(C_b0, first, fix, T, field_n, field_bias)
+        heading = None if self._by_accelerations else self._heading(C_b0, first, fix, T, field_n, field_bias)
         if heading is None and not self._compassing:
             heading = self._matched(C_b0, swing_b, first, fix, T)
         if heading is None:
@@ -310,8 +320,17 @@ class Alignment:
         sigma = math.hypot(sigma_v, ACCELERATION_ERROR * T) if T <= LONGEST_S else math.inf
         push_0 = self._dv_0 + C_b0.T @ swing_b
         self._matching.add(C_b0.T, push_0, self._turned_0, self._specific_force_n(first, fix, T), sigma)
-        found = self._matching.north()
-        return None if found is None else _Heading(found[0], NORTH, 0.0, heading_sigma=found[1])
+        self.matched = self._matching.attitude()
+        if self.matched is None and self._by_accelerations:  # by what has happened since something that did not fit
+            self.matched = self._matching.attitude(FEW + 1)
+        if self.matched is None:
+            return None
+        C_nb, covariance = self.matched
+        return _Heading(C_nb[0].copy(), NORTH, 0.0, heading_sigma=math.sqrt(covariance[2, 2]))
+
+    def go_on(self, fix: GnssSample) -> None:
+        """From the fix that it was given last, though it has found a state."""
+        self._restart(fix)
 
     @property
     def matching(self) -> bool:

@@ -181,6 +181,7 @@ class Batch:
             if sample is not None:
                 taker.took(sample)
                 if what >= 0:
+                    taker.realignment.took(sample.sensor)
                     for filter_ in listening:
                         filter_.stand_in(sample)
             elif what == ESTIMATE:
@@ -193,7 +194,9 @@ class Batch:
         sample = steps.samples[first + done.steps]
         assert sample is not None
         taker.took(sample)
-        reports += taker.finish(sample, done.parts)
+        further = taker.finish(sample, done.parts)
+        taker.realignment.hear(sample, further)
+        reports += further
         for filter_ in self._listening:
             filter_.stand_in(sample)
         return done.steps + 1, done.last_bad

@@ -285,6 +285,7 @@ class Ins:
             reports += [replace(report, sensor=NO_SENSOR) for report in known]
         if self._smoother is not None:
             self._smoother.pause(self.t, state)
+        self.realignment.judge(self, state, 1, sample, reports)
         return reports
 
     def _update_part_by_part(self, state: State, sample: Sample, aid: Aid, first: int = 0) -> list[UpdateReport]:
@@ -388,8 +389,7 @@ class Ins:
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments, the filter itself staying where it is."""
-        state = self._drafted()
-        last_bad = self._last_bad
+        state, last_bad = self._drafted(), self._last_bad
         if state is not None and len(imu):
             last_bad = max(last_bad, self._reference.run(state, imu, PREDICTED_PERIODS, settle=True))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)

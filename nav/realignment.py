@@ -1,9 +1,9 @@
-"""Aligning anew, when increments were missing for so long that an attitude's error is not small any more."""
+"""Aligning anew, when an attitude's error is not small any more: increments were missing for long, or it was wrong."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from copy import deepcopy
 from typing import Protocol
 
@@ -12,6 +12,7 @@ from nav.aids.gnss import has_velocity
 from nav.alignment import Alignment, InitialState, whole
 from nav.earth import displacement_n
 from nav.error_model import PHI, POS, VEL
+from nav.heading_recovery import HeadingRecovery
 from nav.reference import Reference, align
 from nav.samples import Array, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
 from nav.smoother import Smoother
@@ -39,7 +40,7 @@ class Startable(Protocol):
 
 
 class Realignment:
-    """Watches how well an estimator knows its tilt, and aligns it anew when that was lost by missing increments.
+    """Watches how well an estimator knows its attitude, and aligns it anew when that was lost by missing increments.
 
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
     did not. So the fixes of one receiver, and samples of the ``sensors``, go to an alignment, which is as ``alignment``
@@ -47,12 +48,16 @@ class Realignment:
     those of the receiver meanwhile; where it comes to no end in `WAIT_S` from the last missing increment on, or in
     `LONG_S` without a compass, they are used as well as may be. The same where it contradicts the position that was
     known.
+
+    Without missing increments it may be another than the estimator is sure of, which refuses samples then: see
+    `nav.heading_recovery`.
     """
 
     def __init__(
         self, alignment: Alignment, sensors: Container[str], reference: Reference, smoother: Smoother | None = None
     ) -> None:
         self._beginning, self._sensors, self._reference = deepcopy(alignment), sensors, reference
+        self._heading = HeadingRecovery(alignment)
         self._smoother = smoother  # to which what was before tells nothing of what is put in its place
         self.begin(math.inf)
 
@@ -60,18 +65,40 @@ class Realignment:
         """The estimator starts at ``t`` [s]: what was missing before is of no account."""
         self.since = t
         self._alignment: Alignment | None = None
+        self._heading.begin()
         self._receiver = ""
         self._lost_at = self._moved_at = self._widened = math.nan
 
     @property
     def under_way(self) -> bool:
         """Whether there is an alignment to be fed."""
-        return self._alignment is not None
+        return self._alignment is not None or self._heading.under_way
 
     def propagate(self, imu: ImuSamples) -> None:
         """Add a block of increments."""
         if self._alignment is not None:
             self._alignment.propagate(imu)
+        self._heading.propagate(imu)
+
+    def took(self, sensor: str) -> None:
+        """A sample of a sensor was used, whole."""
+        self._heading.took(sensor)
+
+    def hear(self, sample: Sample, reports: Sequence[UpdateReport]) -> None:
+        """What became of a sample."""
+        self._heading.hear(sample, reports)
+
+    def judge(
+        self, estimator: Startable, state: State, filters: int, sample: Sample, reports: Sequence[UpdateReport]
+    ) -> None:
+        """The same of one at whose time the state is settled; the estimator is started where its attitude is another.
+
+        The ``state`` is of so many filters.
+        """
+        self._heading.hear(sample, reports)
+        initial = self._heading.judge(state, filters, sample)
+        if initial is not None:
+            estimator.start(initial)
 
     def keeps(
         self, estimator: Startable, state: State, filters: int, sample: Sample, last_bad: float, sound: bool = True

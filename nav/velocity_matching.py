@@ -16,16 +16,17 @@ b and a with what is known of them; the derivative by b is of first order in the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from nav.samples import Array
 
-PAIRS, LEAST = 15, 8  # the last ones that are used, and how many it takes
+PAIRS, LEAST = 15, 8  # the last ones are used
 STARTS, STEPS = 8, 5  # headings that it is tried from, steps from each
 SIGMA_LIMIT = 0.25  # a heading that is known less well is none [rad]
-EXPLAINED = 0.7  # share of the squares of horizontal pushes that a heading must explain, or they are the receiver's
+EXPLAINED = 0.7
 UNLIKE, ELSEWHERE = 16.0, 1.0  # by which a heading so far away must be worse, in squares of sigma [rad]
 BETTER = 9.0  # times smaller than told residuals may show squares of sigma to be
 DAMPING = 1e-6  # of a turn that nothing tells [1/rad^2]
@@ -40,20 +41,30 @@ class _Pair(NamedTuple):
     sigma: float  # of any axis [m/s]
 
 
+class Matched(NamedTuple):
+    """An attitude, and how well it is known: its heading `AT_BEST` so."""
+
+    C_nb: Array  # (3, 3)
+    covariance: Array  # (3, 3) of its turn about the axes of n, by what residuals show [rad^2]
+
+
 class _Fit(NamedTuple):
     cost: float
     level_cost: float  # of horizontal residuals, and of what was known of biases
     C_n0: Array
-    variance: float  # of the heading [rad^2], if residuals are as told
+    covariance: Array  # (3, 3) of C_n0's turn [rad^2], if residuals are as told
 
 
 class VelocityMatching:
     """Collects pairs of pushes, one after the other without a gap, until they tell a heading.
 
-    ``gyro_sigma`` [rad/s] and ``accel_sigma`` [m/s^2] are those of the biases, each axis alike.
+    ``gyro_sigma`` [rad/s] and ``accel_sigma`` [m/s^2] are those of the biases, each axis alike. It takes at least so
+    many pairs, and a heading must explain the share ``explained`` of the squares of horizontal pushes, or they are the
+    receiver's.
     """
 
-    def __init__(self, gyro_sigma: float, accel_sigma: float) -> None:
+    def __init__(self, gyro_sigma: float, accel_sigma: float, least: int = LEAST, explained: float = EXPLAINED) -> None:
+        self._least, self._explained = least, explained
         self._weights = np.repeat([DAMPING, 1.0, 1.0], 3)
         self._weights[3:6] /= max(gyro_sigma, 1e-9) ** 2
         self._weights[6:] /= max(accel_sigma, 1e-9) ** 2
@@ -80,30 +91,31 @@ class VelocityMatching:
             del self._pairs[:-PAIRS]
         self._C_0b, self._turned = self._C_0b @ C_1b, self._turned + over
 
-    def north(self) -> tuple[Array, float] | None:
-        """North in the body axes of now (3,), and the 1-sigma of the heading [rad], `AT_BEST` included; or None."""
-        if len(self._pairs) < LEAST:
+    def attitude(self, last: int = PAIRS) -> Matched | None:
+        """That of now by so many of the ``last`` pairs, or None."""
+        pairs = self._pairs[-last:]
+        if len(pairs) < self._least:
             return None
-        sigma = np.array([one.sigma for one in self._pairs])[:, None]
-        level = float(np.sum((np.array([one.push_n[:2] for one in self._pairs]) / sigma) ** 2))
+        sigma = np.array([one.sigma for one in pairs])[:, None]
+        level = float(np.sum((np.array([one.push_n[:2] for one in pairs]) / sigma) ** 2))
         if level * SIGMA_LIMIT**2 * BETTER < 1.0:  # not enough for it, whatever they fit
             return None
-        fits = sorted((self._fit(2 * math.pi * k / STARTS) for k in range(STARTS)), key=lambda one: one.cost)
+        fits = sorted((self._fit(pairs, 2 * math.pi * k / STARTS) for k in range(STARTS)), key=lambda one: one.cost)
         best = fits[0]
-        shown = max(1 / BETTER, best.level_cost / (2 * len(self._pairs) - 5))  # over what was told
+        shown = max(1 / BETTER, best.level_cost / (2 * len(pairs) - 5))  # over what was told
         C_nb = best.C_n0 @ self._C_0b
         others = [one.cost for one in fits if abs(_heading(one.C_n0 @ self._C_0b @ C_nb.T)) > ELSEWHERE]
-        heading_sigma = math.hypot(math.sqrt(best.variance * shown), AT_BEST)
+        covariance = shown * best.covariance + np.diag([0.0, 0.0, AT_BEST**2])
         believed = (
-            heading_sigma <= SIGMA_LIMIT
-            and best.level_cost <= (1 - EXPLAINED) * level
+            covariance[2, 2] <= SIGMA_LIMIT**2
+            and best.level_cost <= (1 - self._explained) * level
             and min(others, default=math.inf) - best.cost >= UNLIKE * shown
         )
-        return (C_nb[0].copy(), heading_sigma) if believed else None
+        return Matched(C_nb, covariance) if believed else None
 
-    def _fit(self, heading: float) -> _Fit:
+    def _fit(self, pairs: Sequence[_Pair], heading: float) -> _Fit:
         """Least squares from this turn [rad] of what is level on."""
-        f, over, before, y, sigmas = (np.array(column) for column in zip(*self._pairs, strict=True))
+        f, over, before, y, sigmas = (np.array(column) for column in zip(*pairs, strict=True))
         before = before - self._turned
         sigma = sigmas[:, None]
         C_n0 = _turn(np.array([0.0, 0.0, heading])) @ _between(f.sum(axis=0), y.sum(axis=0))
@@ -122,7 +134,7 @@ class VelocityMatching:
             biases = biases + change[3:]
         prior = float(self._weights[3:] @ biases**2)
         return _Fit(
-            float(np.sum(left**2)) + prior, float(np.sum(left[:, :2] ** 2)) + prior, C_n0, float(np.linalg.inv(N)[2, 2])
+            float(np.sum(left**2)) + prior, float(np.sum(left[:, :2] ** 2)) + prior, C_n0, np.linalg.inv(N)[:3, :3]
         )
 
 

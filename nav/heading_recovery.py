@@ -1,0 +1,108 @@
+"""Finding the attitude again that a filter has begun with wrongly, or lost, while it is sure of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+
+import numpy as np
+
+from nav.alignment import Alignment, InitialState
+from nav.detection import Refusals, chi_square_threshold
+from nav.earth import displacement_n
+from nav.error_model import PHI, POS
+from nav.rotation import quat_conjugate, quat_from_dcm, quat_multiply, rotvec_from_quat
+from nav.samples import GnssSample, ImuSamples, Outcome, Sample, UpdateReport
+from nav.state import State
+from nav.velocity_matching import Matched
+
+DOUBT_S = 1.0  # what is refused for so long may be right
+BELIEVED_S = 10.0  # without such for longer, the filter is
+FALSE_ALARM = 1e-4  # probability that two attitudes as good as they claim contradict each other
+REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
+LIMIT = chi_square_threshold(FALSE_ALARM, 3)
+LEAST = 1e-6  # of a filter's own [rad]
+ELSEWHERE = 5.0  # sigmas
+GRAVITY = 9.8  # [m/s^2]
+TURN, PLACE = slice(PHI, PHI + 3), range(POS, POS + 2)
+
+
+class HeadingRecovery:
+    """Finds the attitude by the accelerations that change a receiver's velocity, while a filter refuses samples.
+
+    Where a heading is off by a radian, what is felt along one axis is taken for another: velocity and tilt go wrong,
+    fixes and fields leave their gates, and what corrections remain go along wrong axes. `nav.velocity_matching` asks
+    nothing of the filter. A receiver that is led astray has the accelerations of the body, or none that it could feel,
+    and speaks for no other attitude; one that is farther away than a wrong attitude could have led in the time is not
+    believed.
+    """
+
+    def __init__(self, alignment: Alignment) -> None:
+        self._beginning = alignment.by_accelerations()
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing was refused so far."""
+        self._refusals: dict[str, Refusals] = {}
+        self._doubted_at = self._refused_at = -math.inf
+        self._alignment: Alignment | None = None
+        self._receiver = ""  # the first that is heard
+
+    @property
+    def under_way(self) -> bool:
+        """Whether it is to have increments."""
+        return self._alignment is not None
+
+    def propagate(self, imu: ImuSamples) -> None:
+        """Add a block of increments."""
+        if self._alignment is not None:
+            self._alignment.propagate(imu)
+
+    def took(self, sensor: str) -> None:
+        """A sample of a sensor was used, whole."""
+        if sensor in self._refusals:
+            self._refusals[sensor].taken()
+
+    def hear(self, sample: Sample, reports: Sequence[UpdateReport]) -> None:
+        """What became of a sample."""
+        if any(report.outcome in REFUSED for report in reports):
+            if self._refusals.setdefault(sample.sensor, Refusals(DOUBT_S)).too_long(sample.t):
+                self._refused_at = sample.t
+                if self._alignment is None:
+                    self._doubted_at, self._alignment = sample.t, deepcopy(self._beginning)
+        elif reports:
+            self.took(sample.sensor)
+        if sample.t - self._refused_at > BELIEVED_S:
+            self._alignment = None
+
+    def judge(self, state: State, filters: int, sample: Sample) -> InitialState | None:
+        """Where to begin anew, given a sound sample, which was heard of; None where nothing contradicts the attitude.
+
+        The ``state``, of so many filters, is settled at the sample's time.
+        """
+        if self._alignment is None or not isinstance(sample, GnssSample):
+            return None
+        self._receiver = self._receiver or sample.sensor
+        found = self._alignment.add_gnss(sample, None) if sample.sensor == self._receiver else None
+        if found is None or self._alignment.matched is None:
+            return None
+        if _contradicts(self._alignment.matched, state, filters) and self._could_be(sample, state, filters):
+            return found
+        self._alignment.go_on(sample)
+        return None
+
+    def _could_be(self, fix: GnssSample, state: State, filters: int) -> bool:
+        """Whether the filter may have gone from a fix, over ground, by taking what it felt for the opposite."""
+        north, east, _ = displacement_n(fix.lat, fix.lon, fix.h, *state.lla.tolist())
+        doubted = fix.t - self._doubted_at + DOUBT_S
+        known = state.P[:filters, PLACE, PLACE].min(axis=0) + fix.sigma_position_n[:2] ** 2
+        return math.hypot(north, east) <= GRAVITY * doubted**2 + ELSEWHERE * math.sqrt(known.sum())
+
+
+def _contradicts(found: Matched, state: State, filters: int) -> bool:
+    """Whether an attitude is where that of the filters together can't be."""
+    turn = rotvec_from_quat(quat_multiply(quat_from_dcm(found.C_nb), quat_conjugate(state.q_nb)))
+    each = state.P[:filters, TURN, TURN] + LEAST**2 * np.eye(3)
+    known = np.linalg.inv(np.linalg.inv(each).sum(axis=0))
+    return bool(turn @ np.linalg.solve(known + found.covariance, turn) > LIMIT)

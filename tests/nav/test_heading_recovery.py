@@ -1,0 +1,125 @@
+"""A filter that begins with a wrong attitude, and is sure of it: found soon, and only where it is wrong."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from worlds.federated import field, named, three, true_start
+from worlds.ins import CONSUMER, barometer, error, feed, flight, gnss, imu, magnetometer
+
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.federated import Federated
+from nav.federation import Config
+from nav.heading_recovery import HeadingRecovery
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+
+SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)
+AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
+SECONDS = 60
+
+
+def a_filter(kind):
+    if kind == "federated":
+        return Federated(Config(SMALL, three()), field)
+    aids = AIDS if kind == "ins" else AIDS[:2]
+    return Ins(InsConfig(SMALL, aids, smooth=kind == "smoother"), field)
+
+
+def begun(truth, turn_deg, about=(0.0, 0.0, 1.0)):
+    """The state at the beginning, turned about an axis of n, claimed to be right to a tenth of a degree."""
+    turned = Rotation.from_rotvec(np.radians(turn_deg) * np.array(about)) * Rotation.from_matrix(truth.C_nb[0])
+    return dataclasses.replace(true_start(truth), q_nb=turned.as_quat(scalar_first=True))
+
+
+def flown(estimator, turn_deg, seed=0, seconds=1.0, change=lambda fix: fix, about=(0.0, 0.0, 1.0)):
+    """The truth, the estimates of a minute, and when the estimator was started again."""
+    truth, rng = flight(SECONDS), np.random.default_rng(seed)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    fixes = [change(fix) for fix in gnss(truth, rng, 5.0)] + named(gnss(truth, rng, 5.0), "gnss2")
+    samples = fixes + barometer(truth, rng) + magnetometer(truth, rng)
+    start, again = estimator.start, []
+    start(begun(truth, turn_deg, about))
+    estimator.start = lambda initial: (again.append(initial.t), start(initial))
+    return truth, feed(FusionHorizon(estimator), increments, samples, seconds)[0], again
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
+@pytest.mark.parametrize("turn_deg", [-60.0, 90.0, 180.0])
+def test_a_wrong_heading_is_found_soon(kind, turn_deg):
+    """It circles; it would be hundreds of metres off for minutes, claiming a third of it."""
+    truth, estimates, again = flown(a_filter(kind), turn_deg)
+    assert len(again) == 1
+    assert again[0] < 15.0
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        if estimate.t > again[0] + 0.1:
+            assert np.hypot(*off[:2]) < 8.0, estimate.t
+            assert (np.abs(off) < 5 * sigma).all(), estimate.t
+
+
+def test_a_wrong_tilt_too():
+    truth, estimates, again = flown(a_filter("ins"), 40.0, about=(1.0, 0.0, 0.0))
+    assert len(again) <= 1
+    assert np.hypot(*error(estimates[-1], truth)[:2]) < 4.0
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_a_right_one_is_let_alone(kind):
+    for seed in range(3):
+        assert not flown(a_filter(kind), 0.0, seed)[2]
+
+
+def pulled(fix, speed, acceleration=0.0):
+    """A fix whose receiver is led to the east from 20 s on."""
+    t = fix.t - 20
+    east = speed * t + 0.5 * acceleration * t**2
+    v_n = fix.v_n + np.array([0.0, speed + acceleration * t, 0.0])
+    return dataclasses.replace(fix, lon=fix.lon + east / (6.38e6 * math.cos(fix.lat)), v_n=v_n)
+
+
+@pytest.mark.parametrize(
+    "false",
+    [
+        lambda fix: dataclasses.replace(fix, lat=fix.lat + 1e-4),  # 640 m away
+        lambda fix: pulled(fix, 6.0),
+        lambda fix: pulled(fix, 0.0, 0.5),
+        lambda fix: dataclasses.replace(fix, v_n=fix.v_n + 8 * np.sin(np.arange(3) + 1.7 * fix.t)),
+    ],
+)
+def test_a_receiver_led_astray_tells_no_other_attitude(false):
+    change = lambda fix: false(fix) if fix.t > 20 else fix  # noqa: E731
+    assert not flown(a_filter("ins"), 0.0, change=change)[2]
+
+
+def test_a_receiver_that_is_elsewhere_is_not_believed():
+    """A wrong attitude led the filter away by hundreds of metres, not by twenty kilometres, until patience ends."""
+    change = lambda fix: dataclasses.replace(fix, lat=fix.lat + 3e-3)  # noqa: E731
+    again = flown(a_filter("ins"), 120.0, change=change)[2]
+    assert min(again) >= InsConfig(SMALL).patience_s
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_however_it_is_cut_the_same_bits(kind):
+    whole, parts = (flown(a_filter(kind), 120.0, seconds=seconds)[1] for seconds in (10.0, 0.5))
+    by_time = {round(one.t, 3): one for one in parts}
+    for one in whole:
+        other = by_time[round(one.t, 3)]
+        assert np.array_equal(one.covariance, other.covariance)
+        assert (one.lat, one.lon, one.h) == (other.lat, other.lon, other.h)
+
+
+@pytest.mark.parametrize("lost", [3, 7, 11])
+def test_what_is_refused_now_and_then_is_no_doubt(lost, monkeypatch):
+    """Each so many fixes one jumps, and is refused: nobody looks for an attitude."""
+    looked = []
+    monkeypatch.setattr(HeadingRecovery, "judge", lambda self, *_: looked.append(self.under_way))
+
+    def jump(fix):
+        return dataclasses.replace(fix, lat=fix.lat + 1e-5) if round(5 * fix.t) % lost == 0 else fix
+
+    flown(a_filter("ins"), 0.0, change=jump)
+    assert looked
+    assert not any(looked)
