@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
+
 from nav.aids import (
     Aid,
     AirspeedAid,
@@ -27,6 +29,7 @@ from nav.aids.terrain import Search
 from nav.earth import STANDARD_GRAVITY
 from nav.error_model import ImuModel
 from nav.point_mass import PointMass
+from nav.samples import Array
 from testbed.estimators.rig import Air, Rig
 from testbed.estimators.section import ImuStates
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
@@ -41,12 +44,18 @@ from testbed.sensors.optical_flow import OpticalFlowConfig
 from testbed.sensors.position_fix import PositionFixConfig
 from testbed.sensors.rangefinder import RangefinderConfig
 from testbed.sensors.star_tracker import StarTrackerConfig
+from testbed.sensors.units import ARCSEC, DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
 from testbed.sensors.wind_report import WindReportConfig
 
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 MANOEUVRE_S = 120.0  # between changes of turn and load
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither, where it is not a state
+# Where a datasheet has no noise, as of grade "perfect", a filter is told of about that of the best real parts. Told of
+# none it would be sure of itself within a second, and refuse what integration and rounding leave.
+BEST_IMU = ImuModel(0.002 * DEG_PER_ROOT_H, 0.005 * MPS_PER_ROOT_H, 0.01 * DEG_PER_H, 0.025 * MG)
+BEST_PRESSURE, BEST_FIELD, BEST_STARS = 0.1, 0.01 * MICROTESLA, 1 * ARCSEC  # [m], [T], [rad]
+BEST_SPEED, BEST_PLACE, BEST_FLOW = 0.005, 0.01, 1e-4  # [m/s], [m], [rad/s]
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
 SHORT_GUSTS = 0.15  # of the gusts, what is faster than that
 CRUISE_THROTTLE = 0.5  # of full throttle
@@ -79,7 +88,7 @@ def imu_model(
     changes = math.sqrt(1 / MANOEUVRE_S)
     turn_rate = usual.turn_rate_radps if turn_rate is None else turn_rate
     load_change = usual.load_change_g * min(1.0, turn_rate / usual.turn_rate_radps) ** 2
-    return ImuModel(
+    model = ImuModel(
         gyro_noise=math.hypot(beside.gyro_noise, beside.gyro_vibration),
         accel_noise=math.hypot(beside.accel_noise, beside.accel_vibration),
         gyro_bias_sigma=math.hypot(
@@ -113,10 +122,23 @@ def imu_model(
         accel_motion=errors.accel_motion,
         vibration=errors.vibration_share,
     )
+    return replace(
+        model,
+        gyro_noise=model.gyro_noise or BEST_IMU.gyro_noise,
+        accel_noise=model.accel_noise or BEST_IMU.accel_noise,
+        gyro_bias_sigma=model.gyro_bias_sigma or BEST_IMU.gyro_bias_sigma,
+        accel_bias_sigma=model.accel_bias_sigma or BEST_IMU.accel_bias_sigma,
+    )
 
 
 def _drive(sigma: float, tau: float) -> float:
     return sigma * math.sqrt(2 / tau)
+
+
+def _of_each(sigma: Array, best: float) -> tuple[float, float, float]:
+    """The noise of each axis; ``best`` where there is none."""
+    x, y, z = np.where(sigma > 0, sigma, best).tolist()
+    return x, y, z
 
 
 def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None = None) -> Aid | None:
@@ -153,7 +175,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             gust = max(air.gust, section.gust_mps)
             return AirspeedAid(
                 name,
-                sigma=math.hypot(math.hypot(a.noise, a.unsteady), SHORT_GUSTS * gust),
+                sigma=math.hypot(math.hypot(a.noise, a.unsteady), SHORT_GUSTS * gust) or BEST_SPEED,
                 scale_sigma=math.hypot(a.scale, a.bias / REFERENCE_EAS),
                 minimum=section.slowest_mps,
                 sideslip_sigma=None if section.slips else math.hypot(SIDESLIP, SHORT_GUSTS * gust),
@@ -163,12 +185,13 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
             )
         case BodyVelocityConfig():
             v = section.errors()
-            return BodyVelocityAid(name, v.axes, v.noise, v.scale, v.correlated, v.tau, slip_mps, from_imu)
+            noise = v.noise or BEST_SPEED
+            return BodyVelocityAid(name, v.axes, noise, v.scale, v.correlated, v.tau, slip_mps, from_imu)
         case StarTrackerConfig():
-            return StarAid(name, tuple(section.errors().noise_b))
+            return StarAid(name, _of_each(section.errors().noise_b, BEST_STARS))
         case PositionFixConfig():
             p = section.errors()
-            return PositionFixAid(name, tuple(p.position_n), p.height, from_imu)
+            return PositionFixAid(name, _of_each(p.position_n, BEST_PLACE), p.height, from_imu)
         case WindReportConfig():
             w = section.errors()
             length = GUST_LENGTH / usual.airspeed_mps
@@ -183,7 +206,7 @@ def _barometer(name: str, section: BarometerConfig) -> Aid:
     b = section.errors()
     return BarometerAid(
         name,
-        sigma=b.noise * METRES_PER_PASCAL,
+        sigma=b.noise * METRES_PER_PASCAL or BEST_PRESSURE,
         bias_walk=_drive(b.drift, b.drift_tau) * METRES_PER_PASCAL,
         error_sigma=b.unsteady * METRES_PER_PASCAL,
         error_correlation_s=b.unsteady_tau,
@@ -200,13 +223,12 @@ def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
     m = section.errors()
     bias = math.hypot(m.hard_iron, math.hypot(m.current * usual.current_a, m.throttle * CRUISE_THROTTLE))
     motor = m.current * usual.current_change_a
+    noise = m.noise or BEST_FIELD
     if not m.doubt:
-        return MagnetometerAid(
-            name, sigma=m.noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron, error_sigma=motor
-        )  # fmt: skip
+        return MagnetometerAid(name, sigma=noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron, error_sigma=motor)
     iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
     return MagnetometerAid(
-        name, sigma=m.noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=math.hypot(iron, motor), doubt=m.doubt,
+        name, sigma=noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=math.hypot(iron, motor), doubt=m.doubt,
         follow_s=section.follow_s,
     )  # fmt: skip
 
@@ -216,7 +238,8 @@ def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, 
     map_ = site.terrain, site.terrain_sigma, site.local_sigma, site.local_length / usual.airspeed_mps
     if isinstance(section, RangefinderConfig):
         r = section.errors()
-        places = PointMass(site.terrain, r.noise, *map_[2:])
-        return RangefinderAid(name, r.noise, r.scale, *map_, Search(places) if site.terrain.heights.size > 1 else None)
+        noise = r.noise or BEST_PLACE
+        places = PointMass(site.terrain, noise, *map_[2:])
+        return RangefinderAid(name, noise, r.scale, *map_, Search(places) if site.terrain.heights.size > 1 else None)
     f = section.errors()
-    return OpticalFlowAid(name, f.noise, f.scale, f.bias, f.tau, *map_)
+    return OpticalFlowAid(name, f.noise or BEST_FLOW, f.scale, f.bias, f.tau, *map_)

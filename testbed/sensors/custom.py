@@ -1,4 +1,6 @@
-"""Running a sensor of the user's: what it raises, or gives that is no sample, ends the run with its name and why."""
+"""Running a sensor of the user's, and its aid: what they raise, or give that is no sample and no measurement, ends the
+run with its name and why.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +8,14 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable
 from numbers import Real
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+import nav.aids
 import nav.samples
+from nav.aids.base import Measurement, OperatingPoint
+from nav.error_model import Block
 from testbed import plugins
 from testbed.errors import UserError, shown
 from testbed.motion.table import COLUMNS, TruthBlock
@@ -36,7 +41,10 @@ def made(name: str, section: Section, *given: Any) -> Any:
 
 
 def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any:
-    """What a sensor of the user's says that it is to filters, None where nothing. Raises UserError where no aid."""
+    """What a sensor of the user's says that it is to filters, None where nothing. Raises UserError where no aid.
+
+    One of a class of the user's is guarded, one of `nav.aids` is what it is.
+    """
     try:
         found = maker(name, section, imu)
     except UserError:
@@ -50,7 +58,61 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
         raise UserError(f"{_called(name, section)}: aid gave {_type(found)}, which lacks {', '.join(missing)}")
     if found.sensor != name:
         raise UserError(f"{_called(name, section)}: aid gave one of sensor {shown(found.sensor)}, not {shown(name)}")
-    return found
+    return found if type(found).__module__.startswith(f"{nav.aids.__name__}.") else AidGuard(name, section, found)
+
+
+class AidGuard:
+    """An aid of the user's. Of what `measure` gives only measurements come through (`nav.aids.base.Aid`).
+
+    Raises UserError where it gives anything else, or raises.
+    """
+
+    def __init__(self, name: str, section: Section, own: Any) -> None:
+        self.sensor, self._called, self._aid = name, f"{_called(name, section)}: aid", own
+        try:
+            self.parts: tuple[tuple[str, int], ...] = tuple((str(part), int(axes)) for part, axes in own.parts)
+            self.states: tuple[str, ...] = tuple(map(str, own.states))
+        except (TypeError, ValueError):
+            given = f"parts = {shown(str(own.parts))} and states = {shown(str(own.states))}"
+            raise UserError(f"{self._called}: {given}: give pairs of a name and its axes, and names") from None
+
+    def blocks(self) -> list[Block]:
+        """Its error states."""
+        found = self._asked("blocks")
+        if not (isinstance(found, list) and all(isinstance(one, Block) for one in found)):
+            raise UserError(f"{self._called}: blocks gave {shown(str(found))}: give a list of nav.error_model.Block")
+        return found
+
+    def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
+        """One part of a sample."""
+        given = self._asked("measure", part, sample, at)
+        if given is not None and (wrong := _no_measurement(given, dict(self.parts)[part], len(at.x))):
+            raise UserError(f"{self._called}: measure gave {wrong} of {shown(part)} at {sample.t:g} s")
+        return cast("Measurement | None", given)
+
+    def _asked(self, method: str, *given: Any) -> Any:
+        try:
+            return getattr(self._aid, method)(*given)
+        except UserError:
+            raise
+        except (Exception, SystemExit) as error:
+            raise UserError(f"{self._called}: {plugins.raised(error)}") from error
+
+
+def _no_measurement(given: Any, axes: int, states: int) -> str:
+    """What is wrong with a measurement by so many axes and states; empty when nothing is."""
+    if not isinstance(given, Measurement):
+        return f"{_type(given)} where a Measurement or None was expected"
+    for what, value, shape in (("nu", given.nu, (axes,)), ("H", given.H, (axes, states)), ("R", given.R, (axes,))):
+        try:
+            numbers = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            return f"{what} = {shown(value)}, which are no numbers,"
+        if numbers.shape != shape:
+            return f"{what} of shape {numbers.shape}, not {shape},"
+        if not np.isfinite(numbers).all():
+            return f"{what} = {numbers.tolist()}"
+    return "" if (np.asarray(given.R) >= 0).all() else f"variances R = {np.asarray(given.R).tolist()}"
 
 
 class Guard:

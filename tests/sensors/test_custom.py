@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import Field
 
+from nav.aids.base import Measurement
 from testbed.noise import Process, stream
 from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig
 from testbed.sensors.timing import AidingTiming, Schedule
@@ -86,6 +87,40 @@ WRONG = {
     "raise": lambda: np.linalg.inv(np.zeros((2, 2))),
     "late": generated,
 }
+
+
+class HeightAid:
+    sensor, parts, states = "radar", (("radar", 1),), ()
+
+    def __init__(self, how):
+        self.how = how
+        self.parts = 3 if how == "parts" else self.parts
+
+    def blocks(self):
+        return ["bias"] if self.how == "blocks" else []
+
+    def measure(self, part, sample, at):
+        nu, H, R = np.zeros(1), np.zeros((1, len(at.x))), np.ones(1)
+        match self.how:
+            case "aid raise":
+                return at.no_such_thing
+            case "aid dict":
+                return {"nu": nu}
+            case "aid nan":
+                nu[0] = np.nan
+            case "aid H":
+                H = np.zeros((1, 3))
+            case "aid R":
+                R[0] = -1.0
+            case "aid text":
+                R = ["wide"]
+        return None if self.how == "aid none" else Measurement(nu, H, R)
+
+
+class Aided(Radar):
+    @staticmethod
+    def aid(name, section, imu):
+        return HeightAid(section.how)
 
 
 class Aiding(Radar):
@@ -215,6 +250,34 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": how}))
     assert f"sensor radar: ./radar.py:Aiding: {'aid: ' if how else ''}{says}" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("parts", 'parts = "3" and states = "()": give pairs of a name and its axes, and names'),
+        ("blocks", """blocks gave "['bias']": give a list of nav.error_model.Block"""),
+        ("aid raise", f"AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' ({at('no_such')})"),
+        ("aid dict", 'measure gave dict where a Measurement or None was expected of "radar" at '),
+        ("aid nan", 'measure gave nu = [nan] of "radar" at '),
+        ("aid H", "measure gave H of shape (1, 3), not (1, "),
+        ("aid R", 'measure gave variances R = [-1.0] of "radar" at '),
+        ("aid text", "measure gave R = "),
+    ],
+)
+def test_what_is_no_measurement_ends_the_run_with_a_line(scenario: Path, how: str, says: str) -> None:
+    """An exception of an aid ended in a traceback, and what is not a number was fused."""
+    keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    with pytest.raises(UserError) as told:
+        run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how}))
+    assert f"sensor radar: ./radar.py:Aided: aid: {says}" in str(told.value)
+
+
+@pytest.mark.parametrize(("how", "looks"), [("", 1), ("aid none", 0)])
+def test_what_is_a_measurement_is_used(scenario: Path, how: str, looks: int) -> None:
+    keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how}))
+    assert len([one for one in result.dataset.groups if one.endswith("innovations/radar")]) == looks
 
 
 def test_what_it_writes_into_truth_nobody_else_sees(scenario: Path) -> None:
