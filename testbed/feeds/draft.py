@@ -187,8 +187,9 @@ def _columns(truth: LogTruth, out: Path) -> Mapping[str, Any]:
     """What the scenario said of a table's columns, without what it left out, files as seen from ``out``."""
     said = {name: stream.model_dump(exclude_unset=True) for name, stream in truth.columns.items()}
     for stream in said.values():
-        if "file" in stream:
-            stream["file"] = _seen_from(out, stream["file"])
+        for table in (stream, *(one for one in stream.values() if isinstance(one, dict))):
+            if table.get("file") is not None:
+                table["file"] = _seen_from(out, table["file"])
     return said
 
 

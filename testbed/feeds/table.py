@@ -90,12 +90,12 @@ class Table(NamedTuple):
 
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
-    """Read a table, and those of sensors that have their own, by their ``columns``.
+    """Read a table, and those of sensors and of quantities that have their own, by their ``columns``.
 
     Raises UserError when one, or what is said of it, is wrong.
     """
-    files = {name: path if stream.file is None else Path(stream.file) for name, stream in columns.items()}
-    of_files = {file: load(file) for file in dict.fromkeys([path, *files.values()])}
+    named = [Path(file) for stream in columns.values() for file in stream.files.values()]
+    of_files = {file: load(file) for file in dict.fromkeys([path, *named])}
     found = {
         name if file == path else f"{name} of {file.name}": len(values)
         for file, table in of_files.items()
@@ -114,7 +114,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = _stream(of_files[files[name]], name, kind, stream, heard, notes)
+        t, values = _stream(of_files, path, name, kind, stream, heard, notes)
         if kind == "imu":
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
@@ -244,25 +244,30 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def _stream(
-    table: Table, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None, notes: list[str]
-) -> tuple[Array, dict[str, Array]]:
+    tables: Mapping[Path, Table], main: Path, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None,
+    notes: list[str],
+) -> tuple[Array, dict[str, Array]]:  # fmt: skip
     """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs.
 
-    ``heard`` is when the inertial unit was, as of `ordered`.
+    They are in the ``main`` one of the tables, or in those that are named. ``heard`` is when the inertial unit was, as
+    of `ordered`.
     """
     where = f"truth.columns.{name}"
     if kind not in NEEDED:
         raise UserError(f"{where}: {unknown('kind', kind, list(NEEDED))}")
     usual = {key for keys in NEEDED[kind] for key in keys} | set(OPTIONAL.get(kind, ()))
-    given = {key: getattr(stream, key) for key in UNITS if key != "time" and getattr(stream, key) is not None}
+    given = {key: column for key, column in stream.columns.items() if key != "time"}
     for key in given:
         if key not in usual:
             raise UserError(f"{where}.{key}: is nothing that a sensor of kind {kind} has: {choice(key, sorted(usual))}")
     for keys in NEEDED[kind]:
         if not any(key in given for key in keys):
             raise UserError(f"{where}.{keys[0]}: is missing: a sensor of kind {kind} needs {' or '.join(keys)}")
-    values = {key: _quantity(table, f"{where}.{key}", key, column, notes) for key, column in given.items()}
-    stamps = _quantity(table, f"{where}.time", "time", stream.time, notes)
+    values = {}
+    for key, column in (given | {"time": stream.time}).items():
+        table = tables[Path(column.file or stream.file or main)]
+        values[key] = _quantity(table, f"{where}.{key}", key, column, notes)
+    stamps = values.pop("time")
     for key, array in values.items():
         if len(array) != len(stamps):
             raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")

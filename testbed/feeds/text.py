@@ -52,7 +52,7 @@ def layout(lines: Iterable[str]) -> Layout:
     if not plain:
         return Layout(",", ".", comment[0], _fields(comment[1], ","), 0)
     (number, first), (_, row) = plain[0], plain[-1]
-    mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES)
+    mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES if " " in row.strip() else ",")
     fields = _fields(row, mark)
     decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, fields)) else "."
     width, top = len(fields), _fields(first, mark)
@@ -66,12 +66,12 @@ def layout(lines: Iterable[str]) -> Layout:
 
 
 def is_table(head: bytes) -> bool:
-    """Whether a file begins as a text of several columns does: with commas, or with numbers."""
+    """Whether a file begins as a text of columns does: with commas, or with numbers."""
     if any(byte < ord(" ") and byte not in b"\t\r\n" for byte in head):
         return False
     lines = [line for line in head.decode(errors="replace").splitlines() if line.strip() and line[0] not in COMMENTS]
     found = layout(lines)
-    return b"," in head or (found.width > 1 and _are_numbers(_fields(lines[:2][-1], found.mark), found.decimal))
+    return b"," in head or (found.width > 0 and _are_numbers(_fields(lines[:2][-1], found.mark), found.decimal))
 
 
 def columns(path: Path) -> Iterator[tuple[str, Any]]:

@@ -34,6 +34,10 @@ class Column(Section):
     column: str | tuple[str, ...] = Field(
         description="its name, of a vector that of an array or those of three; `name:2` is one column of an array"
     )
+    file: str | None = Field(
+        default=None,
+        description="the table that it is in, row by row beside the time, seen from this file; none: the sensor's",
+    )
     unit: str | None = Field(default=None, description="what it is in; none: the SI unit")
     axes: tuple[Component, Component, Component] = Field(
         default=("x", "y", "z"),
@@ -108,11 +112,22 @@ class Stream(Section):
     airspeed: Column | None = Field(default=None, description="equivalent (indicated)")
     attitude: Column | None = Field(default=None, description="roll, pitch, heading; or four of a quaternion, w first")
 
+    @property
+    def columns(self) -> dict[str, Column]:
+        """Those that are given, by the quantity that they hold."""
+        given = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: column for name, column in given.items() if isinstance(column, Column)}
+
+    @property
+    def files(self) -> dict[str, str]:
+        """The tables that it names, by the keys that do."""
+        own = {f"{name}.file": column.file for name, column in self.columns.items()}
+        return {key: file for key, file in {"file": self.file, **own}.items() if file is not None}
+
     @model_validator(mode="after")
     def _frames_are_of_attitudes(self) -> Stream:
-        for name in type(self).model_fields:
-            column = getattr(self, name)
-            if name != "attitude" and isinstance(column, Column) and column.frame != "frd-ned":
+        for name, column in self.columns.items():
+            if name != "attitude" and column.frame != "frd-ned":
                 raise ValueError(f"{name}.frame: is nothing but an attitude's: say it with axes")
         return self
 
@@ -170,5 +185,7 @@ class LogTruth(Section):
     @property
     def files(self) -> dict[str, str]:
         """All that it is in, by the keys that name them."""
-        own = {f"columns.{name}.file": stream.file for name, stream in self.columns.items() if stream.file is not None}
+        own = {
+            f"columns.{name}.{key}": file for name, stream in self.columns.items() for key, file in stream.files.items()
+        }
         return {"file": self.file, **own}

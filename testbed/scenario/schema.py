@@ -370,10 +370,17 @@ def _see_files(truth: dict[str, Any], path: Path | None) -> None:
     folder = path.parent if path else Path()
     if isinstance(named := truth.get("aircraft"), str):
         truth["aircraft"] = _aircraft(named, path)
-    streams = truth["columns"].values() if isinstance(truth.get("columns"), dict) else ()
-    for table in (truth if truth.get("source") == "log" else None, *streams, truth.get("wind"), truth.get("terrain")):
+    streams = _tables(truth.get("columns"))
+    columns = [one for stream in streams for one in _tables(stream)]
+    log = truth if truth.get("source") == "log" else None
+    for table in (log, *streams, *columns, truth.get("wind"), truth.get("terrain")):
         if isinstance(table, dict) and isinstance(file := table.get("file"), str) and file != terrain.JACKSBORO:
             table["file"] = str(folder / file)
+
+
+def _tables(of: Any) -> list[dict[str, Any]]:
+    """The tables in a table, whatever else it has."""
+    return [one for one in of.values() if isinstance(one, dict)] if isinstance(of, dict) else []
 
 
 def _aircraft(named: str, path: Path | None) -> str:

@@ -202,3 +202,36 @@ def test_dates_are_times(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             load(tmp_path / "a.csv").numbers["t"], start.timestamp() + np.arange(100) / 50, atol=1e-6
         )
+
+
+def test_each_quantity_may_have_its_file(tmp_path: Path) -> None:
+    """As gnss-ins-sim writes them: times, rates and forces of one unit in three files, one of a single column."""
+    columns = {"time": ["time (sec)"], "gyro-0": NAMES[1:4], "accel-0": NAMES[4:]}
+    starts = {"time": 0, "gyro-0": 1, "accel-0": 4}
+    for name, names in columns.items():
+        part = IMU[:, starts[name] : starts[name] + len(names)]
+        (tmp_path / f"{name}.csv").write_text("\n".join([",".join(names), *rows(part, ",")]))
+    (tmp_path / "fixes.txt").write_text("\n".join(rows(FIXES, "  ")))
+    text = SCENARIO.replace("imu.txt", "time.csv").replace('time = "0"', 'time = "time (sec)"', 1)
+    text = text.replace('column = ["1", "2", "3"]', 'file = "gyro-0.csv", column = ["gx", "gy", "gz"]')
+    text = text.replace('column = ["4", "5", "6"]', 'file = "accel-0.csv", column = ["fx", "fy", "fz"]')
+    (tmp_path / "flight.toml").write_text(text)
+    truth = Scenario.load(tmp_path / "flight.toml").truth
+    assert isinstance(truth, LogTruth)
+    imu = formats.open_log(truth).imus["imu"]
+    np.testing.assert_allclose(imu.t, T, atol=1e-9)
+    np.testing.assert_allclose(np.hstack([imu.dtheta, imu.dv]), IMU[:, 1:], atol=1e-9)
+
+    (tmp_path / "drafts").mkdir()
+    out = tmp_path / "drafts" / "draft.toml"
+    out.write_text(draft.scenario(survey(formats.open_log(truth)), out, truth, dt.date(2024, 6, 1)))
+    drafted = Scenario.load(out).truth
+    assert isinstance(drafted, LogTruth)
+    assert len(formats.open_log(drafted).imus["imu"]) == 1500
+
+    (tmp_path / "gyro-0.csv").write_text("\n".join(["gx,gy,gz", *rows(IMU[:100, 1:4], ",")]))
+    with pytest.raises(UserError, match=r"columns\.imu\.gyro: has 100 rows, and its time has 1500"):
+        formats.open_log(truth)
+    (tmp_path / "gyro-0.csv").unlink()
+    with pytest.raises(UserError, match=r"truth\.columns\.imu\.gyro\.file: .*gyro-0\.csv: No such file"):
+        formats.open_log(truth)
