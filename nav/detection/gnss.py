@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, auto
+
+import numpy as np
 
 from nav._jit import njit
 from nav.detection.witness import SURE
@@ -14,6 +16,7 @@ from nav.samples import Array, GnssSample
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
 TURN_ERROR = 0.6
 PROBATION_S, RECOVERY_S = 1.0, 4.0  # fixes that agree for so long may be used after an outage, overrule the filter
+SLOW_ERROR = 0.1  # of a velocity, for as long as a streak lasts, at least [m/s]
 JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
 
 
@@ -31,9 +34,11 @@ class GnssMonitor:
     """Decides on each GNSS fix so that a good receiver is never shut out for ever and a bad fix never pulls the filter.
 
     Successive fixes form a streak while each agrees with the one before and with the velocities in between, which
-    needs no trust in the filter. While the filter is being aided, a fix inside the gate is fused and one outside
-    rejected, and only a streak that stays outside for ``patience_s`` is believed against the filter. After an outage of
-    ``outage_s`` the filter's covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
+    needs no trust in the filter. A position that stands still, or goes elsewhere than its velocity, may do so from
+    one fix to the next: with the first of the streak, or the last that was fused, it must agree as well. While the
+    filter is being aided, a fix inside the gate is fused and one outside rejected, and only a streak that stays
+    outside for ``patience_s`` is believed against the filter. After an outage of ``outage_s`` the filter's
+    covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
     has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
     ``recovery_s`` the streak is believed. So it is without an outage where the wind is a witness that the filter was
     led astray (`nav.detection.witness`), as when a spoofer lets go.
@@ -51,6 +56,9 @@ class GnssMonitor:
     _heard: float = math.nan  # when the last of them was
     _was_aided: bool = False
     _previous: tuple[GnssSample, Array] | None = None
+    _begun: GnssSample | None = None  # the first of the streak, or the last fused
+    _moved: Array = field(default_factory=lambda: np.zeros(3))  # since then, by velocities [m]
+    _turned: float = 0.0  # and what turns may add to that, over `TURN_ERROR`: the sum of dt^3 [s^3]
 
     def heard(self, t: float) -> None:
         """The receiver has reported at ``t`` [s], if only that it has no fix."""
@@ -65,8 +73,10 @@ class GnssMonitor:
         """
         self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
-            self._streak_start = fix.t
+            self._begin(fix)
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
+        elif self._strays(fix, sigma_v):
+            self._begin(fix)
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         wait = self.patience_s if self._was_aided and odds < SURE else self.recovery_s
@@ -80,6 +90,7 @@ class GnssMonitor:
         if verdict in (Verdict.FUSE, Verdict.RECOVER):
             self.last_fused = fix.t
             self._was_aided = True
+            self._count_from(fix)
         return verdict
 
     def sure(self, t: float, before: float) -> bool:
@@ -90,33 +101,54 @@ class GnssMonitor:
         """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""
         return max(self.outage_s, 2 * self._interval) if math.isfinite(self._interval) else self.outage_s
 
+    def _begin(self, fix: GnssSample) -> None:
+        self._streak_start = fix.t
+        self._count_from(fix)
+
+    def _count_from(self, fix: GnssSample) -> None:
+        self._begun, self._turned = fix, 0.0
+        self._moved[:] = 0.0
+
     def _continues(self, fix: GnssSample, v_n: Array, sigma_v: Array) -> bool:
         """Whether ``fix`` is where the fix before it and the mean of both velocities say."""
         if self._previous is None:
             return False
         before, v0_n = self._previous
-        return (
-            fix.t - before.t <= self._longest_gap() and jump(before, fix, v0_n + v_n, sigma_v) <= self.consistency_gate
-        )
+        dt = fix.t - before.t
+        if dt > self._longest_gap():
+            return False
+        moved = 0.5 * dt * (v0_n + v_n)
+        self._moved += moved
+        self._turned += dt**3
+        return jump(before, fix, moved, dt * sigma_v, dt**3) <= self.consistency_gate
+
+    def _strays(self, fix: GnssSample, sigma_v: Array) -> bool:
+        """Whether the receiver's own velocities lead elsewhere from the first of the streak."""
+        if self._begun is None or not math.isfinite(fix.v_n[0]):
+            return False
+        drift = (fix.t - self._begun.t) * np.maximum(sigma_v, SLOW_ERROR)
+        return jump(self._begun, fix, self._moved, drift, self._turned) > self.consistency_gate
 
 
-def jump(before: GnssSample, fix: GnssSample, velocities: Array, sigma_v: Array) -> float:
-    """Squared distance, chi-square of three, of a fix from where the one before and both velocities' sum say [m/s]."""
+def jump(before: GnssSample, fix: GnssSample, moved: Array, drift: Array, turned: float) -> float:
+    """Squared distance, chi-square of three, of a fix from where it ``moved`` (3,) [m] by velocities since one before.
+
+    ``drift`` (3,) [m] is 1-sigma of that, and ``turned`` [s^3] the sum of dt^3.
+    """
     return _jump(
-        fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h, fix.t - before.t, velocities,
-        fix.sigma_position_n, before.sigma_position_n, sigma_v,
+        fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h, moved, drift, turned, fix.sigma_position_n,
+        before.sigma_position_n,
     )  # fmt: skip
 
 
 @njit
 def _jump(
-    lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float, dt: float, velocities: Array, sigma: Array,
-    sigma_before: Array, sigma_v: Array,
+    lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float, moved: Array, drift: Array, turned: float,
+    sigma: Array, sigma_before: Array,
 ) -> float:  # fmt: skip
     """`jump`, in one kernel."""
     off, squared = displacement_n(lat, lon, h, lat0, lon0, h0), 0.0
     for k in range(3):
-        variance = sigma[k] ** 2 + sigma_before[k] ** 2 + (dt * sigma_v[k]) ** 2
-        variance += JUMP_FLOOR**2 + (TURN_ERROR * dt**3) ** 2
-        squared += (off[k] - 0.5 * dt * velocities[k]) ** 2 / variance
+        variance = sigma[k] ** 2 + sigma_before[k] ** 2 + drift[k] ** 2 + JUMP_FLOOR**2 + (TURN_ERROR * turned) ** 2
+        squared += (off[k] - moved[k]) ** 2 / variance
     return squared

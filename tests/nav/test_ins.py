@@ -520,6 +520,36 @@ def test_fixes_that_contradict_the_filter_are_believed_sooner_where_something_sp
     assert all(contradicted[6:])
 
 
+@pytest.mark.parametrize(("speed", "rate_hz"), [(25.0, 5.0), (25.0, 1.0), (3.0, 5.0), (1.0, 10.0)])
+def test_a_position_that_stands_still_while_its_velocity_does_not_is_never_believed(speed, rate_hz):
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma, v_n = np.full(3, 1.5), np.array([speed, 0.0, 0.0])
+    for k in range(1, int(200 * rate_hz)):
+        t = k / rate_hz
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, v_n, sigma, 0.05 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        assert monitor.judge(fix, v_n, 0.05 * sigma, False) in (Verdict.REJECT, Verdict.PROBATION)
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0])
+def test_a_receiver_that_circles_late_and_noisily_is_believed_against_the_filter(rate_hz):
+    """Velocities are older than positions by 0.15 s, positions drift by metres: no more than real receivers do."""
+    random = np.random.default_rng(5)
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma = np.full(3, 1.5)
+    for k in range(1, 200):
+        t = k / rate_hz
+        angle, late = 0.3 * t, 0.3 * (t - 0.15)
+        p_n = 80.0 * np.array([np.cos(angle), np.sin(angle), 0.0]) + random.normal(0, 0.5, 3) + 2 * np.sin(t / 20)
+        v_n = 24.0 * np.array([-np.sin(late), np.cos(late), 0.0]) + random.normal(0, 0.1, 3)
+        lat, lon = 0.8 + p_n[0] / 6.37e6, 0.1 + p_n[1] / (6.39e6 * np.cos(0.8))
+        fix = GnssSample(t, t, lat, lon, 100.0 - p_n[2], v_n, sigma, 0.1 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        if monitor.judge(fix, v_n, 0.1 * sigma, False) is Verdict.RECOVER:
+            break
+    assert t == pytest.approx(31.0, abs=1.01)
+
+
 def test_the_wind_speaks_for_who_brings_it_back_to_what_it_was():
     """Against the ratio of two normal densities; nothing is said where velocities agree, or nothing is remembered."""
     memory = WindMemory(walk=0.02, gust=0.8)
