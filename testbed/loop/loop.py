@@ -110,6 +110,8 @@ def run(
     closed at the end; when it fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when
     the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
+    if not isinstance(scenario, Scenario):
+        raise UserError(f"run: give a Scenario, such as Scenario.load({str(scenario)!r})")
     with ExitStack() as ending:
         for link in links:
             ending.callback(link.close)

@@ -20,7 +20,7 @@ import time
 import tomllib
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -38,7 +38,7 @@ from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
-from testbed.scenario import Scenario
+from testbed.scenario import Scenario, keypath
 from testbed.score import accuracy, metrics
 
 if TYPE_CHECKING:
@@ -230,29 +230,41 @@ def campaign(
     scenario: str | Path,
     runs: int,
     *,
-    vary: Mapping[str, Sequence[str]] | None = None,
-    overrides: Sequence[str] = (),
+    vary: Mapping[str, Sequence[Any]] | None = None,
+    overrides: Sequence[str] | Mapping[str, Any] = (),
     draw: int = 0,
     workers: int | str | None = None,
     out: str | Path | None = None,
 ) -> CampaignResult:
     """Fly ``runs`` seeds of a scenario for every combination of the values in ``vary``, and say what they show.
 
-    ``vary`` maps a key path to the values it takes, each as ``--set`` takes it; ``overrides`` apply to all runs. Each
-    ``draw`` has other seeds. ``workers`` is the number of processes, one for each core without, or the address of a
-    Dask scheduler. In ``out``, `usual_folder` without, there are at the end runs/, campaign.csv, campaign.json and
-    figures; what is there already of the same campaign is not flown again. How far it is, and how long it will take,
-    is told on stderr.
+    ``vary`` maps a key path to the values it takes, each as it is or as the text that ``--set`` takes;
+    ``overrides``, as `Scenario.load` takes them, apply to all runs. Each ``draw`` has other seeds. ``workers`` is
+    the number of processes, one for each core without, or the address of a Dask scheduler. In ``out``,
+    `usual_folder` without, there are at the end runs/, campaign.csv, campaign.json and figures; what is there
+    already of the same campaign is not flown again. How far it is is told on stderr.
 
-    A run that fails is in ``failures`` and stops no other. Raises UserError when the scenario or a varied value is
-    wrong, when ``out`` can't be written or holds another campaign, or when the scheduler can't be reached.
+    A run that fails is in ``failures`` and stops no other. Raises UserError when anything given is wrong, when ``out``
+    can't be written or holds another campaign, or when the scheduler can't be reached.
     """
+    if not isinstance(scenario, str | Path):
+        raise UserError(f"campaign: give the file or the name of a scenario, not {type(scenario).__name__}")
+    if isinstance(overrides, Mapping):
+        overrides = [keypath.override(*one) for one in overrides.items()]
+    varied = {key: _written(key, listed) for key, listed in (vary or {}).items()}
     folder = usual_folder(scenario, draw) if out is None else Path(out)
     from rich.console import Console
 
     with progress.shown(Console(stderr=True), str(scenario)) as tell:
-        plan = Plan(scenario, runs, folder, vary or {}, overrides, draw)
+        plan = Plan(scenario, runs, folder, varied, overrides, draw)
         return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
+
+
+def _written(key: str, listed: Any) -> Sequence[str]:
+    """The values that a key takes, as ``--set`` takes them."""
+    if isinstance(listed, str) or not isinstance(listed, Iterable):
+        raise UserError(f"vary {key}: {shown(str(listed))} is one value: give a list of values, such as [0, 5]")
+    return [one if isinstance(one, str) else keypath.as_toml(key, one) for one in listed]
 
 
 def usual_folder(scenario: str | Path, draw: int) -> Path:
@@ -298,8 +310,6 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
 def _combinations(plan: Plan) -> list[Combination]:
     """Every combination of varied values, each loaded and so checked. They differ in nothing else."""
     for key, listed in plan.vary.items():
-        if isinstance(listed, str):
-            raise UserError(f"--vary {key}: {shown(listed)} is one text: give a list of values, such as ['0', '5']")
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
         if not listed or len(set(listed)) < len(listed):

@@ -91,6 +91,8 @@ def opened(tasks: int, workers: int | str | None = None) -> Iterator[Pool]:
         with _client(workers) as client:
             yield _Cluster(client, _hired(client, workers))
         return
+    if workers is not None and workers < 1:
+        raise UserError(f"workers {workers}: give at least 1, or none for one a core")
     count = min(workers or cores(), tasks)
     if count <= 1:
         yield _Here()

@@ -174,12 +174,17 @@ def assign(data: dict[str, Any], override: str) -> KeyPath:
 
 
 def override(key: str, value: Any) -> str:
-    """The ``key=value`` that sets ``key`` to a value given in Python, as `assign` takes it.
+    """The ``key=value`` that sets ``key`` to a value given in Python, as `assign` takes it. Raises as `as_toml`."""
+    return f"{key}={as_toml(key, value)}"
+
+
+def as_toml(key: str, value: Any) -> str:
+    """A value given in Python for ``key``, as TOML has it.
 
     Booleans, numbers, texts, dates, lists and tables of these, and what `tolist` makes into such (numpy). Raises
     UserError for anything else.
     """
-    return f"{key}={_toml_text(value, f'{printable(key)} = {printable(repr(value))}')}"
+    return _toml_text(value, f"{printable(key)} = {printable(repr(value))}")
 
 
 def _toml_text(value: Any, where: str) -> str:

@@ -455,7 +455,27 @@ def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
     assert list(dataset["sensors.gnss.rate_hz"].values) == ["1", "1", "5", "5"]
 
 
+def test_values_may_be_given_as_they_are(at_rest: Path, tmp_path: Path, threads: str) -> None:
+    """They were flown, and then ended in a traceback."""
+    vary = {"sensors.gnss.denied": [[], [[70, 75]]], "sensors.gnss.rate_hz": [1, 5]}
+    result = campaign(at_rest, 1, vary=vary, workers=threads, overrides={"duration_s": 76}, out=tmp_path / "out")
+    assert not result.failures
+    said = [("[]", "1"), ("[]", "5"), ("[[70, 75]]", "1"), ("[[70, 75]]", "5")]
+    assert [tuple(one.values.values()) for one in result.combinations] == said
+    assert [one.scenario.sensors["gnss"].rate_hz for one in result.combinations] == [1, 5, 1, 5]
+    assert result.combinations[0].scenario.duration_s == 76
+
+
 # --- what a user may get wrong
+
+
+def test_what_is_no_scenario_or_no_number_of_workers_is_told(at_rest: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="give the file or the name of a scenario, not Scenario"):
+        campaign(Scenario.load(at_rest), 1, out=tmp_path / "out")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match="workers 0: give at least 1"):
+        campaign(at_rest, 1, workers=0, out=tmp_path / "out")
+    with pytest.raises(UserError, match=r"run: give a Scenario, such as Scenario\.load\('u_turn'\)"):
+        run("u_turn")  # type: ignore[arg-type]
 
 
 @pytest.mark.ci
@@ -625,10 +645,13 @@ def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
         ({"sensors.gnss.rate_hz": []}, "each value once"),
         ({"sensors.gnss.rate_hz": ["5", "7"]}, "does not divide"),
         ({"sensors.gnss.speed": ["5"]}, "unknown key"),
-        ({"sensors.gnss.rate_hz": "1,5"}, '"1,5" is one text: give a list of values'),
+        ({"sensors.gnss.rate_hz": "1,5"}, '"1,5" is one value: give a list of values'),
+        ({"sensors.gnss.rate_hz": 5}, '"5" is one value: give a list of values'),
+        ({"sensors.gnss.rate_hz": [1, "1"]}, "each value once"),
+        ({"sensors.gnss.rate_hz": [5, None]}, "and no NoneType"),
     ],
 )
-def test_wrong_varied_values(at_rest: Path, tmp_path: Path, vary: dict[str, list[str]], message: str) -> None:
+def test_wrong_varied_values(at_rest: Path, tmp_path: Path, vary: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
         campaign(at_rest, 2, vary=vary, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
