@@ -261,7 +261,6 @@ def campaign(
 
 
 def _written(key: str, listed: Any) -> Sequence[str]:
-    """The values that a key takes, as ``--set`` takes them."""
     if isinstance(listed, str) or not isinstance(listed, Iterable):
         raise UserError(f"vary {key}: {shown(str(listed))} is one value: give a list of values, such as [0, 5]")
     return [one if isinstance(one, str) else keypath.as_toml(key, one) for one in listed]

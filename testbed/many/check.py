@@ -33,6 +33,7 @@ from testbed.report import page as report
 from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score.accuracy import column
+from testbed.score.remarks import not_finite
 
 if TYPE_CHECKING:
     from junitparser import Error, Failure
@@ -257,7 +258,10 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
             wrong = [f"the flight ended after {t:.0f} s: {result.failure}"]
-        failure = "\n".join([*wrong, *(f"{name} has ended: {why}" for name, why in result.ended.items())])
+        named = set(task.scenario.expect) | set(task.golden or ())
+        lost = not_finite({key: count for key, count in result.metrics.items() if key not in named})
+        ended = [f"{name} has ended: {why}" for name, why in result.ended.items()]
+        failure = "\n".join([*wrong, *ended, *lost])
         rows = judge(task.scenario.expect, result.metrics)
         if task.golden is not None:
             rows += against_golden(task.golden, result.metrics)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     import xarray
 
 VARIANCES = tuple(f"{axis} {what}" for what in ("position", "velocity", "attitude") for axis in accuracy.AXES)
+LOST = ".nonfinite_samples"
 CONFIDENCE = 0.999  # of the bound
 WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
@@ -40,11 +41,18 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
     return [
         *([f"errors are against {reference}"] if reference else []),
         *scores.unscored(dataset),
+        *not_finite(metrics),
         *unfinished_leg(dataset),
         *_impossible(dataset),
         *astray.values(),
         *_overconfident(dataset, metrics, trusted),
     ]
+
+
+def not_finite(metrics: Mapping[str, float]) -> list[str]:
+    """Who, once aligned, gave estimates that are no numbers, and so are in no other metric: a sentence each."""
+    lost = {key.removesuffix(LOST): count for key, count in metrics.items() if key.endswith(LOST)}
+    return [f"{name}: {n:.0f} estimates since its alignment are not finite, and not scored" for name, n in lost.items()]
 
 
 def _impossible(dataset: xarray.DataTree) -> Iterator[str]:

@@ -227,6 +227,30 @@ def test_a_lost_flight_fails_though_all_bounds_are_kept(tmp_path: Path, monkeypa
     assert outcome.failed
 
 
+LOST = "mine.nonfinite_samples"
+
+
+@pytest.mark.parametrize(
+    ("expected", "golden", "failed"),
+    [({}, {}, True), ({LOST: {"max": 800}}, None, False), ({}, {LOST: 799.0}, False)],
+)
+def test_estimates_that_are_no_numbers_fail_unless_they_are_expected(
+    expected: dict[str, Any],
+    golden: dict[str, float] | None,
+    failed: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They are in no error: a filter that is dead for most of a run kept all bounds."""
+    dead = SimpleNamespace(metrics={LOST: 799.0}, failure="", dataset={}, remarks=(), ended={})
+    monkeypatch.setattr(loop, "run", lambda *_, **__: dead)
+    monkeypatch.setattr(report, "write_report", lambda *_: None)
+    loaded = Scenario.load("static_bench", {"expect": expected, "estimator": [{"name": "mine", "aids": ["gnss"]}]})
+    outcome = check.fly(Task("mine", loaded, tmp_path, golden))
+    assert outcome.failed == failed
+    assert outcome.failure.startswith("mine: 799 estimates since its alignment are not finite") == failed
+
+
 @pytest.mark.ci
 def test_a_loop_that_never_closes_fails_though_all_bounds_are_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

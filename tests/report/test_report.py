@@ -18,6 +18,8 @@ from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.samples import Outcome
+from testbed import Scenario
+from testbed import run as simulate
 from testbed.errors import UserError
 from testbed.record.recorder import Recorder
 from testbed.report import campaign_figures, differences, style, tables
@@ -199,6 +201,17 @@ def test_broken_increments_leave_the_rest_of_the_bias_figure() -> None:
     apart = np.abs(broken["t"] - 100.0) > 31
     np.testing.assert_allclose(broken["gyro"][apart], clean["gyro"][apart], atol=1e-9)
     assert np.isnan(broken["gyro"][np.abs(broken["t"] - 100.0) < 29]).all()
+
+
+def test_the_errors_of_a_unit_are_of_body_axes_however_it_is_mounted() -> None:
+    """Of one that is turned by 90 deg they were thousands of deg/h."""
+    mounted = {"sensors.imu.grade": "perfect", "sensors.imu.mounting_deg": [0.0, 10.0, 90.0]}
+    keys = {"duration_s": 250, "truth.segments[0].duration_s": 100, "expect": {}}
+    flown = simulate(Scenario.load("kinematic_u_flight", keys | mounted))
+    found = imu.imu_error(Run(flown.dataset), "ins")
+    assert found is not None
+    assert abs(found["gyro"]).max() < 1e-7
+    assert abs(found["accel"]).max() < 1e-4
 
 
 def test_table_sets_gnss_and_outage_side_by_side() -> None:

@@ -119,7 +119,8 @@ def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> N
         f"other claims a variance of 0 or below in 100 of {len(covariance)} estimates (north position, down attitude): "
         "no NEES and no 3 σ there"
     )
-    assert doubts(run, metrics.compute(run)) == [text] * told
+    unscored = "other: 100 estimates since its alignment are not finite, and not scored"
+    assert doubts(run, metrics.compute(run)) == ([unscored] * bool(np.isnan(variance)) + [text] * told)
 
 
 def test_an_estimator_of_attitude_alone_claims_no_position() -> None:
@@ -127,3 +128,9 @@ def test_an_estimator_of_attitude_alone_claims_no_position() -> None:
     accuracy.column(run, "estimators/other/covariance")[:, 0, 0] = 0.0
     accuracy.column(run, "estimators/other/status")[:] |= Status.ATTITUDE_ONLY
     assert doubts(run, metrics.compute(run)) == []
+
+
+def test_estimates_that_are_no_numbers_are_told() -> None:
+    run = flown()
+    told = remarks(run, {"ins.nonfinite_samples": 12.0, "ins.aligned_s": 2.0})
+    assert "ins: 12 estimates since its alignment are not finite, and not scored" in told

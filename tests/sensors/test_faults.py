@@ -378,13 +378,19 @@ def test_truth_says_what_was_done() -> None:
         fault(sensor="it", channel="north", kind="ramp", slope=0.5),
         fault(sensor="it", channel="north", kind="ramp", slope=2.0, unit="sigma"),
         fault(name="spoof", sensor="it", kind="drag_off", bearing_deg=0.0, velocity_mps=1.0),
+        fault(name="slowly", sensor="it", kind="drag_off", bearing_deg=0.0, acceleration_mps2=0.05),
         fault(sensor="it", kind="dropout"),
     ]
     truth = Faults(injected, {"it": config}, 1).truth
-    assert [one.name for one in truth] == ["it_north_ramp", "it_north_ramp_2", "spoof", "it_dropout"]
+    assert [one.name for one in truth] == ["it_north_ramp", "it_north_ramp_2", "spoof", "slowly", "it_dropout"]
     assert [(one.size, one.unit) for one in truth[:3]] == [(0.5, "m/s"), (2.0, "sigma/s"), (1.0, "m/s")]
-    assert [str(one) for one in truth[1:]] == ["it north ramp 2 sigma/s", "it drag_off 1 m/s", "it dropout"]
-    assert math.isnan(truth[3].size)
+    assert [str(one) for one in truth[1:]] == [
+        "it north ramp 2 sigma/s",
+        "it drag_off 1 m/s",
+        "it drag_off 0.05 m/s^2",
+        "it dropout",
+    ]
+    assert math.isnan(truth[4].size)
 
 
 def test_slow_delivers_one_of_so_many_and_an_imu_repeats_itself() -> None:

@@ -82,7 +82,7 @@ def imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
         return None
     found = {"t": (edges[n:] + edges[:-n]) / 2}
     for what, name in (("gyro", "dtheta"), ("accel", "dv")):
-        increments = column(run.dataset, f"sensors/{imu}/{name}")
+        increments = _increments(run, imu, name)
         broken = ~_sound(increments)
         measured = np.vstack([np.zeros(3), np.cumsum(np.where(broken[:, None], 0.0, increments), axis=0)])
         lost = np.append(0, np.cumsum(broken))
@@ -93,6 +93,12 @@ def imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
         whole = lost[at[n:]] == lost[at[:-n]]
         found[what] = np.where(whole[:, None], (total[n:] - total[:-n]) / BIAS_MEAN_S, np.nan)
     return found
+
+
+def _increments(run: Run, imu: str, name: str) -> Array:
+    """Recorded increments (N, 3) of a unit in body axes, as truth is, however it is mounted."""
+    increments, errors = column(run.dataset, f"sensors/{imu}/{name}"), run.datasheet(imu)
+    return increments if errors is None else np.asarray(increments @ errors.C_sb)
 
 
 def _sound(increments: Array) -> npt.NDArray[np.bool_]:
@@ -111,7 +117,8 @@ def longest(mask: npt.NDArray[np.bool_]) -> slice:
 
 def _signals(run: Run, imu: str, rows: npt.NDArray[np.bool_]) -> tuple[float, Array, Array] | None:
     """Interval [s], rates [rad/s] and specific force [m/s^2] (N, 3) of the longest sound stretch of these rows."""
-    t, dtheta, dv = (column(run.dataset, f"sensors/{imu}/{name}") for name in ("time", "dtheta", "dv"))
+    t = column(run.dataset, f"sensors/{imu}/time")
+    dtheta, dv = (_increments(run, imu, name) for name in ("dtheta", "dv"))
     if len(t) < 3:
         return None
     dt = float(np.median(np.diff(t)))

@@ -251,6 +251,8 @@ _PER = {"ramp": "/s", "quadratic": "/s^2"}
 def _truth(fault: FaultConfig, sensor: Any, taken: Collection[str]) -> FaultTruth:
     size = next((value for key in _SIZES if (value := getattr(fault, key, None)) is not None), math.nan)
     unit = _UNITS.get(fault.kind, "")
+    if isinstance(fault, DragOff) and not fault.velocity_mps:
+        size, unit = fault.acceleration_mps2, "m/s^2"
     if isinstance(fault, Sized) and not math.isnan(size):
         unit = (fault.unit or next(iter(CHANNELS[sensor.kind][fault.channel].units))) + _PER.get(fault.kind, "")
     channel = getattr(fault, "channel", None) or ""

@@ -281,7 +281,8 @@ async function start() {
   });
   new ResizeObserver(() => panels.forEach((panel) => panel.follow())).observe(document.body);
   sight();
-  setCursor(PAGE.live ? PAGE.end : PAGE.windows.length ? PAGE.windows[0][0] : (PAGE.start + PAGE.end) / 2);
+  const outage = PAGE.windows.find(([begin]) => begin > PAGE.start); // before the first nobody is aligned
+  setCursor(PAGE.live ? PAGE.end : outage ? outage[0] : (PAGE.start + PAGE.end) / 2);
   document.documentElement.dataset.state = "open";
   idle();
 }
