@@ -12,6 +12,9 @@ from nav._jit import njit
 from nav.earth import GAS_CONSTANT
 from nav.rotation import quat_from_euler_components, quat_rotate_components
 from nav.samples import Array
+from nav.terrain import Terrain
+from nav.terrain import ground as height_of_ground
+from testbed.motion import terrain
 from testbed.motion.guidance import Guidance, beginning, climb_out
 from testbed.motion.launch import Launcher
 from testbed.motion.legs import Leg
@@ -45,13 +48,13 @@ class Flight:
         self._weather = Weather(truth.wind, truth.start, seed, self._frame / truth.rate_hz)
         start, envelope, wind = truth.start, self._aircraft.envelope, self._weather.start()
         self._launcher: Launcher | None = None
-        self._legs, self._lowest = list(plan), HIT_M
+        self._legs, self._ground = list(plan), terrain.of(truth.terrain)
         if start.on_ground:
             assert envelope.launch is not None  # the scenario was checked
             self._launcher = Launcher(envelope.launch, truth, self._frame)
             self._aircraft.stand(start, envelope.launch, wind)
             self._legs.insert(0, climb_out(start, envelope))
-            self._lowest += start.alt_m
+            self._ground = Terrain.flat(start.alt_m)
         else:
             self._aircraft.start(start, wind)
         wind_seed = truth.wind.turbulence_seed
@@ -148,7 +151,8 @@ class Flight:
     def _guide(self) -> None:
         """One step of guidance, or the end of the flight."""
         true = self.true_feedback()
-        self.failure = _loss_of_control(true, self._lowest)
+        lowest = HIT_M + height_of_ground(true.lat, true.lon, self._ground.heights, self._ground.grid)[0]
+        self.failure = _loss_of_control(true, lowest)
         if self.failure:
             self._ended = True
             return

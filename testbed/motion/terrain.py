@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nav.earth import radii
+from nav.earth import radii, wrap_longitude
 from nav.samples import Array
 from nav.terrain import Terrain
 from testbed.errors import UserError
@@ -37,6 +37,22 @@ def of(section: Section) -> Terrain:
     except OSError as error:
         raise UserError(f"{path}: can't be read: {error.strerror or error}") from None
     return _kept(path, changed)
+
+
+def covers(terrain: Terrain, lat: float, lon: float) -> bool:
+    """Whether a place [rad] is not beyond the edge of a map with relief."""
+    lat_0, lat_step, lon_0, lon_step = terrain.grid.tolist()
+    rows, columns = terrain.heights.shape
+    north, east = lat - lat_0, wrap_longitude(lon - lon_0 - 0.5 * (columns - 1) * lon_step)
+    return bool(0.0 <= north <= (rows - 1) * lat_step and abs(east) <= 0.5 * (columns - 1) * lon_step)
+
+
+def extent(terrain: Terrain) -> str:
+    """From where to where a map with relief goes, in words."""
+    lat_0, lat_step, lon_0, lon_step = np.degrees(terrain.grid).tolist()
+    rows, columns = terrain.heights.shape
+    lat_1, lon_1 = lat_0 + (rows - 1) * lat_step, lon_0 + (columns - 1) * lon_step
+    return f"latitudes {lat_0:.4g} to {lat_1:.4g} deg, longitudes {lon_0:.5g} to {lon_1:.5g} deg"
 
 
 def thinned(terrain: Terrain, every: int) -> tuple[Terrain, float]:

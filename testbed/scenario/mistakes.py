@@ -82,7 +82,9 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         return
     start = scenario.truth.start
     yield from _launch_mistakes(scenario.truth, envelope)
-    begun, ground = guidance.beginning(start, envelope), start.alt_m if start.on_ground else 0.0
+    yield from _ground_mistakes(scenario.truth)
+    begun = guidance.beginning(start, envelope)
+    ground = start.alt_m if start.on_ground else scenario.truth.terrain.height_m
     for key, what in guidance.plan_mistakes(scenario.plan, begun, envelope, foreseen, ground):
         yield keypath.read(key), what
 
@@ -108,6 +110,27 @@ def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope) -> Iterato
             f"a start on the ground is where the ground is, {ground:.1f} m by {whose}, not at {start.alt_m:g}:"
             " change the one or the other",
         )
+
+
+def _ground_mistakes(truth: FlightTruth) -> Iterator[tuple[KeyPath, str]]:
+    """What of a start in the air can't be where the ground has relief."""
+    start = truth.start
+    try:
+        relief = terrain.of(truth.terrain)
+    except UserError:  # told already
+        return
+    if start.on_ground or relief.heights.size == 1:
+        return
+    lat, lon = math.radians(start.lat_deg), math.radians(start.lon_deg)
+    if not terrain.covers(relief, lat, lon):
+        yield (
+            ("truth", "terrain", "file"),
+            f"has no heights where the flight begins: it covers {terrain.extent(relief)}",
+        )
+        return
+    ground = height_of_ground(lat, lon, relief.heights, relief.grid)[0]
+    if start.alt_m <= ground:
+        yield ("truth", "start", "alt_m"), f"is below the ground, which is at {ground:.0f} m there: start above it"
 
 
 def _aircraft_mistakes(named: str) -> Iterator[tuple[KeyPath, str]]:

@@ -173,3 +173,48 @@ def test_mistakes_in_the_section(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "hills.toml").write_text(written, "utf-8")
     with pytest.raises(UserError, match=says):
         Scenario.load(tmp_path / "hills.toml")
+
+
+def flown_over(ground: dict[str, object], **overrides: object) -> Scenario:
+    """A straight flight at 1050 m over what is given."""
+    start = {"lat_deg": 36.58, "lon_deg": -84.34, "alt_m": 1050, "heading_deg": 30, "airspeed_mps": 25}
+    keys = {"truth.start": start, "truth.terrain": ground, "duration_s": 20, "expect": {}, "estimator": []}
+    return Scenario.load("u_turn", keys | overrides)
+
+
+@pytest.mark.parametrize(
+    ("ground", "overrides", "says"),
+    [
+        ({"height_m": 2000}, {}, r"truth\.start\.alt_m: .* 2\d\d\d"),
+        (
+            {"file": "jacksboro"},
+            {"truth.start.alt_m": 300},
+            r"truth\.start\.alt_m: is below the ground, which is at \d+ m",
+        ),
+        (
+            {"file": "jacksboro"},
+            {"truth.start.lon_deg": 84.34},
+            r"truth\.terrain\.file: has no heights where the flight begins: it covers latitudes 36\.45 to 36\.73 deg, "
+            r"longitudes -84\.4\d+ to -84\.0\d+ deg",
+        ),
+    ],
+)
+def test_a_start_below_the_ground_or_off_its_map_is_told(
+    ground: dict[str, object], overrides: dict[str, object], says: str
+) -> None:
+    with pytest.raises(UserError, match=says):
+        flown_over(ground, **overrides)
+
+
+def test_a_flight_ends_where_it_meets_the_ground(tmp_path: Path) -> None:
+    """It went on through hills: here, a kilometre ahead, is one of 1200 m."""
+    lat, lon = 36.5 + 0.01 * np.arange(20), -84.4 + 0.01 * np.arange(20)
+    height = np.where(lat > 36.585, 1200.0, 500.0)[:, None] + np.zeros(20)
+    np.savez(tmp_path / "hill.npz", lat_deg=lat, lon_deg=lon, height_m=height)
+    result = run(flown_over({"file": str(tmp_path / "hill.npz")}, duration_s=120))
+    assert result.failure == "the aircraft hit the ground"
+    truth = result.dataset["truth"]
+    terrain = read(tmp_path / "hill.npz")
+    here = ground(float(truth["lat"][-1]), float(truth["lon"][-1]), terrain.heights, terrain.grid)[0]
+    assert float(truth["h"][-1]) == pytest.approx(here + 1.0, abs=70.0)
+    assert float(truth["time"][-1]) < 100
