@@ -19,6 +19,8 @@ import numpy as np
 
 from nav.detection import chi_square_threshold
 from nav.samples import Status
+from testbed.errors import UserError
+from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
 from testbed.score.plan import unfinished_leg
@@ -42,6 +44,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *([f"errors are against {reference}"] if reference else []),
         *scores.unscored(dataset),
         *not_finite(metrics),
+        *_silent(dataset),
         *unfinished_leg(dataset),
         *_impossible(dataset),
         *astray.values(),
@@ -53,6 +56,16 @@ def not_finite(metrics: Mapping[str, float]) -> list[str]:
     """Who, once aligned, gave estimates that are no numbers, and so are in no other metric: a sentence each."""
     lost = {key.removesuffix(LOST): count for key, count in metrics.items() if key.endswith(LOST)}
     return [f"{name}: {n:.0f} estimates since its alignment are not finite, and not scored" for name, n in lost.items()]
+
+
+def _silent(dataset: xarray.DataTree) -> list[str]:
+    """Which sensors of the scenario gave nothing at all, such as one that never saw the ground."""
+    try:
+        sensors = scenario_of(dataset).sensors
+    except UserError:  # `unscored` says so
+        return []
+    heard = dataset["sensors"].children if "sensors" in dataset.children else ()
+    return [f"{name}: gave no sample in the whole run" for name in sensors if name not in heard]
 
 
 def _impossible(dataset: xarray.DataTree) -> Iterator[str]:

@@ -11,6 +11,7 @@ from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.samples import Status
+from testbed import Scenario, run
 from testbed.record.recorder import Recorder
 from testbed.score import accuracy, metrics
 from testbed.score.remarks import remarks
@@ -134,3 +135,10 @@ def test_estimates_that_are_no_numbers_are_told() -> None:
     run = flown()
     told = remarks(run, {"ins.nonfinite_samples": 12.0, "ins.aligned_s": 2.0})
     assert "ins: 12 estimates since its alignment are not finite, and not scored" in told
+
+
+def test_a_sensor_that_never_says_anything_is_told() -> None:
+    sensors = {"sensors.rangefinder": {"min_range_m": 0.5, "max_range_m": 20.0}}
+    result = run(Scenario.load("u_turn", {"duration_s": 5, "expect": {}, "estimator": []} | sensors))
+    assert "rangefinder: gave no sample in the whole run" in result.remarks
+    assert not [one for one in result.remarks if one.startswith(("imu", "gnss"))]
