@@ -65,8 +65,13 @@ class Doubts:
 
     def overruled(self, state: State, sample: Sample, nu: Array, report: UpdateReport) -> bool:
         """Whether to believe a fix against the filters, given its innovation ``nu`` (3,) and what became of it."""
-        lasting = report.weight == 0 and self._refusals.too_long(sample.t)
+        lasting = report.weight == 0 and self._refusals.too_long(sample.t) and not self.astray(sample)
         return self._witnessed(state, sample, nu, report.outcome) or lasting
+
+    def astray(self, sample: Sample) -> bool:
+        """Whether a sample is of a receiver whose refused positions contradict its own velocities."""
+        receiver = self._receivers.get(sample.sensor)
+        return receiver is not None and receiver.astray(sample.t)
 
     def _witnessed(self, state: State, sample: Sample, nu: Array, outcome: Outcome) -> bool:
         """Whether the wind speaks for a fix that was refused, and that those before it agree with."""

@@ -318,6 +318,8 @@ class Federated:
             return report_on(sample, part, nu, S, nis, math.nan, withheld)
         monitors = filter_.of_sensor[sample.sensor]
         suspect = any(w.suspect for w in monitors)
+        if suspect and self._doubts.astray(sample):
+            monitor.doubt()
         nu_judged, S_judged = self._against_master(state, filter_, sample, part) if suspect else (nu, S)
         decision, changed = monitor.judge(nu_judged, filter_.as_judged(part, sample, S_judged), t)
         if changed:

@@ -149,6 +149,10 @@ class Monitor:
             return decision, Change.ISOLATED
         return decision, Change.READMITTED if (before & ~self.isolated).any() else Change.NONE
 
+    def doubt(self) -> None:
+        """Sound measurements before this one speak for no readmission."""
+        self._good[:] = self._alone[:] = 0.0
+
     def isolate(self) -> None:
         """Isolate every axis, whatever the detector found."""
         self.isolated, self._good = np.full(len(self.isolated), True), np.zeros(len(self.isolated))

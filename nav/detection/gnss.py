@@ -16,6 +16,7 @@ from nav.samples import Array, GnssSample
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
 TURN_ERROR = 0.6
 PROBATION_S, RECOVERY_S = 1.0, 4.0  # fixes that agree for so long may be used after an outage, overrule the filter
+ASTRAY_S = 10.0  # as long as a slow vehicle needs to show it again
 SLOW_ERROR = 0.1  # of a velocity, for as long as a streak lasts, at least [m/s]
 JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
 
@@ -58,6 +59,7 @@ class GnssMonitor:
     _previous: tuple[GnssSample, Array] | None = None
     _begun: GnssSample | None = None  # the first of the streak, or the last fused
     _moved: Array = field(default_factory=lambda: np.zeros(3))  # since then, by velocities [m]
+    _strayed: float = -math.inf  # when one last did not agree with its first, or two in a row with none
     _turned: float = 0.0  # and what turns may add to that, over `TURN_ERROR`: the sum of dt^3 [s^3]
 
     def heard(self, t: float) -> None:
@@ -73,10 +75,13 @@ class GnssMonitor:
         """
         self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
+            again = self._previous is not None and self._streak_start == self._previous[0].t
+            self._strayed = fix.t if again else -math.inf  # a receiver that jumps may have come to itself
             self._begin(fix)
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         elif self._strays(fix, sigma_v):
             self._begin(fix)
+            self._strayed = fix.t
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         wait = self.patience_s if self._was_aided and odds < SURE else self.recovery_s
@@ -96,6 +101,10 @@ class GnssMonitor:
     def sure(self, t: float, before: float) -> bool:
         """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""
         return self._was_aided and t - before <= self.outage_s
+
+    def astray(self, t: float) -> bool:
+        """Whether, of late, refused positions went elsewhere than the receiver's own velocities, at ``t`` [s]."""
+        return t - self._strayed <= ASTRAY_S
 
     def _longest_gap(self) -> float:
         """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""

@@ -529,6 +529,8 @@ def test_a_position_that_stands_still_while_its_velocity_does_not_is_never_belie
         t = k / rate_hz
         fix = GnssSample(t, t, 0.8, 0.1, 100.0, v_n, sigma, 0.05 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
         assert monitor.judge(fix, v_n, 0.05 * sigma, False) in (Verdict.REJECT, Verdict.PROBATION)
+        assert monitor.astray(t) or t < 20.0
+    assert not monitor.astray(t + 11.0)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0])
