@@ -32,6 +32,7 @@ from nav.rotation import (
     quat_multiply,
     quat_normalise,
     quat_rotate,
+    skew,
 )
 from nav.samples import Array, GnssSample, ImuSamples
 from nav.velocity_matching import Matched, VelocityMatching
@@ -410,15 +411,21 @@ class Alignment:
             correlated[cause.block] = np.zeros((MOTION, len(cause.known)))
             correlated[cause.block][phi] = -turning @ cause.known
 
+        # What is known is the antenna: about it the IMU's place and velocity turn with the attitude.
+        arm_n, swing_n = C_nb @ self.arm_b, C_nb @ cross(self._omega_b, self.arm_b)
+        carried = np.eye(MOTION)
+        carried[pos, phi], carried[vel, phi] = -skew(arm_n), -skew(swing_n)
+        P = carried @ P @ carried.T
+        correlated = {name: carried @ one for name, one in correlated.items()}
+
         q_nb = quat_from_dcm(C_nb)
-        arm_n = C_nb @ self.arm_b
         R_M, R_N = radii(fix.lat)
         return InitialState(
             t=fix.t,
             lat=fix.lat - arm_n[0] / (R_M + fix.h),
             lon=wrap_longitude(fix.lon - arm_n[1] / ((R_N + fix.h) * math.cos(fix.lat))),
             h=fix.h + arm_n[2],
-            v_n=fix.v_n - C_nb @ cross(self._omega_b, self.arm_b),
+            v_n=fix.v_n - swing_n,
             q_nb=q_nb,
             covariance=P,
             correlated=correlated,
