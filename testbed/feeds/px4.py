@@ -21,7 +21,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from nav.earth import isa_pressure, radii, wrap_longitude
-from nav.samples import Array, ImuSamples
+from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
 from testbed.feeds.reference import doubt, is_flown
@@ -292,10 +292,21 @@ def _solution(topics: Topics) -> Reference | None:
         R_M, R_N = radii(lat0)
         columns["lat"] = lat0 + there("x", "xy_valid") / (R_M + h0)
         columns["lon"] = wrap_longitude(lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0)))
-        columns["h"] = h0 - there("z", "z_valid")
+        columns["h"] = h0 - there("z", "z_valid") + _geoid(topics)
         somewhere = is_flown(columns["lat"], columns["h"])
         columns |= {name: np.where(somewhere, columns[name], np.nan) for name in ("lat", "lon", "h")}
     return Reference("the autopilot's own solution (EKF)", t, columns)
+
+
+def _geoid(topics: Topics) -> float:
+    """How far the receiver has the sea above the ellipsoid [m]: the EKF's heights are of the one, its of the other."""
+    gps = _first(topics, ("vehicle_gps_position", "sensor_gps"))
+    for ellipsoid, sea, unit in (("altitude_ellipsoid_m", "altitude_msl_m", 1.0), ("alt_ellipsoid", "alt", 1e-3)):
+        if gps is not None and ellipsoid in gps and sea in gps:
+            known = (gps["fix_type"] >= FixType.FIX_3D) & (gps[ellipsoid] != 0)
+            apart = gps[ellipsoid][known].astype(float) - gps[sea][known]
+            return unit * float(np.median(apart)) if known.any() else 0.0
+    return 0.0
 
 
 def _date(topics: Topics) -> dt.date | None:

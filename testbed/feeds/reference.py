@@ -19,6 +19,7 @@ from testbed.motion.table import COLUMNS, TruthBlock
 
 SAME_TIME_S = 1e-6
 LONGEST_STEP_S = 1.5  # between rows that are joined: a receiver of 1 Hz may be late
+OTHER_HEIGHT_M = 10.0  # as the sea is above the ellipsoid or below it, and no receiver all the time
 DOUBTED_M, LATE_S = 10.0, 0.5  # of a solution from its receiver: more than both are off, and the receiver is late
 STEPS = 3.0  # or so many of its own, where it is slower
 KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
@@ -142,13 +143,30 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
             if apart := silence(solution, fixes[0].t, fixes[-1].t):
                 return f'{apart} of {name}: truth.reference = "gnss" judges by the receiver'
             rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
-            speed = float(np.nan_to_num(np.nanmedian([math.hypot(*one.v_n[:2]) for one in fixes])))
+            speeds = [speed for one in fixes if math.isfinite(speed := math.hypot(*one.v_n[:2]))]
+            speed = float(np.median(speeds)) if speeds else 0.0
             if rms <= DOUBTED_M + LATE_S * speed:
                 return ""
             return (
                 f"{solution.name} is {rms:.3g} m (RMS) from {name}, {off.max():.3g} m at most:"
                 ' truth.reference = "gnss" judges by the receiver'
             )
+    return ""
+
+
+def elsewhere_in_height(reference: Reference, samples: Mapping[str, Samples]) -> str:
+    """That a reference is higher or lower than the first receiver all the time, nothing where it is not."""
+    for name, own in samples.items():
+        fixes = [one for one in own if isinstance(one, GnssSample) and one.has_fix and is_flown(one.lat, one.h)]
+        if fixes and "h" in reference.columns and "lat" in reference.columns:
+            h = ReferenceMotion(reference, 1.0, 0).at(np.array([one.t for one in fixes])).h
+            above = h - np.array([one.h for one in fixes])
+            above = above[np.isfinite(above)]
+            off = float(np.median(above)) if len(above) else 0.0
+            if abs(off) > OTHER_HEIGHT_M:
+                where = "above" if off > 0 else "below"
+                return f"{reference.name} is {abs(off):.3g} m {where} {name}: is one of heights above the sea?"
+            return ""
     return ""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import numpy.typing as npt
@@ -73,12 +73,16 @@ def newly(
     A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
     it, to the last bit, comes again about as often each time, as a slower clock makes it, at the unit's own times: by a
     receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's rate that says the same by
-    chance, or since nothing changes.
+    chance, or since nothing changes. Of a receiver latitude and longitude tell, where the rest changes no more often:
+    it may come in rows of its own.
     """
     if len(t) < 2 or not any(np.isin(t, imu.t).mean() > HELD_SHARE for imu in imus.values()):
         return t, dict(values)
-    rows = np.column_stack([np.nan_to_num(one.reshape(len(t), -1), nan=np.inf) for one in values.values()])
-    first = np.concatenate([[0], 1 + np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))])
+    first = _changes(values.values())
+    if "lat" in values and "lon" in values:
+        placed = _changes([values["lat"], values["lon"]])
+        if max(len(_changes([one])) for one in values.values()) <= (1 + ALIKE) * len(placed):
+            first = placed
     counts = np.diff(first, append=len(t))
     usual = float(np.median(counts))
     alike = np.mean(np.abs(counts - usual) <= max(ALIKE * usual, 1.0))
@@ -88,6 +92,12 @@ def newly(
     told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
     notes.append(left_out(name, told, held, len(t)))
     return t[first], {key: one[first] for key, one in values.items()}
+
+
+def _changes(values: Iterable[Array]) -> Array:
+    """The rows (M,) that differ from the one before in any of the quantities, and the first."""
+    rows = np.column_stack([np.nan_to_num(one.reshape(len(one), -1), nan=np.inf) for one in values])
+    return np.concatenate([[0], 1 + np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))])
 
 
 def barometers(name: str, t: Array, pressure: Array) -> list[Sample]:

@@ -17,10 +17,10 @@ from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
 from testbed.feeds.formats import known
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.reference import doubt, silence
+from testbed.feeds.reference import doubt, elsewhere_in_height, silence
 from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
-from testbed.feeds.stamps import integrated, ordered, spaced, with_holes
+from testbed.feeds.stamps import integrated, left_out, ordered, spaced, with_holes
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
@@ -116,6 +116,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
         t, values = _stream(of_files, path, name, kind, stream, heard, notes)
         if kind == "imu":
+            t, values = _whole(name, t, values, stream, notes)
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
         elif kind == "reference":
@@ -130,6 +131,19 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     )
 
 
+def _whole(
+    name: str, t: Array, values: dict[str, Array], stream: Stream, notes: list[str]
+) -> tuple[Array, dict[str, Array]]:
+    """Rates and forces without the rows that lack one of them; a lost increment is missing, and stays so."""
+    known = np.isfinite(values["gyro"]).all(axis=1) & np.isfinite(values["accel"]).all(axis=1)
+    lacking = len(t) - int(known.sum())
+    if not lacking or stream.form == "increments":
+        return t, values
+    told = f"{lacking} of {len(t)} rows have no rate or no specific force: left out"
+    notes.append(left_out(name, told, lacking, len(t)))
+    return t[known], {key: one[known] for key, one in values.items()}
+
+
 def _contradicted(
     reference: Reference | None, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]
 ) -> str:  # fmt: skip
@@ -140,7 +154,7 @@ def _contradicted(
     """
     if reference is None:
         return ""
-    said = [doubt(reference, samples)]
+    said = [doubt(reference, samples), elsewhere_in_height(reference, samples)]
     name, main = next((name, imu) for name, imu in imus.items() if len(imu))
     if not said[0] and (apart := silence(reference, float(main.t[0]), float(main.t[-1]))):
         said.append(f"{apart} of {name}")
@@ -200,8 +214,10 @@ def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
 
 def _seconds(array: Any) -> Any:
     """Dates and times of day, which are UTC where they don't say, as seconds since 1970; any other column as it is."""
+    if array.ndim != 1:
+        return array
     said = next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
-    if array.ndim != 1 or not (array.dtype.kind == "M" or DATE.match(said)):
+    if not (array.dtype.kind == "M" or DATE.match(said)):
         return array
     import pandas
 

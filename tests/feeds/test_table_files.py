@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from nav.rotation import euler_from_quat
 from testbed import Scenario, run
 from testbed.errors import UserError
-from testbed.feeds import draft, formats
+from testbed.feeds import draft, formats, px4
 from testbed.feeds.survey import survey
 from testbed.feeds.table import load
 from testbed.many.shared_flight import log_digests
-from testbed.motion.logged import LogTruth
+from testbed.motion.logged import LogTruth, Stream
 
 T = np.arange(1, 1501) / 50
 IMU = np.column_stack([T, np.zeros((1500, 3)), np.tile([0.0, 0.0, -9.8 / 50], (1500, 1))])  # increments
@@ -235,3 +236,64 @@ def test_each_quantity_may_have_its_file(tmp_path: Path) -> None:
     (tmp_path / "gyro-0.csv").unlink()
     with pytest.raises(UserError, match=r"truth\.columns\.imu\.gyro\.file: .*gyro-0\.csv: No such file"):
         formats.open_log(truth)
+
+
+def test_a_text_among_the_variables_of_matlab_is_no_matter(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"t": T, "gyro": IMU[:, 1:4], "note": "hello"})
+    assert set(load(tmp_path / "a.mat").numbers) == {"t", "gyro"}
+
+
+def test_rows_without_a_rate_are_left_out_and_told(tmp_path: Path) -> None:
+    """A unit whose gyro is slower than its accelerometer, in one table, was none: its increments were no numbers."""
+    gyro = np.where(np.arange(1500)[:, None] % 3 == 1, np.nan, 0.1)
+    np.savez(tmp_path / "a.npz", t=T, gyro=gyro + np.zeros((1500, 3)), accel=np.tile([0.0, 0.0, -9.8], (1500, 1)))
+    log = formats.read(tmp_path / "a.npz", {"imu": Stream(time="t", gyro="gyro", accel="accel")})  # type: ignore[arg-type]
+    assert np.isfinite(log.imus["imu"].dtheta).all()
+    assert log.imus["imu"].dtheta[1:].sum(axis=0) == pytest.approx(0.1 * (T[-1] - log.imus["imu"].t[0]), rel=1e-3)
+    assert "imu: 500 of 1500 rows have no rate or no specific force: left out" in log.notes
+
+
+def test_a_receiver_whose_height_comes_in_rows_of_its_own_is_held_too(tmp_path: Path) -> None:
+    """As NMEA has it, written beside each row of an IMU."""
+    second = np.arange(1500) // 50
+    height = 500.0 + 0.1 * ((np.arange(1500) + 20) // 50)
+    np.savez(
+        tmp_path / "a.npz", t=T, gyro=np.zeros((1500, 3)), accel=np.tile([0.0, 0.0, -9.8], (1500, 1)),
+        lat=0.8 + 1e-6 * second, lon=0.1 + 1e-6 * second, h=height,
+    )  # fmt: skip
+    columns = {
+        "imu": {"time": "t", "gyro": "gyro", "accel": "accel"},
+        "gnss": {"time": "t", "lat": "lat", "lon": "lon", "height": "h"},
+    }
+    log = formats.read(tmp_path / "a.npz", {name: Stream(**own) for name, own in columns.items()})  # type: ignore[arg-type]
+    assert len(log.samples["gnss"]) == 30
+
+
+def test_a_reference_above_the_sea_beside_a_receiver_above_the_ellipsoid_is_told(tmp_path: Path) -> None:
+    place = {"lat": np.full(1500, 0.8), "lon": np.full(1500, 0.1)}
+    np.savez(
+        tmp_path / "a.npz", t=T, gyro=np.zeros((1500, 3)), accel=np.tile([0.0, 0.0, -9.8], (1500, 1)), **place,
+        h=np.full(1500, 500.0), sea=np.full(1500, 452.0), t1=T[::50], lat1=np.full(30, 0.8), lon1=np.full(30, 0.1),
+        h1=np.full(30, 500.0),
+    )  # fmt: skip
+    columns = {
+        "imu": {"time": "t", "gyro": "gyro", "accel": "accel"},
+        "gnss": {"time": "t1", "lat": "lat1", "lon": "lon1", "height": "h1"},
+        "reference": {"time": "t", "lat": "lat", "lon": "lon", "height": "sea"},
+    }
+    log = formats.read(tmp_path / "a.npz", {name: Stream(**own) for name, own in columns.items()})  # type: ignore[arg-type]
+    assert "is 48 m below gnss: is one of heights above the sea?" in log.remark
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_the_heights_of_a_px4_solution_are_above_the_ellipsoid(old: bool) -> None:
+    """Those of its EKF are above the sea, and were judged by a receiver's above the ellipsoid."""
+    ellipsoid, sea = np.array([0.0, 55.6, 55.2, 56.0]), np.array([0.0, 89.6, 89.2, 90.0])
+    rows = {"fix_type": np.array([0, 3, 3, 3])}
+    rows |= (
+        {"alt_ellipsoid": (1e3 * ellipsoid).astype(np.int32), "alt": (1e3 * sea).astype(np.int32)}
+        if old
+        else {"altitude_ellipsoid_m": ellipsoid, "altitude_msl_m": sea}
+    )
+    assert px4._geoid({"vehicle_gps_position": {0: rows}}) == pytest.approx(-34.0, abs=1e-6)
+    assert px4._geoid({}) == 0.0
