@@ -310,7 +310,9 @@ class Alignment:
             return self._gyrocompass(C_b0, earth_n, T)
         lacking = "no magnetometer" if told else "the magnetometer is not calibrated"
         slow = (
-            f"gyrocompassing would leave {math.degrees(left):.3g} deg" if at_rest else "it is too slow for the course"
+            f"gyrocompassing would leave {math.degrees(min(left, math.pi)):.3g} deg"
+            if at_rest
+            else "it is too slow for the course"
         )
         self.problem = f"{lacking}, and {slow}: waiting for flight, or for accelerations that tell the heading"
         return None

@@ -32,6 +32,7 @@ VARIANCES = tuple(f"{axis} {what}" for what in ("position", "velocity", "attitud
 LOST = ".nonfinite_samples"
 CONFIDENCE = 0.999  # of the bound
 WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
+FEW, MOST = 10, 0.5  # looks, and the share of them that nobody refuses who is right
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
 
 
@@ -45,6 +46,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *scores.unscored(dataset),
         *not_finite(metrics),
         *_silent(dataset),
+        *_refusing(dataset),
         *unfinished_leg(dataset),
         *_impossible(dataset),
         *astray.values(),
@@ -66,6 +68,19 @@ def _silent(dataset: xarray.DataTree) -> list[str]:
         return []
     heard = dataset["sensors"].children if "sensors" in dataset.children else ()
     return [f"{name}: gave no sample in the whole run" for name in sensors if name not in heard]
+
+
+def _refusing(dataset: xarray.DataTree) -> Iterator[str]:
+    """Who refuses most of what it is aided by, in a run that is too short to be scored."""
+    for name in accuracy.names(dataset):
+        t, aligned_s = accuracy.alignment(dataset, name)
+        if aligned_s is None or t[-1] >= aligned_s + accuracy.SETTLING_S:
+            continue
+        for aid in accuracy.aids(dataset, name):
+            looks = detection.judged(dataset, name, aid)
+            gated = looks.gated[looks.t >= aligned_s]
+            if len(gated) >= FEW and gated.mean() > MOST:
+                yield f"{name} refused {gated.mean():.0%} of {aid} since its alignment: it is wrong, or the sensor is"
 
 
 def _impossible(dataset: xarray.DataTree) -> Iterator[str]:

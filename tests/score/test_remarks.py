@@ -142,3 +142,12 @@ def test_a_sensor_that_never_says_anything_is_told() -> None:
     result = run(Scenario.load("u_turn", {"duration_s": 5, "expect": {}, "estimator": []} | sensors))
     assert "rangefinder: gave no sample in the whole run" in result.remarks
     assert not [one for one in result.remarks if one.startswith(("imu", "gnss"))]
+
+
+def test_who_refuses_most_in_a_run_too_short_to_be_scored_is_told() -> None:
+    """Nothing else said so."""
+    jump = {"sensor": "gnss", "channel": "north", "kind": "step", "size": 500.0, "window": [4, 20]}
+    aided = {"duration_s": 20, "expect": {}, "fault": [jump]}
+    told = run(Scenario.load("u_turn", aided)).remarks
+    assert [one for one in told if one.startswith("ins refused") and "of gnss_position since its alignment" in one]
+    assert not [one for one in run(Scenario.load("u_turn", aided | {"fault": []})).remarks if " refused " in one]
