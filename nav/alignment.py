@@ -128,6 +128,7 @@ class Alignment:
     def __init__(self, imu: ImuModel, aids: AidSigmas, arm_b: Array, duration_s: float) -> None:
         self.imu, self.aids, self.arm_b, self.duration_s = imu, aids, arm_b, duration_s
         self._model = ErrorModel(imu)
+        self.receiver = ""  # whose arm and slow errors it is told
         self.names: dict[str, str] = {}  # of the blocks in `InitialState.correlated`, where a filter has others
         self.problem = "waiting for GNSS"
         self._first: GnssSample | None = None
@@ -158,6 +159,7 @@ class Alignment:
             wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),
         )
         made = cls(imu, sigmas, gnss.arm, duration_s)
+        made.receiver = gnss.sensor
         made.names = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=False))
         made.names |= dict(zip(_MAGNETOMETER, magnetometer.states, strict=True))
         return made
@@ -165,7 +167,7 @@ class Alignment:
     def by_accelerations(self) -> Alignment:
         """One for the same sensors that finds the heading by accelerations alone, soon, where they tell it clearly."""
         other = Alignment(self.imu, self.aids, self.arm_b, DIFFERENCE_S)
-        other.names = self.names
+        other.names, other.receiver = self.names, self.receiver
         other._matching, other._by_accelerations = VelocityMatching(*self._biases, FEW, CLEARLY), True
         return other
 

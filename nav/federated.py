@@ -191,7 +191,7 @@ class Federated:
                 reports += [replace(report, sensor=NO_SENSOR) for report in self._use(state, filter_, silent)]
         if sample.t >= self.pauses_from:
             self._pause(state, sample.t)
-        self.realignment.judge(self, state, len(self.locals), sample, reports)
+        self.realignment.judge(self, state, len(self.locals), sample, reports, self._last_fused)
         return reports
 
     @property

@@ -23,6 +23,7 @@ FALSE_ALARM = 1e-4  # probability that two attitudes as good as they claim contr
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 LIMIT = chi_square_threshold(FALSE_ALARM, 3)
 LEAST = 1e-6  # of a filter's own [rad]
+PULLED = 0.06  # of the tilt that accelerations tell: a receiver that is pulled away by 0.6 m/s^2 [rad]
 ELSEWHERE = 5.0  # sigmas
 GRAVITY = 9.8  # [m/s^2]
 TURN, PLACE = slice(PHI, PHI + 3), range(POS, POS + 2)
@@ -33,9 +34,10 @@ class HeadingRecovery:
 
     Where a heading is off by a radian, what is felt along one axis is taken for another: velocity and tilt go wrong,
     fixes and fields leave their gates, and what corrections remain go along wrong axes. `nav.velocity_matching` asks
-    nothing of the filter. A receiver that is led astray has the accelerations of the body, or none that it could feel,
-    and speaks for no other attitude; one that is farther away than a wrong attitude could have led in the time is not
-    believed.
+    nothing of the filter. A receiver that is pulled away steadily tells of a tilt that is not there, and of no other
+    heading: so tilt is known by it to `PULLED` only. One that is farther away than a wrong attitude could have led in
+    the time is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what
+    is refused is wrong. It is the receiver that the ``alignment`` was made for.
     """
 
     def __init__(self, alignment: Alignment) -> None:
@@ -47,7 +49,6 @@ class HeadingRecovery:
         self._refusals: dict[str, Refusals] = {}
         self._doubted_at = self._refused_at = -math.inf
         self._alignment: Alignment | None = None
-        self._receiver = ""  # the first that is heard
 
     @property
     def under_way(self) -> bool:
@@ -76,21 +77,33 @@ class HeadingRecovery:
         if sample.t - self._refused_at > BELIEVED_S:
             self._alignment = None
 
-    def judge(self, state: State, filters: int, sample: Sample) -> InitialState | None:
+    def follow(self, sample: Sample) -> None:
+        """A sound sample whose position, if it has one, was used: by it nothing begins anew."""
+        if isinstance(sample, GnssSample) and self._alignment is not None and self._found(self._alignment, sample):
+            self._alignment.go_on(sample)
+
+    def judge(self, state: State, filters: int, sample: Sample, last_fused: float) -> InitialState | None:
         """Where to begin anew, given a sound sample, which was heard of; None where nothing contradicts the attitude.
 
-        The ``state``, of so many filters, is settled at the sample's time.
+        The ``state``, of so many filters, is settled at the sample's time; a position was ``last_fused`` then [s].
         """
         if self._alignment is None or not isinstance(sample, GnssSample):
             return None
-        self._receiver = self._receiver or sample.sensor
-        found = self._alignment.add_gnss(sample, None) if sample.sensor == self._receiver else None
-        if found is None or self._alignment.matched is None:
+        found = self._found(self._alignment, sample)
+        if found is None:
             return None
-        if _contradicts(self._alignment.matched, state, filters) and self._could_be(sample, state, filters):
-            return found
+        initial, matched = found
+        lost = sample.t - last_fused > DOUBT_S and _contradicts(matched, state, filters)
+        if lost and self._could_be(sample, state, filters):
+            return initial
         self._alignment.go_on(sample)
         return None
+
+    @staticmethod
+    def _found(alignment: Alignment, fix: GnssSample) -> tuple[InitialState, Matched] | None:
+        """What an alignment has found by a fix, if it is one of its receiver."""
+        initial = alignment.add_gnss(fix, None) if fix.sensor == alignment.receiver else None
+        return None if initial is None or alignment.matched is None else (initial, alignment.matched)
 
     def _could_be(self, fix: GnssSample, state: State, filters: int) -> bool:
         """Whether the filter may have gone from a fix, over ground, by taking what it felt for the opposite."""
@@ -105,4 +118,5 @@ def _contradicts(found: Matched, state: State, filters: int) -> bool:
     turn = rotvec_from_quat(quat_multiply(quat_from_dcm(found.C_nb), quat_conjugate(state.q_nb)))
     each = state.P[:filters, TURN, TURN] + LEAST**2 * np.eye(3)
     known = np.linalg.inv(np.linalg.inv(each).sum(axis=0))
-    return bool(turn @ np.linalg.solve(known + found.covariance, turn) > LIMIT)
+    told = found.covariance + np.diag([PULLED**2, PULLED**2, 0.0])
+    return bool(turn @ np.linalg.solve(known + told, turn) > LIMIT)

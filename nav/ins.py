@@ -285,7 +285,7 @@ class Ins:
             reports += [replace(report, sensor=NO_SENSOR) for report in known]
         if self._smoother is not None:
             self._smoother.pause(self.t, state)
-        self.realignment.judge(self, state, 1, sample, reports)
+        self.realignment.judge(self, state, 1, sample, reports, self._monitor.last_fused)
         return reports
 
     def _update_part_by_part(self, state: State, sample: Sample, aid: Aid, first: int = 0) -> list[UpdateReport]:

@@ -85,20 +85,25 @@ class Realignment:
         self._heading.took(sensor)
 
     def hear(self, sample: Sample, reports: Sequence[UpdateReport]) -> None:
-        """What became of a sample."""
+        """What became of a sample whose position, if it has one, was used."""
         self._heading.hear(sample, reports)
+        self._heading.follow(sample)
 
     def judge(
-        self, estimator: Startable, state: State, filters: int, sample: Sample, reports: Sequence[UpdateReport]
-    ) -> None:
-        """The same of one at whose time the state is settled; the estimator is started where its attitude is another.
+        self, estimator: Startable, state: State, filters: int, sample: Sample, reports: list[UpdateReport],
+        last_fused: float,
+    ) -> None:  # fmt: skip
+        """What became of a sample; where the attitude is another the estimator is started, and the reports say so.
 
-        The ``state`` is of so many filters.
+        The ``state``, of so many filters, is settled at its time; a position was ``last_fused`` then [s].
         """
         self._heading.hear(sample, reports)
-        initial = self._heading.judge(state, filters, sample)
+        initial = self._heading.judge(state, filters, sample, last_fused)
         if initial is not None:
             estimator.start(initial)
+            reports[:] = estimator.refuse(
+                sample, "the attitude was wrong: begun anew by accelerations", Outcome.WITHHELD
+            )
 
     def keeps(
         self, estimator: Startable, state: State, filters: int, sample: Sample, last_bad: float, sound: bool = True

@@ -15,6 +15,7 @@ from nav.federation import Config
 from nav.heading_recovery import HeadingRecovery
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.samples import Outcome
 
 SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)
 AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
@@ -86,12 +87,19 @@ def pulled(fix, speed, acceleration=0.0):
         lambda fix: dataclasses.replace(fix, lat=fix.lat + 1e-4),  # 640 m away
         lambda fix: pulled(fix, 6.0),
         lambda fix: pulled(fix, 0.0, 0.5),
+        lambda fix: pulled(fix, 0.0, 1.0),
+        lambda fix: pulled(fix, 0.0, 2.0),
         lambda fix: dataclasses.replace(fix, v_n=fix.v_n + 8 * np.sin(np.arange(3) + 1.7 * fix.t)),
+        lambda fix: dataclasses.replace(fix, v_n=fix.v_n * [1.0, -1.0, 1.0]),
+        lambda fix: dataclasses.replace(fix, v_n=fix.v_n * [-1.0, -1.0, 1.0]),
     ],
 )
-def test_a_receiver_led_astray_tells_no_other_attitude(false):
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_a_receiver_led_astray_tells_no_other_attitude(kind, false):
+    """A steady pull is a tilt, and velocities alone are no reason where positions are fused: both were believed."""
     change = lambda fix: false(fix) if fix.t > 20 else fix  # noqa: E731
-    assert not flown(a_filter("ins"), 0.0, change=change)[2]
+    again = flown(a_filter(kind), 0.0, change=change)[2]
+    assert not [t for t in again if t < 20 + InsConfig(SMALL).patience_s]
 
 
 def test_a_receiver_that_is_elsewhere_is_not_believed():
@@ -101,8 +109,9 @@ def test_a_receiver_that_is_elsewhere_is_not_believed():
     assert min(again) >= InsConfig(SMALL).patience_s
 
 
-@pytest.mark.parametrize("kind", ["ins", "federated"])
+@pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
 def test_however_it_is_cut_the_same_bits(kind):
+    """Where no compass begins the doubt, too: fixes whose position was used and whose velocity was not."""
     whole, parts = (flown(a_filter(kind), 120.0, seconds=seconds)[1] for seconds in (10.0, 0.5))
     by_time = {round(one.t, 3): one for one in parts}
     for one in whole:
@@ -123,3 +132,14 @@ def test_what_is_refused_now_and_then_is_no_doubt(lost, monkeypatch):
     flown(a_filter("ins"), 0.0, change=jump)
     assert looked
     assert not any(looked)
+
+
+def test_that_it_began_anew_is_told():
+    told = []
+    estimator = a_filter("ins")
+    update = estimator.update
+    estimator.update = lambda sample: told.extend(reports := update(sample)) or reports
+    again = flown(estimator, 120.0)[2]
+    said = [one for one in told if one.reason.startswith("the attitude was wrong: begun anew")]
+    assert {one.t for one in said} == set(again)
+    assert {one.outcome for one in said} == {Outcome.WITHHELD}
