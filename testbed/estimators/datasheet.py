@@ -53,7 +53,7 @@ METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
 SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither, where it is not a state
 # Where a datasheet has no noise, as of grade "perfect", a filter is told of about that of the best real parts. Told of
 # none it would be sure of itself within a second, and refuse what integration and rounding leave.
-BEST_IMU = ImuModel(0.002 * DEG_PER_ROOT_H, 0.005 * MPS_PER_ROOT_H, 0.01 * DEG_PER_H, 0.025 * MG)
+BEST_IMU = ImuModel(0.001 * DEG_PER_ROOT_H, 0.003 * MPS_PER_ROOT_H, 0.003 * DEG_PER_H, 0.01 * MG)
 BEST_PRESSURE, BEST_FIELD, BEST_STARS = 0.1, 0.01 * MICROTESLA, 1 * ARCSEC  # [m], [T], [rad]
 BEST_SPEED, BEST_PLACE, BEST_FLOW = 0.005, 0.01, 1e-4  # [m/s], [m], [rad/s]
 GUST_LENGTH = 300.0  # of gusts at the height of 300 m (MIL-F-8785C) [m]
