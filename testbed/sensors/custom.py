@@ -43,7 +43,7 @@ def made(name: str, section: Section, *given: Any) -> Any:
 def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any:
     """What a sensor of the user's says that it is to filters, None where nothing. Raises UserError where no aid.
 
-    One of a class of the user's is guarded, one of `nav.aids` is what it is.
+    One of a class of the user's is guarded, one of `nav.aids`, or made of one, is what it is.
     """
     try:
         found = maker(name, section, imu)
@@ -58,7 +58,13 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
         raise UserError(f"{_called(name, section)}: aid gave {_type(found)}, which lacks {', '.join(missing)}")
     if found.sensor != name:
         raise UserError(f"{_called(name, section)}: aid gave one of sensor {shown(found.sensor)}, not {shown(name)}")
-    return found if type(found).__module__.startswith(f"{nav.aids.__name__}.") else AidGuard(name, section, found)
+    return found if _is_ours(found) else AidGuard(name, section, found)
+
+
+def _is_ours(aid: Any) -> bool:
+    """Whether it is one of `nav.aids`, or made of one, which filters know by its class."""
+    bases = {one.__module__ for one in type(aid).__mro__} - {nav.aids.base.__name__}
+    return any(module.startswith(f"{nav.aids.__name__}.") for module in bases)
 
 
 class AidGuard:
@@ -86,9 +92,12 @@ class AidGuard:
     def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
         """One part of a sample."""
         given = self._asked("measure", part, sample, at)
-        if given is not None and (wrong := _no_measurement(given, dict(self.parts)[part], len(at.x))):
+        if given is None:
+            return None
+        if wrong := _no_measurement(given, dict(self.parts)[part], len(at.x)):
             raise UserError(f"{self._called}: measure gave {wrong} of {shown(part)} at {sample.t:g} s")
-        return cast("Measurement | None", given)
+        nu, H, R = (np.array(numbers, dtype=float) for numbers in (given.nu, given.H, given.R))
+        return cast("Measurement", given._replace(nu=nu, H=H, R=R))
 
     def _asked(self, method: str, *given: Any) -> Any:
         try:

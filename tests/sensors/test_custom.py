@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nav.aids import GnssAid
+from nav.aids.base import Aid
 from testbed import Scenario, run
 from testbed.errors import UserError
-from testbed.sensors import registry
+from testbed.sensors import custom, registry
+from testbed.sensors.magnetometer import MagnetometerConfig
 
 RADAR = """
 from dataclasses import dataclass, field
@@ -114,6 +117,8 @@ class HeightAid:
                 R[0] = -1.0
             case "aid text":
                 R = ["wide"]
+            case "aid lists":
+                nu, H, R = [0], H.tolist(), [1]
         return None if self.how == "aid none" else Measurement(nu, H, R)
 
 
@@ -273,11 +278,32 @@ def test_what_is_no_measurement_ends_the_run_with_a_line(scenario: Path, how: st
     assert f"sensor radar: ./radar.py:Aided: aid: {says}" in str(told.value)
 
 
-@pytest.mark.parametrize(("how", "looks"), [("", 1), ("aid none", 0)])
+@pytest.mark.parametrize(("how", "looks"), [("", 1), ("aid lists", 1), ("aid none", 0)])
 def test_what_is_a_measurement_is_used(scenario: Path, how: str, looks: int) -> None:
     keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
     result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how}))
     assert len([one for one in result.dataset.groups if one.endswith("innovations/radar")]) == looks
+
+
+def test_an_aid_made_of_one_of_ours_is_known_as_that() -> None:
+    class Mine(GnssAid):
+        pass
+
+    made = custom.aid(lambda *_: Mine("mine"), "mine", MagnetometerConfig(), None)
+    assert type(made) is Mine
+    assert isinstance(custom.aid(lambda *_: Own(), "mine", MagnetometerConfig(), None), custom.AidGuard)
+
+
+class Own(Aid):
+    """Written after the protocol, which makes it none of ours."""
+
+    sensor, parts, states = "mine", (("mine", 1),), ()  # type: ignore[assignment]
+
+    def blocks(self):  # type: ignore[no-untyped-def]
+        return []
+
+    def measure(self, part, sample, at):  # type: ignore[no-untyped-def]
+        return None
 
 
 def test_what_it_writes_into_truth_nobody_else_sees(scenario: Path) -> None:
