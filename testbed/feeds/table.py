@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 import re
 import zipfile
@@ -82,11 +83,15 @@ OPTIONAL: Mapping[str, tuple[str, ...]] = {
 
 
 class Table(NamedTuple):
-    """A file: its columns of ``numbers``, each (N,) or (N, k), by name, and what the ``others`` hold, a few words."""
+    """A file: its columns of ``numbers``, each (N,) or (N, k), by name, and what the ``others`` hold, a few words.
+
+    Those that were ``dates`` are seconds since 1970.
+    """
 
     path: Path
     numbers: Mapping[str, Array]
     others: Mapping[str, str]
+    dates: frozenset[str] = frozenset()
 
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
@@ -126,9 +131,18 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
     require_one_clock(path, imus, samples)
     start = beginning(imus, samples, reference, notes)
-    return Log(
-        path, "table", imus, samples, reference, start, found, notes, remark=_contradicted(reference, imus, samples)
-    )
+    remark = _contradicted(reference, imus, samples)
+    date = _date(of_files, path, columns.values(), start)
+    return Log(path, "table", imus, samples, reference, start, found, notes, date=date, remark=remark)
+
+
+def _date(tables: Mapping[Path, Table], main: Path, streams: Iterable[Stream], start: float) -> dt.date | None:
+    """The date in UTC at which a log begins, ``start`` of its clock, None where no sensor's time is a date."""
+    for stream in streams:
+        column = stream.time
+        if column.column in tables[Path(column.file or stream.file or main)].dates:
+            return dt.datetime.fromtimestamp(start, dt.UTC).date()
+    return None
 
 
 def _whole(
@@ -202,14 +216,17 @@ def _stacked(values: Any) -> Any:
 
 def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
     """Those that hold numbers, as floats, and the others."""
-    numbers, others = {}, {}
+    numbers, others, dates = {}, {}, set()
     for name, values in columns:
-        array = _seconds(np.asarray(values))
+        read = np.asarray(values)
+        array = _seconds(read)
+        if array is not read:
+            dates.add(name)
         if array.ndim in (1, 2) and array.dtype.kind in "fiub":
             numbers[name] = array.astype(float)
         elif array.ndim:
             others[name] = _instead(array)
-    return Table(path, numbers, others)
+    return Table(path, numbers, others, frozenset(dates))
 
 
 def _seconds(array: Any) -> Any:

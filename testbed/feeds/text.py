@@ -16,6 +16,7 @@ MARKS = (";", "\t", ",")  # that part fields, the first that a row has; else spa
 SPACES = " "
 QUOTED = re.compile(r'"[^"]*"')
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 MISSING = ("", "NA", "N/A", "null")  # in place of numbers
 
 
@@ -43,6 +44,8 @@ def layout(lines: Iterable[str]) -> Layout:
     plain: list[tuple[int, str]] = []  # the first two of these
     for number, raw in enumerate(lines):
         line = raw.strip("\ufeff\r\n")
+        if SAID.fullmatch(line) and not plain:
+            continue
         if line.startswith(COMMENTS) and not plain:
             comment = number, line
         elif line.strip():
@@ -69,7 +72,8 @@ def is_table(head: bytes) -> bool:
     """Whether a file begins as a text of columns does: with commas, or with numbers."""
     if any(byte < ord(" ") and byte not in b"\t\r\n" for byte in head):
         return False
-    lines = [line for line in head.decode(errors="replace").splitlines() if line.strip() and line[0] not in COMMENTS]
+    said = [line for line in head.decode(errors="replace").splitlines() if line.strip() and line[0] not in COMMENTS]
+    lines = said[1:] if said and SAID.fullmatch(said[0].strip("\ufeff")) else said
     found = layout(lines)
     return b"," in head or (found.width > 0 and _are_numbers(_fields(lines[:2][-1], found.mark), found.decimal))
 

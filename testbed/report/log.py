@@ -50,7 +50,8 @@ def tables(found: Survey) -> Iterator[Table]:
     quality = _table("measured", "sensor", "what", "value")
     for row in _measured(found):
         _add(quality, *row)
-    yield quality
+    if quality.row_count:
+        yield quality
 
 
 def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:

@@ -47,7 +47,7 @@ def report(error: ValidationError, root: type[Section], written: Written) -> str
     lines = keypath.line_numbers(text)
     messages = []
     for path, texts in said.items():
-        if path in misspelt and texts == [MISSING]:
+        if path in misspelt and all(text.startswith(MISSING) for text in texts):
             continue  # it is there under the name that is complained about already
         above = [path[:length] for length in range(len(path), -1, -1)]
         below = [p for p in set_paths if path and p[: len(path)] == path]
@@ -116,7 +116,7 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
         case "extra_forbidden":
             return _elsewhere(path, models) or f"unknown key: {choice(str(path[-1]), _keys(models))}"
         case "missing":
-            return "is missing: this item needs one more value" if isinstance(path[-1], int) else MISSING
+            return "is missing: this item needs one more value" if isinstance(path[-1], int) else _missing(path, models)
         case "sensor_kind":
             return str(context["text"])
         case "union_tag_not_found":
@@ -150,6 +150,13 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
         case "bool_type":
             return f"must be true or false, not {shown(given)}"
     return f"{details['msg'].replace('Input should be', 'must be')}, not {shown(given)}"
+
+
+def _missing(path: KeyPath, models: Sequence[type[Section]]) -> str:
+    """That a key has to be added, and what it is."""
+    fields = [model.model_fields[key] for model in models for key in path[-1:] if key in model.model_fields]
+    what = next((field.description for field in fields if field.description), None)
+    return f"{MISSING} ({what})" if what else MISSING
 
 
 def _elsewhere(path: KeyPath, models: Sequence[type[Section]]) -> str:

@@ -61,6 +61,14 @@ def test_names_below_a_comment_with_as_many_commas_are_the_names(tmp_path: Path)
         assert list(load(tmp_path / "a.csv").numbers) == ["t", "a", "b"]
 
 
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_a_line_that_tells_spreadsheets_the_mark_is_no_row(mark: str, tmp_path: Path) -> None:
+    lines = [f"sep={mark}", f"t{mark}a", *(f"{k / 10}{mark}1.5" for k in range(20))]
+    for told in (lines, [lines[0], *lines[2:]]):
+        (tmp_path / "a.csv").write_text("\n".join(told))
+        assert [len(one) for one in load(tmp_path / "a.csv").numbers.values()] == [20, 20]
+
+
 def test_numbers_that_count_the_columns_are_names(tmp_path: Path) -> None:
     """As a data frame without names is written, with and without its index."""
     for index in ("", ",0,1,2"):
@@ -203,6 +211,17 @@ def test_dates_are_times(tmp_path: Path) -> None:
         np.testing.assert_allclose(
             load(tmp_path / "a.csv").numbers["t"], start.timestamp() + np.arange(100) / 50, atol=1e-6
         )
+
+
+def test_a_log_whose_times_are_dates_has_a_date(tmp_path: Path) -> None:
+    """That of its first row, in UTC, which the magnetic field of a drafted scenario needs; of numbers none is known."""
+    start = dt.datetime(2024, 6, 1, 23, 30, tzinfo=dt.timezone(dt.timedelta(hours=-2)))
+    times = [(start + dt.timedelta(seconds=k / 50)).isoformat() for k in range(100)]
+    for said, date in ((times, dt.date(2024, 6, 2)), ([str(k / 50) for k in range(100)], None)):
+        lines = ["t,x,y,z,a,b,c", *(f"{one},0,0,0,0,0,-9.8" for one in said)]
+        (tmp_path / "a.csv").write_text("\n".join(lines))
+        stream = Stream.model_validate({"time": "t", "gyro": ["x", "y", "z"], "accel": ["a", "b", "c"]})
+        assert formats.read(tmp_path / "a.csv", {"imu": stream}).date == date
 
 
 def test_each_quantity_may_have_its_file(tmp_path: Path) -> None:
