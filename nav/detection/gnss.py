@@ -85,7 +85,9 @@ class GnssMonitor:
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         wait = self.patience_s if self._was_aided and odds < SURE else self.recovery_s
-        if not self._was_aided and lasted < self.probation_s:
+        # a place that stands still is inside a gate that has grown wide, each time that the vehicle comes by
+        comes_by = inside_gate and self.astray(fix.t) and fix.t - self.last_fused > self.outage_s
+        if comes_by or (not self._was_aided and lasted < self.probation_s):
             verdict = Verdict.PROBATION
         elif inside_gate:
             verdict = Verdict.FUSE
@@ -132,8 +134,14 @@ class GnssMonitor:
         return jump(before, fix, moved, dt * sigma_v, dt**3) <= self.consistency_gate
 
     def _strays(self, fix: GnssSample, sigma_v: Array) -> bool:
-        """Whether the receiver's own velocities lead elsewhere from the first of the streak."""
-        if self._begun is None or not math.isfinite(fix.v_n[0]):
+        """Whether the receiver's own velocities lead elsewhere from the first of the streak.
+
+        Where it tells none they are the filter's, which may be wrong: the count begins anew.
+        """
+        if self._begun is None or self._previous is None:
+            return False
+        if not (math.isfinite(self._previous[0].v_n[0]) and math.isfinite(fix.v_n[0])):
+            self._count_from(fix)
             return False
         drift = (fix.t - self._begun.t) * np.maximum(sigma_v, SLOW_ERROR)
         return jump(self._begun, fix, self._moved, drift, self._turned) > self.consistency_gate

@@ -533,6 +533,35 @@ def test_a_position_that_stands_still_while_its_velocity_does_not_is_never_belie
     assert not monitor.astray(t + 11.0)
 
 
+def test_who_comes_by_a_position_that_stands_still_does_not_use_it():
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma = np.full(3, 1.5)
+    for k in range(1, 400):
+        t = 0.2 * k
+        v_n = 25.0 * np.array([np.cos(0.1 * t), np.sin(0.1 * t), 0.0])
+        fix = GnssSample(t, t, 0.8, 0.1, 100.0, v_n, sigma, 0.05 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        inside = 60.0 < t < 63.0
+        assert monitor.judge(fix, v_n, 0.05 * sigma, inside) is not Verdict.FUSE
+
+
+@pytest.mark.parametrize("every", [2, 5])
+def test_a_receiver_that_tells_its_velocity_now_and_then_is_believed_against_the_filter(every):
+    """As NMEA's do, in rows of their own; what the filter says of the velocity in between may be wrong."""
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma, v_n = np.full(3, 1.5), np.array([25.0, 0.0, 0.0])
+    for k in range(1, 300):
+        t = 0.2 * k
+        own = v_n if k % every == 0 else np.full(3, np.nan)
+        used = v_n if k % every == 0 else v_n + np.array([2.0, 0.0, 0.0])
+        lat = 0.8 + 25.0 * t / 6.37e6
+        fix = GnssSample(t, t, lat, 0.1, 100.0, own, sigma, 0.05 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        if monitor.judge(fix, used, 0.1 * sigma, False) is Verdict.RECOVER:
+            break
+    assert t == pytest.approx(30.2, abs=0.5)
+
+
 @pytest.mark.parametrize("rate_hz", [1.0, 5.0])
 def test_a_receiver_that_circles_late_and_noisily_is_believed_against_the_filter(rate_hz):
     """Velocities are older than positions by 0.15 s, positions drift by metres: no more than real receivers do."""
