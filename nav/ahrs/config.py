@@ -100,6 +100,7 @@ class AhrsConfig:
     # Of the heading from one sample, as if errors were white [rad]: hard and soft iron of 2 deg that last for 15 s,
     # seen at 10 Hz, are worth 2 deg sqrt(2 * 15 * 10). Told less, the filter turns them into tilt.
     magnetometer_sigma: float = 30 * DEG
+    iron_sigma: float = 0.0  # what iron makes of the heading while the body flies straight on [rad]
 
     any_motion: AnyMotion | None = None  # levels by this instead of in low dynamics, and takes all corrections at once
 

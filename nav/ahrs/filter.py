@@ -12,7 +12,19 @@ from nav.ahrs import steps as kernels
 from nav.ahrs.any_motion import AnyMotionLevelling
 from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig, limited
 from nav.ahrs.further import RIGHT, FurtherStates
-from nav.ahrs.state import BIAS, CORRECTIONS, FIXED, LEVELLINGS, PERIOD_END, PHI, STATES, State, fresh, propagate
+from nav.ahrs.state import (
+    BIAS,
+    CORRECTIONS,
+    FIXED,
+    LEVELLINGS,
+    PERIOD_END,
+    PHI,
+    STATES,
+    TURN_RATE,
+    State,
+    fresh,
+    propagate,
+)
 from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
@@ -36,6 +48,7 @@ from nav.samples import (
 COUNTED = "mode_counter", "correction_counter"  # periods of low dynamics, and corrections
 JUDGED = "judged_acceleration", "judged_yaw_rate", "judged_roll_rate"  # what the last period was judged by
 BAD_SAMPLE_S = 1.0  # for how long a refused sample is told of (`Status.BAD_SAMPLE`)
+AVERAGING = 0.02  # rate of a turn in which what iron does to the heading averages out [rad/s]
 TIME_TOLERANCE = 1e-4  # between a sample and the filter [s]
 KNOWN = Status.ALIGNED | Status.DEAD_RECKONING | Status.ATTITUDE_ONLY
 
@@ -66,8 +79,10 @@ class Ahrs:
         self._sigma_accel_bias = np.full(3, imu.accel_bias_sigma)
         self._accel_bias = self.further.accel_bias
         biased = self._accel_bias.start == self._accel_bias.stop  # accelerometers, by what no state stands for
-        self._floor = np.diag([(imu.accel_bias_sigma / self._g) ** 2 if biased else 0.0] * 2 + [0.0])
         rows = self._model.rows
+        # the heading of a levelled field is off with the tilt that levels it
+        off = np.vstack([np.eye(2), rows[kernels.HEADING_ROW, PHI : PHI + 2] * self._sees_heading])
+        self._floor = (imu.accel_bias_sigma / self._g) ** 2 * off @ off.T if biased else np.zeros((3, 3))
         self._H_level = rows[kernels.LEVEL_ROW : kernels.LEVEL_ROW + 2]
         H = rows[kernels.HEADING_ROW, None]
         self.heading_measurement = H, np.array([config.magnetometer_sigma**2])  # H (1, n) and R (1,) of a heading
@@ -443,7 +458,7 @@ class Ahrs:
         """The estimates at ``t`` (N,) of settled states, each the whole of one of ``wholes``.
 
         The attitude is what it is before the corrections still outstanding, so they are part of its error; so is the
-        tilt of accelerometers that are biased, which no state stands for.
+        tilt of accelerometers that are biased, and the pull of iron on a course that stays, which no state stands for.
         """
         N, n, zero = len(t), self._n, np.zeros((len(t), 1))
         q_nb, gyro_bias, shown, counts = wholes[:, :4], wholes[:, 4:7], wholes[:, 13:16], wholes[:, 16:19]
@@ -451,6 +466,8 @@ class Ahrs:
         phi = x[:, PHI : PHI + 3]
         covariance = np.full((N, 9, 9), np.nan)
         covariance[:, 6:, 6:] = P[:, PHI : PHI + 3, PHI : PHI + 3] + phi[:, :, None] * phi[:, None] + self._floor
+        turned = np.square(wholes[:, TURN_RATE] / AVERAGING)
+        covariance[:, 8, 8] = np.maximum(covariance[:, 8, 8], self.config.iron_sigma**2 * np.exp(-turned))
         sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         accel_bias, sigma_accel_bias = np.zeros((N, 3)), np.tile(self._sigma_accel_bias, (N, 1))
         if self._accel_bias.start < self._accel_bias.stop:

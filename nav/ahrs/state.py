@@ -15,8 +15,9 @@ from nav.state import turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 UNKNOWN = np.full(3, np.nan)
-FIXED = 53  # numbers in a `State` of any size
+FIXED = 54  # numbers in a `State` of any size
 PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
+TURN_RATE = 44  # and in the whole
 
 
 @dataclasses.dataclass
@@ -72,8 +73,8 @@ class State:
     turned: Array  # (3, 3) integral of C_nb since the last covariance step
     angle: Array  # (3,) integral of angular rate over the period, body axes
     force: Array  # (3,) integral of specific force over the period, n
-    elapsed: Array  # (4,) seconds since the last covariance step, since the start of the period; increments since then;
-    # and seconds since a sound increment
+    elapsed: Array  # (5,) seconds since the last covariance step, since the start of the period; increments since then;
+    # seconds since a sound increment; and `TURN_RATE`, about the vertical, mean of the last half-minute [rad/s]
     sums: Array  # (3, 3) integrals over the period of specific force and of the squares of rate and of it, body axes
     x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
     P: Array  # (n, n)
@@ -109,7 +110,7 @@ def parts(
     x = FIXED + n
     return (
         whole[:4], whole[4:7], whole[7:10], whole[10:13], whole[13:16], whole[16:19], whole[19:25].reshape(2, 3),
-        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:44], whole[44:FIXED].reshape(3, 3),
+        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:45], whole[45:FIXED].reshape(3, 3),
         whole[FIXED:x], whole[x:].reshape(n, n),
     )  # fmt: skip
 

@@ -15,7 +15,17 @@ import numpy as np
 from nav._jit import inlined, njit
 from nav.ahrs.config import AhrsConfig, limited
 from nav.ahrs.further import FurtherStates, columns, misaligned
-from nav.ahrs.state import BIAS, CORRECTIONS, LEVELLINGS, PERIOD_END, PHI, STATES, parts, propagate, transition
+from nav.ahrs.state import (
+    BIAS,
+    CORRECTIONS,
+    LEVELLINGS,
+    PERIOD_END,
+    PHI,
+    STATES,
+    parts,
+    propagate,
+    transition,
+)
 from nav.earth import earth_rate_n
 from nav.error_model import PAPERS, ErrorModel, Indices
 from nav.increments import (
@@ -45,6 +55,7 @@ MISALIGNMENT, ACCEL_BIAS, GUST, FED_BACK, SEES_HEADING = range(5)
 
 AIRSPEED, DENSITY, MAGNETIC = 0, 1, 2  # what a step is that has a sample
 WIDTH = NUMBERS + 4
+TURN_MEMORY_S = 30.0  # over which the rate of a turn is taken, so that what a nose does in gusts is none
 REPORT = 15  # kind, t, nis, innovation (3,), S (9,)
 
 
@@ -103,6 +114,8 @@ def settle(
             for j in range(3):
                 Phi[j, i] = first[j, i]
     misaligned(Phi, turned, angle[2] / elapsed[1], places[MISALIGNMENT])
+    turn = (turned[2, 0] * angle[0] + turned[2, 1] * angle[1] + turned[2, 2] * angle[2]) / (elapsed[1] * T)
+    elapsed[4] -= math.expm1(-T / TURN_MEMORY_S) * (turn - elapsed[4])
     for i in range(3):
         half_noise[PHI + i] += turning
     for i in range(3):

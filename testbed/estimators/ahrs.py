@@ -191,7 +191,11 @@ def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
         lasting = math.hypot(iron, FIELD_ERROR) * math.sqrt(2 * turn_s * magnetometer.rate_hz)
         field_n = _field_n(rig)
         level_field = math.hypot(field_n[0], field_n[1])
-        config = replace(config, magnetometer_sigma=math.hypot(m.noise, lasting) / level_field)
+        config = replace(
+            config,
+            magnetometer_sigma=math.hypot(m.noise, lasting) / level_field,
+            iron_sigma=math.hypot(iron, FIELD_ERROR) / level_field,
+        )
     return config
 
 

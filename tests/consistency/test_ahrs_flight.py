@@ -63,3 +63,27 @@ def test_a_circle_without_a_pitot_tube_is_no_tilt(flight: str, plan: list[str], 
     print(f"{flight}, {grade}: {tilt:.2f} deg, NEES {nees:.2f}", np.round(found, 2).tolist())
     assert tilt < 1.5
     assert 0.2 < nees < 3.0
+
+
+def heading(grade: str, seed: int) -> list[float]:
+    """Mean square of the heading over what is claimed of it, of both profiles, a quarter of an hour straight on."""
+    plan = [{"leg": "straight", "length_m": 60000}]
+    flown = {"expect": {}, "duration_s": 900, "plan": plan, "sensors.gnss.denied": [], "sensors.imu.grade": grade}
+    by = [
+        {"name": "jiang2021", "kind": "ahrs", "aids": ["airspeed", "barometer", "magnetometer"]},
+        {"name": "any_motion", "kind": "ahrs", "profile": "any_motion", "aids": ["magnetometer"]},
+    ]
+    result = run(Scenario.load("loiter_gnss_outage", flown | {"estimator": by}), seed=seed)
+    series = [error_series(result, name).loc[60:] for name in ("jiang2021", "any_motion")]
+    return [float(np.square(one["phi_down_deg"] / one["sigma_phi_down_deg"]).mean()) for one in series]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", ["mems-consumer", "mems-industrial", "mems-hobby"])
+def test_a_heading_straight_on_is_claimed_no_better_than_iron_leaves_it(grade: str) -> None:
+    """Iron pulls it one way then: it was claimed by 2.0 to 6.7 times (medians of the square) too well."""
+    seeds = range(993201, 993211)
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        found = np.array(list(pool.map(heading, [grade] * len(seeds), seeds)))
+    print(f"{grade}: NEES of the heading", np.round(np.median(found, axis=0), 2), np.round(found, 2).tolist())
+    assert (np.median(found, axis=0) < 2.0).all()

@@ -152,6 +152,28 @@ def test_heading_jacobian_against_finite_differences():
     assert found[2] == pytest.approx(-1, rel=1e-6)
 
 
+def test_the_claim_of_a_heading_has_what_iron_does_straight_on_and_what_biases_do_to_the_level():
+    """Azimuths of a field levelled wrongly by scipy; a turn of 3 deg/s for two minutes shows iron from all sides."""
+    config = replace(PAPER, aids=("magnetometer",), heading_sigma=1e-3, iron_sigma=0.02)
+    claims = []
+    for bias, degps in ((0.0, 0.0), (0.2, 0.0), (0.0, 3.0)):
+        filter_ = Ahrs(replace(config, imu=ImuModel(1e-9, 0.0, 0.0, bias)), FIELD_N)
+        filter_.start(0.0, np.array([1.0, 0, 0, 0]))
+        still = at_rest(120.0)
+        still.dtheta[:, 2] += np.radians(degps) * still.dt
+        filter_.propagate(still)
+        claims.append(filter_.estimate().covariance[6:, 6:])
+    assert claims[0][2, 2] == pytest.approx(0.02**2, rel=1e-3)
+    assert claims[2][2, 2] < 0.2 * 0.02**2
+    tilt = 1e-4
+    turned = [Rotation.from_rotvec(-tilt * axis).apply(FIELD_N) for axis in np.eye(3)[:2]]
+    off = np.array([math.atan2(one[1], one[0]) - math.atan2(FIELD_N[1], FIELD_N[0]) for one in turned]) / tilt
+    lean = (0.2 / 9.79) ** 2 * np.vstack([np.eye(2), off]) @ np.vstack([np.eye(2), off]).T
+    found = claims[1] - claims[0]
+    np.testing.assert_allclose(found[:2, :2], lean[:2, :2], rtol=2e-3, atol=1e-9)
+    np.testing.assert_allclose(found[2, :2], lean[2, :2], rtol=2e-3)
+
+
 def test_covariance_without_levelling_against_the_formula():
     """sigma^2 + sigma_b^2 T^2 + gyro noise^2 T + walk^2 T^3 / 3, and the tilt of a biased accelerometer on top."""
     T, model = 100.0, ImuModel(1e-4, 0.0, 5e-5, 0.01, gyro_bias_walk=1e-5)

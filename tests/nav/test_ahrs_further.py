@@ -75,7 +75,13 @@ def test_a_step_against_dense_matrices():
     state, n = filter_._state, STATES + 8
     root = rng.normal(size=(n, n))
     turned, x, P, T = rng.normal(size=(3, 3)), rng.normal(size=n), root @ root.T, 0.7
-    state.turned[:], state.x[:], state.P[:], state.elapsed[:], state.angle[2] = turned, x, P, (T, 0.9, 180, 0.0), 0.3
+    state.turned[:], state.x[:], state.P[:], state.elapsed[:], state.angle[2] = (
+        turned,
+        x,
+        P,
+        (T, 0.9, 180, 0.0, 0.0),
+        0.3,
+    )
     earth_n = np.array([math.cos(PAPER.lat), 0.0, -math.sin(PAPER.lat)]) * OMEGA_IE
     whole, Q = np.eye(n), np.zeros(n)
     whole[:3, :3] += np.cross(np.eye(3), earth_n).T * T
