@@ -25,6 +25,8 @@ import yaml
 import testbed.__main__ as cli
 from testbed import Scenario, run
 from testbed.schema import Section
+from testbed.sensors.imu import ALLAN_PEAK
+from testbed.sensors.units import MG
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -212,6 +214,40 @@ def test_links_of_the_readme_lead_somewhere() -> None:
     links = re.findall(r"\]\(([^)#]+)", text)
     assert links
     assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_figures_of_the_readme_are_those_of_the_page_that_it_cites() -> None:
+    readme, page = (" ".join(path.read_text("utf-8").split()) for path in (ROOT / "README.md", DOCS / "expected.md"))
+    rows: dict[str, list[str]] = {}
+    for name in ("loiter_gnss_outage", "hardware_gnss_outage"):
+        chapter = page[page.index(f" ## {name} ") :]
+        for second in (120, 600):
+            row = re.search(rf"\| ins\.outage_position_horizontal_at_{second}s_m (.*?)\| ins\.", chapter)
+            assert row is not None
+            rows[f"{name} {second}"] = [
+                f"{float(x):.0f}" for x in re.findall(r"[\d.]+", row[1].split("%", 1)[1].split("|", 1)[1])
+            ]
+    clear = [rows[f"loiter_gnss_outage {second}"][0] for second in (120, 600)]
+    assert f"{clear[0]} m after 120 s and {clear[1]} m after 600 s" in readme
+    (a, a1, a2, a95, *_), (b, b1, b2, b95, *_) = (rows[f"hardware_gnss_outage {second}"] for second in (120, 600))
+    assert f"{a} m (95 % interval {a1} to {a2}) and {b} m ({b1} to {b2})" in readme
+    assert f"95 % of the runs stay below {a95} and {b95} m" in readme
+
+
+def test_installing_without_make_is_what_make_does() -> None:
+    made = (ROOT / "Makefile").read_text("utf-8")
+    made = made.replace("$(PYTHON)", "python3").replace("$(BIN)", "$(VENV)/bin").replace("$(VENV)", ".venv")
+    recipe = re.sub(r" --(quiet|disable-pip-version-check|no-compile)", "", made).splitlines()
+    (told,) = [block.text for block in blocks(DOCS / "tutorial.md") if "venv" in block.text]
+    assert [line for line in told.splitlines() if f"\t{line}" not in recipe] == []
+
+
+def test_factors_between_the_terms_of_other_tools_and_ours() -> None:
+    page = (DOCS / "sensors.md").read_text("utf-8")
+    mgal, hour = 1e-5, 3600
+    factors = (1, hour, mgal / MG, 1 / MG)  # to 1 sigma; and to the floor of the Allan deviation
+    for factor in (*(ALLAN_PEAK * one for one in factors), *factors[1:]):
+        assert re.search(rf" × {factor:.4g} \|".replace(".", r"\."), page), factor
 
 
 def test_the_manual_lists_its_pages() -> None:
