@@ -104,6 +104,20 @@ def test_a_magnetometer_without_a_field_is_left_out(tmp_path: Path) -> None:
     assert "magnetometer: 1 samples have no field at all: left out" in once.notes
 
 
+@pytest.mark.parametrize("turns", [False, True])
+def test_no_sphere_is_fitted_to_a_magnetometer_that_does_not_turn(turns: bool, tmp_path: Path) -> None:
+    """To noise alone one of the noise's own size fits."""
+    rng = np.random.default_rng(41)
+    messages: Messages = []
+    for name, values in circling():
+        if name == "MAG":
+            angle = values[0] / 1e6 if turns else 0.0
+            field = 300.0 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)]) + rng.normal(0.0, 1.0, 3)
+            values = (*values[:2], *field)
+        messages.append((name, values))
+    assert bool(survey(read(messages, tmp_path)).field_residual) == turns
+
+
 @pytest.mark.parametrize(
     "before", ["", "9\n\nArduCopter V3.1 (5c6503e2)\nFree RAM: 1044\nAPM 2\n", "ArduPlane V2.7\r\n"]
 )
