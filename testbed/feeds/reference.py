@@ -154,6 +154,12 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
     return ""
 
 
+def doubt_in_height(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
+    """The same of its height."""
+    off = "" if solution is None else elsewhere_in_height(solution, samples)
+    return f'{off}: truth.reference = "gnss" judges by the receiver' if off else ""
+
+
 def elsewhere_in_height(reference: Reference, samples: Mapping[str, Samples]) -> str:
     """That a reference is higher or lower than the first receiver all the time, nothing where it is not."""
     for name, own in samples.items():
@@ -165,7 +171,7 @@ def elsewhere_in_height(reference: Reference, samples: Mapping[str, Samples]) ->
             off = float(np.median(above)) if len(above) else 0.0
             if abs(off) > OTHER_HEIGHT_M:
                 where = "above" if off > 0 else "below"
-                return f"{reference.name} is {abs(off):.3g} m {where} {name}: is one of heights above the sea?"
+                return f"{reference.name} is {abs(off):.3g} m {where} {name} (median)"
             return ""
     return ""
 
