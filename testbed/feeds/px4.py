@@ -23,8 +23,9 @@ import numpy as np
 from nav.earth import isa_pressure, radii, wrap_longitude
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError
+from testbed.feeds.doubted import remark
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
-from testbed.feeds.reference import doubt, doubt_in_height, is_flown
+from testbed.feeds.reference import is_flown
 from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, spread
 from testbed.feeds.stamps import integrated, ordered
@@ -72,7 +73,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     start = beginning(imus, samples, solution, notes)
     return Log(
         path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),
-        remark=doubt(solution, samples) or doubt_in_height(solution, samples),
+        remark=remark(solution, imus, samples),
     )  # fmt: skip
 
 

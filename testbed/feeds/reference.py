@@ -154,12 +154,6 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
     return ""
 
 
-def doubt_in_height(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
-    """The same of its height."""
-    off = "" if solution is None else elsewhere_in_height(solution, samples)
-    return f'{off}: truth.reference = "gnss" judges by the receiver' if off else ""
-
-
 def elsewhere_in_height(reference: Reference, samples: Mapping[str, Samples]) -> str:
     """That a reference is higher or lower than the first receiver all the time, nothing where it is not."""
     for name, own in samples.items():
