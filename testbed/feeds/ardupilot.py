@@ -22,8 +22,9 @@ import numpy as np
 
 from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
+from testbed.feeds.doubted import remark
 from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, require_imu
-from testbed.feeds.reference import doubt, is_flown
+from testbed.feeds.reference import is_flown
 from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
@@ -77,7 +78,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         solution = None
     log = Log(
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution, notes), found, notes,
-        date=_date(units), remark=doubt(solution, samples),
+        date=_date(units), remark=remark(solution, imus, samples),
     )  # fmt: skip
     return at_pace(log, _pace(units))
 

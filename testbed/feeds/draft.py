@@ -19,6 +19,7 @@ from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.reference import doubt
 from testbed.feeds.survey import Noise, Survey
+from testbed.feeds.unsound import magnetometers
 from testbed.motion.logged import LogTruth
 from testbed.motion.terrain import JACKSBORO
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
@@ -114,7 +115,9 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     lasts = max(end - (0.0 if truth is None else truth.start_s), SHORTEST_S)
     date = log.date if date is None else date
     own = sections(found)
+    unsound = magnetometers(found)
     aids = [name for name, keys in own.items() if keys["kind"] != "imu"]
+    aids.sort(key=unsound.__contains__)  # those that are come last
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
     if log.receiver is not None:
         first["gnss"] = log.receiver  # the first with a fix

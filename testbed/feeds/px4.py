@@ -23,8 +23,9 @@ import numpy as np
 from nav.earth import isa_pressure, radii, wrap_longitude
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError
+from testbed.feeds.doubted import remark
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu
-from testbed.feeds.reference import doubt, is_flown
+from testbed.feeds.reference import is_flown
 from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, spread
 from testbed.feeds.stamps import integrated, ordered
@@ -37,6 +38,9 @@ NEVER = 2**31 - 1  # a relative time of what is not there
 # share of the most samples on, than one that is raw.
 ALIKE, RAW_SHARE = 0.9, 0.1
 USED_FROM = {"vehicle_magnetometer": 0.0, "sensor_combined": 0.0}
+RECEIVERS = ("sensor_gps", "vehicle_gps_position")  # the topics of GNSS
+HEIGHTS = ("altitude_ellipsoid_m", "altitude_msl_m", 1.0)  # of them above ellipsoid and sea, and the unit [m]
+OLD_HEIGHTS = ("alt_ellipsoid", "alt", 1e-3)
 OLDEST_MBAR = 2000.0  # pressures below it are in the millibars of early logs
 
 Rows: TypeAlias = Mapping[str, Array]  # the fields of one instance of a topic
@@ -46,10 +50,11 @@ Making: TypeAlias = Callable[[str, Rows, list[str]], Samples]
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a ULog. Raises UserError when it is damaged, or has no inertial data."""
-    topics = _topics(path)
+    logged = _topics(path)
+    found = {name: sum(len(rows["timestamp"]) for rows in own.values()) for name, own in logged.items()}
+    topics = _one_height(logged)
     notes: list[str] = []
     imus = _imus(topics, notes)
-    found = {name: sum(len(rows["timestamp"]) for rows in own.values()) for name, own in topics.items()}
     require_imu(path, imus, found, NEEDED)
     samples: dict[str, Samples] = {}
     for kind, sources in SOURCES.items():
@@ -68,7 +73,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     start = beginning(imus, samples, solution, notes)
     return Log(
         path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),
-        remark=doubt(solution, samples),
+        remark=remark(solution, imus, samples),
     )  # fmt: skip
 
 
@@ -175,12 +180,10 @@ def _fixes(name: str, rows: Rows, notes: list[str]) -> Samples:
     t, kept = ordered(name, rows["timestamp"].astype(float) / 1e6, notes)
     own = {key: values[kept].astype(float) for key, values in rows.items()}
     if "latitude_deg" in own:
-        lat, lon, h = own["latitude_deg"], own["longitude_deg"], own["altitude_ellipsoid_m"]
+        lat, lon = own["latitude_deg"], own["longitude_deg"]
     else:
-        above_sea = own["alt"] / 1e3
-        h = own["alt_ellipsoid"] / 1e3 if own.get("alt_ellipsoid", np.zeros(1)).any() else above_sea
         lat, lon = own["lat"] / 1e7, own["lon"] / 1e7
-    fixes = Fixes(t, np.radians(lat), np.radians(lon), h)
+    fixes = Fixes(t, np.radians(lat), np.radians(lon), _heights(own)[0])
     fixes.v_n = np.column_stack([own[f"vel_{axis}_m_s"] for axis in "ned"])
     if "vel_ned_valid" in own:
         fixes.v_n[own["vel_ned_valid"] == 0] = np.nan
@@ -193,6 +196,27 @@ def _fixes(name: str, rows: Rows, notes: list[str]) -> Samples:
     each = own["s_variance_m_s"] / math.sqrt(3)
     fixes.sigma_velocity_n = spread(each, each)
     return fixes.samples(name)
+
+
+def _heights(rows: Rows) -> tuple[Array, Array]:
+    """A receiver's heights above the ellipsoid and above the sea [m], the latter twice where it tells no others."""
+    ellipsoid, sea, unit = OLD_HEIGHTS if "alt" in rows else HEIGHTS
+    above_sea = unit * rows[sea].astype(float)
+    return (unit * rows[ellipsoid].astype(float) if _has_ellipsoid(rows) else above_sea), above_sea
+
+
+def _has_ellipsoid(rows: Rows) -> bool:
+    """Whether a receiver's topic tells heights above the ellipsoid: where it does not, they are missing or zero."""
+    return any(rows[keys[0]].any() for keys in (HEIGHTS, OLD_HEIGHTS) if keys[0] in rows)
+
+
+def _one_height(topics: Topics) -> Topics:
+    """The topics without a receiver's that tell heights above the sea alone, where the other tells those it needs.
+
+    Else the fixes could be above the sea, and the EKF's heights brought to the ellipsoid.
+    """
+    better = {name for name in RECEIVERS if any(map(_has_ellipsoid, topics.get(name, {}).values()))}
+    return {name: own for name, own in topics.items() if name not in RECEIVERS or name in (better or RECEIVERS)}
 
 
 def _field(name: str, rows: Rows, notes: list[str]) -> Samples:
@@ -245,7 +269,7 @@ def _tube(name: str, rows: Rows, notes: list[str]) -> Samples:
 
 # By kind: topic, a field that it must have, and what makes samples of it.
 SOURCES: Mapping[str, tuple[tuple[str, str, Making], ...]] = {
-    "gnss": (("sensor_gps", "eph", _fixes), ("vehicle_gps_position", "eph", _fixes)),
+    "gnss": tuple((name, "eph", _fixes) for name in RECEIVERS),
     "magnetometer": (
         ("vehicle_magnetometer", "magnetometer_ga[0]", _field),
         ("sensor_combined", "magnetometer_ga[0]", _combined_field),
@@ -300,17 +324,16 @@ def _solution(topics: Topics) -> Reference | None:
 
 def _geoid(topics: Topics) -> float:
     """How far the receiver has the sea above the ellipsoid [m]: the EKF's heights are of the one, its of the other."""
-    gps = _first(topics, ("vehicle_gps_position", "sensor_gps"))
-    for ellipsoid, sea, unit in (("altitude_ellipsoid_m", "altitude_msl_m", 1.0), ("alt_ellipsoid", "alt", 1e-3)):
-        if gps is not None and ellipsoid in gps and sea in gps:
-            known = (gps["fix_type"] >= FixType.FIX_3D) & (gps[ellipsoid] != 0)
-            apart = gps[ellipsoid][known].astype(float) - gps[sea][known]
-            return unit * float(np.median(apart)) if known.any() else 0.0
-    return 0.0
+    gps = _first(topics, RECEIVERS)
+    if gps is None:
+        return 0.0
+    ellipsoid, sea = _heights(gps)
+    known = (gps["fix_type"] >= FixType.FIX_3D) & (ellipsoid != 0)
+    return float(np.median(ellipsoid[known] - sea[known])) if known.any() else 0.0
 
 
 def _date(topics: Topics) -> dt.date | None:
     """The day of the flight, by the receiver."""
-    gps = _first(topics, ("vehicle_gps_position", "sensor_gps"))
+    gps = _first(topics, RECEIVERS)
     utc = 0 if gps is None or "time_utc_usec" not in gps else int(gps["time_utc_usec"].max())
     return dt.datetime.fromtimestamp(utc / 1e6, dt.UTC).date() if utc else None

@@ -165,7 +165,7 @@ def elsewhere_in_height(reference: Reference, samples: Mapping[str, Samples]) ->
             off = float(np.median(above)) if len(above) else 0.0
             if abs(off) > OTHER_HEIGHT_M:
                 where = "above" if off > 0 else "below"
-                return f"{reference.name} is {abs(off):.3g} m {where} {name}: is one of heights above the sea?"
+                return f"{reference.name} is {abs(off):.3g} m {where} {name} (median)"
             return ""
     return ""
 

@@ -32,7 +32,7 @@ USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
-LEAST_SPREAD = 0.05  # of a field about its mean, over its size, in the direction of the least
+LEAST_SPREAD = 0.05  # of a field about its mean, over its median size, in the direction of the least
 ACROSS = 0.1  # share of the flight across its main direction, to tell wind from scale
 SCALE_SIGMA, WORST_CONDITION = 0.05, 1e6  # of an airspeed scale that is worth saying
 LEAST_AIR = 10.0  # an airspeed says something of its scale from here on [m/s]
@@ -297,7 +297,8 @@ def _sphere(field: Array) -> tuple[float, float] | None:
     radius = math.sqrt(max(float(solved[3] + solved[:3] @ solved[:3]), 0.0))
     apart = np.linalg.norm(x - solved[:3], axis=1) - radius
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[-1] / math.sqrt(len(x))
-    return (scale * float(np.sqrt(np.mean(apart**2))), scale * radius) if spread > LEAST_SPREAD * radius else None
+    size = float(np.median(np.linalg.norm(x, axis=1)))  # not the radius: to noise alone a tiny sphere fits
+    return (scale * float(np.sqrt(np.mean(apart**2))), scale * radius) if spread > LEAST_SPREAD * size else None
 
 
 def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:

@@ -168,7 +168,9 @@ def _contradicted(
     """
     if reference is None:
         return ""
-    said = [doubt(reference, samples), elsewhere_in_height(reference, samples)]
+    said = [doubt(reference, samples)]
+    if apart := elsewhere_in_height(reference, samples):
+        said.append(f"{apart}: is one of heights above the sea?")
     name, main = next((name, imu) for name, imu in imus.items() if len(imu))
     if not said[0] and (apart := silence(reference, float(main.t[0]), float(main.t[-1]))):
         said.append(f"{apart} of {name}")

@@ -12,7 +12,6 @@ from nav._jit import njit
 from nav.earth import GAS_CONSTANT
 from nav.rotation import quat_from_euler_components, quat_rotate_components
 from nav.samples import Array
-from nav.terrain import Terrain
 from nav.terrain import ground as height_of_ground
 from testbed.motion import terrain
 from testbed.motion.guidance import Guidance, beginning, climb_out
@@ -48,13 +47,14 @@ class Flight:
         self._weather = Weather(truth.wind, truth.start, seed, self._frame / truth.rate_hz)
         start, envelope, wind = truth.start, self._aircraft.envelope, self._weather.start()
         self._launcher: Launcher | None = None
-        self._legs, self._ground = list(plan), terrain.of(truth.terrain)
+        self._legs, self._ground, self._hit = list(plan), terrain.of(truth.terrain), HIT_M
         if start.on_ground:
             assert envelope.launch is not None  # the scenario was checked
             self._launcher = Launcher(envelope.launch, truth, self._frame)
             self._aircraft.stand(start, envelope.launch, wind)
             self._legs.insert(0, climb_out(start, envelope))
-            self._ground = Terrain.flat(start.alt_m)
+            # It rests on the ground, whose height its start tells to a metre.
+            self._hit += start.alt_m - self._height_of_ground(math.radians(start.lat_deg), math.radians(start.lon_deg))
         else:
             self._aircraft.start(start, wind)
         wind_seed = truth.wind.turbulence_seed
@@ -148,11 +148,14 @@ class Flight:
         period = self._frame / self.rate_hz
         return Guidance(self._legs, self._aircraft.envelope, self.true_feedback(), alt, self._speed, period)
 
+    def _height_of_ground(self, lat: float, lon: float) -> float:
+        """The map's [m]."""
+        return height_of_ground(lat, lon, self._ground.heights, self._ground.grid)[0]
+
     def _guide(self) -> None:
         """One step of guidance, or the end of the flight."""
         true = self.true_feedback()
-        lowest = HIT_M + height_of_ground(true.lat, true.lon, self._ground.heights, self._ground.grid)[0]
-        self.failure = _loss_of_control(true, lowest)
+        self.failure = _loss_of_control(true, self._hit + self._height_of_ground(true.lat, true.lon))
         if self.failure:
             self._ended = True
             return

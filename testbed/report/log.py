@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from testbed.feeds.draft import sections
 from testbed.feeds.survey import Survey
+from testbed.feeds.unsound import barometers, magnetometers
 from testbed.score.likeness import ALIKE, Row
 from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
 
@@ -31,7 +32,8 @@ def tables(found: Survey) -> Iterator[Table]:
     listed = [f"{name} {count}" for name, count in sorted(log.messages.items())]
     more = " …" if len(listed) > MESSAGES_SHOWN else ""
     _add(head, "holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
-    for note in [*log.notes, *([log.remark] if log.remark else [])]:
+    unsound = {**magnetometers(found), **barometers(found)}
+    for note in [*log.notes, *([log.remark] if log.remark else []), *unsound.values()]:
         _add(head, "note", note)
     yield head
     reports = _table("sensors", "sensor", "samples", "rate [Hz]", "jitter [ms]", "gaps", "longest step [s]", "proposed")

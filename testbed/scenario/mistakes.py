@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from nav.terrain import Terrain
 from nav.terrain import ground as height_of_ground
 from testbed import measures
 from testbed.errors import UserError, unknown
@@ -80,16 +81,21 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     except UserError as error:
         yield ("truth", "wind", "file"), str(error)
         return
+    try:
+        relief = terrain.of(scenario.truth.terrain)
+    except UserError:  # told already
+        return
     start = scenario.truth.start
-    yield from _launch_mistakes(scenario.truth, envelope)
-    yield from _ground_mistakes(scenario.truth)
+    yield from _launch_mistakes(scenario.truth, envelope, relief)
+    yield from _ground_mistakes(scenario.truth, relief)
     begun = guidance.beginning(start, envelope)
-    ground = start.alt_m if start.on_ground else scenario.truth.terrain.height_m
+    # Nothing is flown below the lowest of a relief; whether a leg meets what is higher the flight shows.
+    ground = start.alt_m if start.on_ground else float(relief.heights.min())
     for key, what in guidance.plan_mistakes(scenario.plan, begun, envelope, foreseen, ground):
         yield keypath.read(key), what
 
 
-def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope) -> Iterator[tuple[KeyPath, str]]:
+def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope, relief: Terrain) -> Iterator[tuple[KeyPath, str]]:
     """What of a start on the ground can't be."""
     start = truth.start
     if not start.on_ground:
@@ -97,10 +103,6 @@ def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope) -> Iterato
     if envelope.launch is None:
         lacking = f"the aircraft {truth.aircraft!r} has no [launch] in its envelope.toml"
         yield ("truth", "start", "on_ground"), f"{lacking}: add it, or begin in the air"
-    try:
-        relief = terrain.of(truth.terrain)
-    except UserError:  # told already
-        return
     lat, lon = math.radians(start.lat_deg), math.radians(start.lon_deg)
     ground = height_of_ground(lat, lon, relief.heights, relief.grid)[0]
     if not abs(start.alt_m - ground) <= ON_THE_GROUND_M:
@@ -112,13 +114,9 @@ def _launch_mistakes(truth: FlightTruth, envelope: aircraft.Envelope) -> Iterato
         )
 
 
-def _ground_mistakes(truth: FlightTruth) -> Iterator[tuple[KeyPath, str]]:
+def _ground_mistakes(truth: FlightTruth, relief: Terrain) -> Iterator[tuple[KeyPath, str]]:
     """What of a start in the air can't be where the ground has relief."""
     start = truth.start
-    try:
-        relief = terrain.of(truth.terrain)
-    except UserError:  # told already
-        return
     if start.on_ground or relief.heights.size == 1:
         return
     lat, lon = math.radians(start.lat_deg), math.radians(start.lon_deg)

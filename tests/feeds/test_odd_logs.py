@@ -104,6 +104,20 @@ def test_a_magnetometer_without_a_field_is_left_out(tmp_path: Path) -> None:
     assert "magnetometer: 1 samples have no field at all: left out" in once.notes
 
 
+@pytest.mark.parametrize("turns", [False, True])
+def test_no_sphere_is_fitted_to_a_magnetometer_that_does_not_turn(turns: bool, tmp_path: Path) -> None:
+    """To noise alone one of the noise's own size fits."""
+    rng = np.random.default_rng(41)
+    messages: Messages = []
+    for name, values in circling():
+        if name == "MAG":
+            angle = values[0] / 1e6 if turns else 0.0
+            field = 300.0 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)]) + rng.normal(0.0, 1.0, 3)
+            values = (*values[:2], *field)
+        messages.append((name, values))
+    assert bool(survey(read(messages, tmp_path)).field_residual) == turns
+
+
 @pytest.mark.parametrize(
     "before", ["", "9\n\nArduCopter V3.1 (5c6503e2)\nFree RAM: 1044\nAPM 2\n", "ArduPlane V2.7\r\n"]
 )
@@ -316,6 +330,26 @@ def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, t
     by_solution = run(scenario.changed({"truth.reference": "solution"}))
     assert any("judges by the receiver" in one for one in by_solution.remarks) == told
     assert not any("judges by the receiver" in one for one in run(scenario).remarks)
+
+
+@pytest.mark.parametrize(("below_m", "told"), [(0.0, False), (8.0, False), (20.0, True)])
+def test_a_solution_that_is_below_its_receiver_is_told(below_m: float, told: bool, tmp_path: Path) -> None:
+    messages = with_solution(circling())
+    low = [(name, (*v[:3], v[3] - below_m) if name == "POS" else v) for name, v in messages]
+    said = '(XKF1) is 20 m below gnss (median): truth.reference = "gnss" judges by the receiver'
+    assert read(low, tmp_path).remark == (f"the autopilot's own solution {said}" if told else "")
+
+
+@pytest.mark.parametrize("below_m", [0.0, 20.0])
+def test_a_px4_solution_that_is_below_its_receiver_is_told(below_m: float, tmp_path: Path) -> None:
+    messages: Messages = []
+    for k in range(1, 101):
+        t, place = us(k / 100), (470_000_000, 80_000_000, 500_000, 500_000)
+        messages.append(("vehicle_imu", (t, 0.0, 0.0, 0.0, 0.0, 0.0, -0.098, 10_000, 10_000)))
+        messages.append(("vehicle_attitude", (t, 1.0, 0.0, 0.0, 0.0)))
+        messages.append(("vehicle_local_position", (t, 47.0, 8.0, 500.0 - below_m, *[0.0] * 6)))
+        messages.append(("vehicle_gps_position", (t, *place, 0.3, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 3, 9)))
+    assert ("20 m below gnss" in formats.read(ulog(messages, tmp_path / "flight.ulg"), {}).remark) == bool(below_m)
 
 
 @pytest.mark.parametrize(("late_s", "told"), [(0.2, False), (1.0, True)])

@@ -301,7 +301,7 @@ def test_a_reference_above_the_sea_beside_a_receiver_above_the_ellipsoid_is_told
         "reference": {"time": "t", "lat": "lat", "lon": "lon", "height": "sea"},
     }
     log = formats.read(tmp_path / "a.npz", {name: Stream(**own) for name, own in columns.items()})  # type: ignore[arg-type]
-    assert "is 48 m below gnss: is one of heights above the sea?" in log.remark
+    assert "is 48 m below gnss (median): is one of heights above the sea?" in log.remark
 
 
 @pytest.mark.parametrize("old", [True, False])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,11 @@ REST_S, RATE_HZ, GROUND_M, HEADING = 4.0, 200.0, 430.0, 60.0
 PLAN = [{"leg": "climb", "to_m": 480}, {"leg": "straight", "length_m": 9000}]
 
 
-def flight(name: str, rest_s: float = REST_S, **wind: Any) -> Flight:
+def flight(name: str, rest_s: float = REST_S, terrain: Any = None, **wind: Any) -> Flight:
     start = {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": GROUND_M, "heading_deg": HEADING, "rest_s": rest_s}
     truth = FlightTruth(
         source="flight", aircraft=name, rate_hz=RATE_HZ, start={**start, "on_ground": True}, wind=wind,
-        terrain={"height_m": GROUND_M},
+        terrain=terrain or {"height_m": GROUND_M},
     )  # fmt: skip
     return Flight(truth, TypeAdapter(list[Leg]).validate_python(PLAN), 92110001)
 
@@ -97,6 +98,18 @@ def test_it_climbs_away_without_stalling_or_touching(taken_off: tuple[aircraft.E
     begun = np.flatnonzero(truth.leg == 0.0)[0]
     assert truth.h[begun] == pytest.approx(GROUND_M + envelope.altitude.floor_m, abs=6)
     assert truth.h[-1] > truth.h[begun]
+
+
+@pytest.mark.parametrize(("hill_m", "hit"), [(600.0, True), (GROUND_M, False)])
+def test_off_the_runway_the_ground_is_the_maps(hill_m: float, hit: bool, tmp_path: Path) -> None:
+    """The runway is told to a metre: here the map has it half a metre higher."""
+    ahead = 0.01 * np.arange(5)
+    height = np.where(ahead < 0.02, GROUND_M + 0.5, hill_m)[:, None] + np.zeros(5)
+    np.savez(tmp_path / "hill.npz", lat_deg=46.99 + ahead, lon_deg=7.99 + ahead, height_m=height)
+    source = flight("flying_wing", terrain={"file": str(tmp_path / "hill.npz")})
+    truth = source.advance(round(90.0 * RATE_HZ))
+    assert source.failure == ("the aircraft hit the ground" if hit else "")
+    assert hit == (len(truth) < 90.0 * RATE_HZ)
 
 
 def test_same_bits_however_it_is_advanced() -> None:

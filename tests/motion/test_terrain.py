@@ -188,6 +188,11 @@ def flown_over(ground: dict[str, object], **overrides: object) -> Scenario:
         ({"height_m": 2000}, {}, r"truth\.start\.alt_m: .* 2\d\d\d"),
         (
             {"file": "jacksboro"},
+            {"plan": [{"leg": "descend", "to_m": 100}]},
+            r"plan\[0\]\.to_m: 100 m can't be flown: the ground is at 236 m \(ellipsoid\), choose from 266 to",
+        ),
+        (
+            {"file": "jacksboro"},
             {"truth.start.alt_m": 300},
             r"truth\.start\.alt_m: is below the ground, which is at \d+ m",
         ),

@@ -1,0 +1,41 @@
+"""Of several topics in which PX4 logs a receiver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from worlds.log_writers import ULOG, ulog
+
+from nav.samples import GnssSample
+from testbed.feeds import formats
+
+RECEIVERS = ("sensor_gps", "vehicle_gps_position")
+
+
+@pytest.mark.parametrize("told_by", RECEIVERS)
+def test_the_heights_of_a_px4_solution_are_those_of_its_fixes(
+    told_by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two topics one has no heights above the ellipsoid: they were 47 m apart."""
+    gps = ULOG["vehicle_gps_position"]
+    monkeypatch.setitem(ULOG, "sensor_gps", gps)
+    messages: list[tuple[str, tuple[Any, ...]]] = []
+    for k in range(1, 101):
+        t = 10_000 * k
+        messages.append(("vehicle_imu", (t, 0.0, 0.0, 0.0, 0.0, 0.0, -0.098, 10_000, 10_000)))
+        messages.append(("vehicle_attitude", (t, 1.0, 0.0, 0.0, 0.0)))
+        messages.append(("vehicle_local_position", (t, 47.0, 8.0, 510.0, *[0.0] * 6)))
+        for topic in RECEIVERS:
+            ellipsoid = 557_000 if topic == told_by else 0
+            place = 470_000_000, 80_000_000, 510_000, ellipsoid
+            messages.append((topic, (t, *place, 0.3, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 3, 9)))
+    log = formats.read(ulog(messages, tmp_path / "flight.ulg"), {})
+    assert log.solution is not None
+    assert log.messages.keys() >= set(RECEIVERS)
+    assert np.nanmedian(log.solution.columns["h"]) == pytest.approx(557.0, abs=1e-3)
+    for one in log.samples["gnss"]:
+        assert isinstance(one, GnssSample)
+        assert one.h == pytest.approx(557.0, abs=1e-3)
