@@ -210,7 +210,7 @@ class FlightTruth(Section):
     rate_hz: TickRate = 200.0
     start: Start = Field(description="where the flight begins")
     wind: Wind = Field(default=Wind(), description="wind and turbulence; none: calm air")
-    terrain: Terrain = Field(default=Terrain(), description="the ground that sensors see; it stops nobody")
+    terrain: Terrain = Field(default=Terrain(), description="the ground that sensors see, and on which a flight ends")
 
 
 class KinematicStart(Section):
