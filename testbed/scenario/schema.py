@@ -26,7 +26,7 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails, PydanticCustomError, to_json
 
 from testbed import plugins
 from testbed.data import data_dir
@@ -59,7 +59,10 @@ def _sensor(table: object, info: ValidationInfo) -> Section:
         section = sensor_registry.find(_text(table.get("kind")), folder).section
     except UserError as error:
         raise PydanticCustomError("sensor_kind", "{text}", {"text": str(error)}) from None
-    return section.model_validate(table, strict=True)
+    if table["kind"] in sensor_registry.BUILT_IN:
+        return section.model_validate(table, strict=True)
+    # The user's fields may be lists as well as tuples: what is read as JSON becomes either.
+    return section.model_validate_json(to_json(table), strict=True)
 
 
 def _estimator(table: object) -> EstimatorSection:

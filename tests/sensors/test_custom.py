@@ -49,6 +49,8 @@ class Timeless:
 class Radar:
     class Section(AidingTiming):
         noise_m: float = Field(0.5, ge=0, description="1 sigma")
+        beams: list[list[float]] = []
+        arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
         how: str = ""
 
     def __init__(self, name, section, tick_rate_hz, seed):
@@ -221,6 +223,11 @@ def test_it_is_recorded_with_unit_and_noise(scenario: Path) -> None:
     ("overrides", "says"),
     [
         ({"sensors.radar.noise": 1.0}, "sensors.radar.noise: unknown key: did you mean noise_m?"),
+        ({"sensors.radar.arm_m": [0.0, 1.0]}, "sensors.radar.arm_m[2]: is missing: this item needs one more value"),
+        ({"sensors.radar.beams": [1]}, "sensors.radar.beams[0]: must be a list, not 1"),
+        ({"sensors.radar.beams": [[1.0, "a"]]}, 'sensors.radar.beams[0][1]: must be a number, not "a"'),
+        ({"sensors.radar.beams": [[1.0, float("inf")]]}, "sensors.radar.beams[0][1]: must be a finite number, not inf"),
+        ({"sensors.radar.noise_m": "1"}, 'sensors.radar.noise_m: must be a number, not "1"'),
         ({"sensors.radar.noise_m": -1.0}, "sensors.radar.noise_m: must be greater than or equal to 0"),
         ({"sensors.radar.kind": "./radar.py:Rader"}, 'there is no class in ./radar.py "Rader": did you mean Radar?'),
         ({"sensors.radar.kind": "./radar.py:HeightSample"}, "lacks a Section"),
@@ -231,6 +238,13 @@ def test_what_is_wrong_is_said(scenario: Path, overrides: dict[str, object], say
     with pytest.raises(UserError) as told:
         Scenario.load(scenario, overrides)
     assert says in str(told.value)
+
+
+def test_its_lists_may_be_lists_or_tuples(scenario: Path) -> None:
+    keys = {"sensors.radar.beams": [[1, 0.1], [2.5]], "sensors.radar.arm_m": [0.1, 0.1, 0.2]}
+    own = Scenario.load(scenario, keys).sensors["radar"]
+    assert own.beams == [[1.0, 0.1], [2.5]]
+    assert own.arm_m == (0.1, 0.1, 0.2)
 
 
 def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.MonkeyPatch) -> None:
