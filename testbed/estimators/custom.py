@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -91,6 +92,15 @@ def build(section: CustomSection, rig: Rig) -> Lane:
     return Lane(FusionHorizon(adapter, rig.lag_s(used), coning=coning), imus, used, voter=voter)
 
 
+def options_of(kind: str, folder: Path) -> type[BaseModel] | None:
+    """The model that checks the keys of a class; None where it has none, or can't be had, which `build` says."""
+    try:
+        found = getattr(plugins.load(kind, folder, GROUP), "Options", None)
+    except UserError:
+        return None
+    return found if isinstance(found, type) and issubclass(found, BaseModel) else None
+
+
 def _options(section: CustomSection, made: Any) -> dict[str, Any]:
     """The class's own keys, checked by its ``Options`` if it has that."""
     options: type[BaseModel] | None = getattr(made, "Options", None)
@@ -98,7 +108,7 @@ def _options(section: CustomSection, made: Any) -> dict[str, Any]:
         return section.options
     try:
         checked = options.model_validate(section.options)
-    except ValidationError as error:
+    except ValidationError as error:  # of a record, whose class was another: where it is loaded all is said
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"])) or "options"
         if first["type"] == "extra_forbidden":

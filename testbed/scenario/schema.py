@@ -65,8 +65,8 @@ def _sensor(table: object, info: ValidationInfo) -> Section:
     return section.model_validate_json(to_json(table), strict=True)
 
 
-def _estimator(table: object) -> EstimatorSection:
-    """One ``[[estimator]]`` table, by its kind."""
+def _estimator(table: object, info: ValidationInfo) -> EstimatorSection:
+    """One ``[[estimator]]`` table, by its kind, with the keys of a class of the user's if that is asked for."""
     if not isinstance(table, dict):
         raise PydanticCustomError("dict_type", "Input should be a table")
     kind = table.get("kind", DEFAULT_ESTIMATOR)
@@ -74,7 +74,17 @@ def _estimator(table: object) -> EstimatorSection:
         section = registry.find(_text(kind)).section
     except UserError as error:
         raise PydanticCustomError("estimator_kind", "{text}", {"text": str(error)}) from None
-    return section.model_validate({**table, "kind": kind}, strict=True)
+    found = section.model_validate({**table, "kind": kind}, strict=True)
+    if isinstance(found, custom.CustomSection) and (folder := (info.context or {}).get("options")) is not None:
+        options = custom.options_of(found.kind, folder)
+        try:
+            if options is not None:
+                options.model_validate(found.options)
+        except ValidationError:
+            raise
+        except Exception as error:  # a validator of the user's
+            raise PydanticCustomError("estimator_kind", "{text}", {"text": plugins.raised(error)}) from None
+    return found
 
 
 def _text(kind: object) -> str:
@@ -210,11 +220,18 @@ class Scenario(Section):
         path = _find(path_or_name)
         if isinstance(overrides, Mapping):
             overrides = [keypath.override(key, value) for key, value in overrides.items()]
-        return cls.parse(_read(path), overrides, path)
+        return cls._parsed(_read(path), overrides, path, {"options": path.parent})
 
     @classmethod
     def parse(cls, text: str, overrides: Sequence[str] = (), path: Path | None = None) -> Scenario:
-        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does."""
+        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does.
+
+        The keys of an estimator of the user's are left to its class, which may be another one by now.
+        """
+        return cls._parsed(text, overrides, path, {})
+
+    @classmethod
+    def _parsed(cls, text: str, overrides: Sequence[str], path: Path | None, context: Mapping[str, Path]) -> Scenario:
         place = str(path) if path else "scenario"
         data = _toml(text, place)
         if not data:
@@ -227,14 +244,11 @@ class Scenario(Section):
             if isinstance(table, dict):
                 table.setdefault("kind", name)
         try:
-            scenario = cls.model_validate(
-                _frozen(data), strict=True, context={"folder": path.parent if path else Path()}
-            )
+            folder = path.parent if path else Path()
+            scenario = cls.model_validate(_frozen(data), strict=True, context={"folder": folder, **context})
         except ValidationError as error:
             raise UserError(
-                messages.report(
-                    error, cls, messages.Written(data, text, place, set_paths, path.parent if path else Path())
-                )
+                messages.report(error, cls, messages.Written(data, text, place, set_paths, folder))
             ) from None
         except RecursionError:
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
