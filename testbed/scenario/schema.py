@@ -257,13 +257,15 @@ class Scenario(Section):
 
     @classmethod
     def of_record(cls, said: Mapping[Any, Any]) -> Scenario:
-        """The scenario of a record, by the record's attributes; an aircraft in a folder is looked for where it was.
+        """The scenario of a record, by the record's attributes; what is the user's is looked for where it was.
+
+        Where that is older records don't say in full: it is seen from the working folder.
 
         Raises KeyError or ValueError where the attributes are no record's, UserError as `load` does.
         """
         path = str(said.get("scenario_path", ""))
         overrides = json.loads(said.get("overrides", "[]"))
-        return cls.parse(str(said["scenario"]), overrides, Path(path) if path else None)
+        return cls.parse(str(said["scenario"]), overrides, Path(path).absolute() if path else None)
 
     def changed(self, values: Mapping[str, Any]) -> Scenario:
         """The same with further values by key, which belong to it from then on. Raises UserError as `load` does."""

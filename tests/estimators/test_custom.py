@@ -4,6 +4,7 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -300,3 +301,21 @@ def test_external() -> None:
     print(result.metrics)
     assert result.metrics["own.position_horizontal_rms_m"] < 10.0
     assert not [one for one in result.remarks if "has ended" in one]
+
+
+@pytest.mark.ci
+def test_garbage_of_an_external_program_is_shown() -> None:
+    program = "import sys\nfor line in sys.stdin:\n if line == 'estimate\\n': print('oops', flush=True)"
+    result, _ = example("external.py", "External", command=[sys.executable, "-c", program])
+    (ended,) = [one for one in result.remarks if "has ended" in one]
+    assert "RuntimeError: the program has answered 'oops\\n' (external.py, line " in ended
+
+
+@pytest.mark.ci
+def test_an_external_program_that_hangs_does_not_outlive_the_run() -> None:
+    made = plugins.load("./external.py:External", EXAMPLES, "none")
+    own = made(SimpleNamespace(folder=EXAMPLES), [sys.executable, "-c", "import time; time.sleep(100)"])
+    program = own.program
+    own.tell("barometer", 0.0, 1e5)
+    del own
+    assert program.returncode is not None

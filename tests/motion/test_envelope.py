@@ -120,6 +120,7 @@ def test_a_folder_is_seen_from_the_scenario_file(mine: Path, tmp_path: Path, mon
     assert Scenario.of_record(said).truth == scenario.truth
     monkeypatch.chdir(tmp_path)
     assert Scenario.parse(scenario.text).truth == scenario.truth
+    assert Scenario.of_record({**said, "scenario_path": file.name}).truth == scenario.truth  # of an older record
     shutil.rmtree(mine)
     with pytest.raises(UserError, match=r'truth\.aircraft: there is no aircraft "./mine".* path of its folder'):
         Scenario.of_record(said)
