@@ -8,6 +8,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterable
+from functools import cache
 from numbers import Real
 from typing import Any, cast
 
@@ -61,8 +62,9 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
         raise UserError(f"{_called(name, section)}: aid gave one of sensor {shown(found.sensor)}, not {shown(name)}")
     if _is_ours(type(found)):
         return found
-    called = f"{_called(name, section)}: aid"
-    return _as_made(found, called) if any(map(_is_ours, type(found).__mro__)) else AidGuard(name, called, found)
+    if any(map(_is_ours, type(found).__mro__)):
+        return _as_made(found, getattr(section, "kind", ""))
+    return AidGuard(name, f"{_called(name, section)}: aid", found)
 
 
 def is_own_aid(aid: Any) -> bool:
@@ -75,29 +77,36 @@ def _is_ours(kind: type) -> bool:
     return kind.__module__.startswith(f"{nav.aids.__name__}.") and kind.__module__ != nav.aids.base.__name__
 
 
-def _as_made(found: Any, called: str) -> Any:
-    """A copy, guarded as `AidGuard` does, of an aid made of one of ours, which filters still know by its class.
+def _as_made(found: Any, of: str) -> Any:
+    """A copy of an aid made of one of ours, guarded as `AidGuard` does, which filters still know by its class."""
+    kind: Any = type(found)
+    guarded = copy.copy(found)
+    object.__setattr__(guarded, "__class__", _guarding(kind, of))  # it may be frozen
+    return guarded
+
+
+@cache
+def _guarding(kind: Any, of: str) -> type:
+    """The guarded class of a class made of one of ours, which the sensor's kind gives: one, as filters compare them.
 
     What takes the place of `measure` where it is ours is off: no kernel knows what the user's measures.
     """
-    kind: Any = type(found)
 
     class Guarded(kind):  # type: ignore[misc]
         __slots__ = ()
         plain = None
 
         def blocks(self) -> list[Block]:
-            return _blocks(called, super().blocks)
+            return _blocks(f"sensor {self.sensor}: {of}: aid", super().blocks)
 
         def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
+            called = f"sensor {self.sensor}: {of}: aid"
             return _measured(called, dict(self.parts)[part], super().measure, part, sample, at)
 
         def at_points(self, *_: Any) -> None:  # one by one
             return None
 
-    guarded = copy.copy(found)
-    object.__setattr__(guarded, "__class__", Guarded)  # it may be frozen
-    return guarded
+    return Guarded
 
 
 class AidGuard:

@@ -339,6 +339,7 @@ def test_an_aid_made_of_one_of_ours_is_known_as_that() -> None:
 
     made = custom.aid(lambda *_: Mine("mine"), "mine", MagnetometerConfig(), None)
     assert isinstance(made, Mine)
+    assert type(made) is type(custom.aid(lambda *_: Mine("other"), "other", MagnetometerConfig(), None))
     assert made == made
     assert dataclasses.replace(made, course=None).sensor == "mine"
     assert made.plain is None  # no kernel knows what it measures
