@@ -38,10 +38,15 @@ def load(kind: str, folder: Path, group: str) -> Any:
     """
     module, where, name = _named(kind, folder, group)
     if not hasattr(module, name):
-        classes = [key for key, value in vars(module).items() if isinstance(value, type) and not key.startswith("_")]
+        classes = [key for key, value in vars(module).items() if _is_of(value, module) and not key.startswith("_")]
         raise UserError(f"kind {shown(kind)}: {unknown(f'class in {where}', name, classes)}")
     _looked_at(module)
     return getattr(module, name)
+
+
+def _is_of(value: object, module: ModuleType) -> bool:
+    """Whether it is a class of the module's own package, not one that it imports from elsewhere."""
+    return isinstance(value, type) and value.__module__.partition(".")[0] == module.__name__.partition(".")[0]
 
 
 def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:

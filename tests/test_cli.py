@@ -341,6 +341,25 @@ def test_a_record_of_a_class_that_was_edited_is_run_again_with_a_remark(testbed:
     assert "first/run.nc: ./filters.py:Mine has been edited since: bits may differ" in ended.err
 
 
+@pytest.mark.ci
+def test_a_record_with_a_class_of_the_user_s_is_run_again_from_anywhere(
+    testbed: Testbed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file was looked for only from where the first was run."""
+    assert testbed("init", "mine").code == 0
+    assert testbed("run", "mine/first.toml", *QUICK, "--out", "first").code == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    ended = testbed("run", "../first/run.nc", "--no-report", "--out", "again")
+    assert ended.code == 0, ended.err
+    assert record.load(Path("again/run.nc")).identical(record.load(tmp_path / "first/run.nc"))
+    file = tmp_path / "mine/filters.py"
+    file.unlink()
+    ended = testbed("run", "../first/run.nc", "--no-report", "--out", "third")
+    assert ended.code == 2
+    assert f"{file}: can't be read: No such file or directory" in ended.err
+
+
 def _spoilt(folder: Path, **attributes: str) -> Path:
     """A record some of whose attributes are not what a run writes."""
     import h5py

@@ -15,6 +15,7 @@ To the program, fields separated by blanks, SI units and radians, ``nan`` where 
 """
 
 import subprocess
+import weakref
 
 import numpy as np
 
@@ -27,11 +28,10 @@ class External:
     Files in it are relative to the scenario, as the file in ``kind`` is.
     """
 
-    program = None
-
     def __init__(self, rig, command):
         pipe = subprocess.PIPE
         self.program = subprocess.Popen(command, cwd=rig.folder, stdin=pipe, stdout=pipe, text=True)
+        weakref.finalize(self, stop, self.program)  # at the end of the run, or of Python
 
     def propagate(self, imu):
         rows = np.column_stack([imu.t, imu.dt, imu.dtheta, imu.dv]).tolist()
@@ -58,18 +58,23 @@ class External:
         answer = self.program.stdout.readline()
         if not answer:
             raise RuntimeError(f"the program has ended with exit code {self.program.wait()}")
-        t, aligned, *state = map(float, answer.split())
+        try:
+            t, aligned, *state = map(float, answer.split())
+        except ValueError:
+            raise RuntimeError(f"the program has answered {answer!r}") from None
         if not aligned:
             return Estimate.of(t)
         lla, v_n, q_nb = (np.array(part) for part in (state[:3], state[3:6], state[6:]))
         return Estimate.of(t, q_nb=q_nb, lla=lla, v_n=v_n, status=Status.ALIGNED)
 
-    def __del__(self):
-        if self.program is None:  # it could not be started
-            return
-        self.program.stdin.close()
-        self.program.stdout.close()
-        self.program.wait()
+
+def stop(program):
+    """End its input, at which it should end; one that hangs does not outlive the run."""
+    try:
+        program.communicate(timeout=5)
+    except subprocess.TimeoutExpired:
+        program.kill()
+        program.communicate()
 
 
 def line(*fields):

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -87,7 +88,17 @@ def build(section: CustomSection, rig: Rig) -> Lane:
     used = section.aiding(rig.sensors)
     imus, voter = mountings(section, rig)
     coning = rig.imu(section.imu).rate_hz < rig.tick_rate_hz
-    return Lane(FusionHorizon(Adapter(inner), rig.lag_s(used), coning=coning), imus, used, voter=voter)
+    adapter = Adapter(inner, 1 / rig.tick_rate_hz)
+    return Lane(FusionHorizon(adapter, rig.lag_s(used), coning=coning), imus, used, voter=voter)
+
+
+def options_of(kind: str, folder: Path) -> type[BaseModel] | None:
+    """The model that checks the keys of a class; None where it has none, or can't be had, which `build` says."""
+    try:
+        found = getattr(plugins.load(kind, folder, GROUP), "Options", None)
+    except UserError:
+        return None
+    return found if isinstance(found, type) and issubclass(found, BaseModel) else None
 
 
 def _options(section: CustomSection, made: Any) -> dict[str, Any]:
@@ -97,7 +108,7 @@ def _options(section: CustomSection, made: Any) -> dict[str, Any]:
         return section.options
     try:
         checked = options.model_validate(section.options)
-    except ValidationError as error:
+    except ValidationError as error:  # of a record, whose class was another: where it is loaded all is said
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"])) or "options"
         if first["type"] == "extra_forbidden":
@@ -115,14 +126,14 @@ class Adapter:
     """A class of three methods as an estimator of the house (`nav.horizon.Estimator`).
 
     What it raises, or gives that can't be used, is its end: ``failure`` says why, and from there on it has no estimate.
-    It is handed copies, so that it can't change what others see.
+    It is handed copies, so that it can't change what others see. A tick lasts ``tick_s`` [s].
     """
 
-    def __init__(self, inner: Any) -> None:
+    def __init__(self, inner: Any, tick_s: float) -> None:
         self.inner = inner
         self.failure = ""
         self._t = np.nan
-        self._given = Given()
+        self._given = Given(tick_s)
 
     @property
     def listening(self) -> bool:
@@ -188,13 +199,13 @@ class Adapter:
         return [] if given is None else self._given.reports(given, "refuse")
 
     def _estimate(self) -> Estimate | None:
-        return self._given.estimate(self.inner.estimate(), "estimate")
+        return self._given.estimate(self.inner.estimate(), "estimate", self._t)
 
     def _predict(self, imu: ImuSamples) -> Estimate | None:
         predict = getattr(self.inner, "predict", None)
         if predict is not None:
-            return self._given.estimate(predict(_copied(imu)), "predict")
-        return carried(self._given.estimate(self.inner.estimate(), "estimate"), imu)
+            return self._given.estimate(predict(_copied(imu)), "predict", float(imu.t[-1]))
+        return carried(self._given.estimate(self.inner.estimate(), "estimate", self._t), imu)
 
 
 def carried(estimate: Estimate, imu: ImuSamples) -> Estimate:

@@ -17,7 +17,9 @@ from testbed.errors import shown
 FLOAT = np.dtype(float)
 NUMBERS = ("t", "lat", "lon", "h")
 ALL = sum(Status)
+LIMITS = {"lat": math.pi / 2, "lon": 2 * math.pi}  # [rad]
 LENGTH = 1e-3  # by which that of a quaternion may be off 1: angles are wrong by as much
+SYMMETRY = 1e-3  # by which correlations across the diagonal may differ: rounding of single precision is far below
 # Dimensions in the record that have labels (`testbed.record.columns`), and times: no column or group can be called so.
 DIMENSIONS = {"time", "sample_time", "ned", "body", "north_east", "cross", "fix_part", "body_xy", "quaternion",
               "inertial_quaternion", "surface", "command", "error", "error_column", "element"}  # fmt: skip
@@ -33,15 +35,17 @@ class Unfit(Exception):
 class Given:
     """Looks at what one estimator gives; the length of what has a name must stay as it was at first.
 
-    Numbers and arrays of another type than that of the record become of that type.
+    Numbers and arrays of another type than that of the record become of that type. An estimate may be off its time by
+    ``tick_s`` [s], as a clock that counts ticks is between them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s = tick_s
         self._innovations: dict[str, int] = {}  # by aid
         self._states: dict[str, int] = {}
 
-    def estimate(self, given: Any, method: str) -> Estimate:
-        """What a method gave as an estimate. Raises Unfit."""
+    def estimate(self, given: Any, method: str, t: float) -> Estimate:
+        """What a method gave as an estimate at ``t`` [s], NaN before the first increment. Raises Unfit."""
         if not isinstance(given, Estimate):
             raise Unfit(f"{method} gave {_told(given)}, not a nav.samples.Estimate")
         changes: dict[str, Any] = {}
@@ -63,7 +67,16 @@ class Given:
             changes["status"] = _status(given.status, f"{method}: status")
         if type(given.extra) is not dict or given.extra:
             changes["extra"] = self._extra(given.extra, f"{method}: extra")
-        return dataclasses.replace(given, **changes) if changes else given
+        fit = dataclasses.replace(given, **changes) if changes else given
+        if fit.status & Status.ALIGNED and abs(fit.t - t) > self._tick_s * (1 + LENGTH):  # false for NaN
+            raise Unfit(f"{method} is of {fit.t:.10g} s, not of {t:.10g} s, the end of the last increment")
+        for name, limit in LIMITS.items():
+            angle = getattr(fit, name)
+            if limit < abs(angle) < math.inf:  # what is not finite is counted
+                raise Unfit(f"{method}: {name} is {angle:.6g}: latitude and longitude are in radians")
+        if not _is_symmetric(fit.covariance):
+            raise Unfit(f"{method}: covariance is not symmetric: give 0.5 * (P + P.T)")
+        return fit
 
     def reports(self, given: Any, method: str) -> list[UpdateReport]:
         """What a method gave as a list of reports. Raises Unfit."""
@@ -157,6 +170,13 @@ def _array(value: Any, what: str) -> Array:
         raise Unfit(f"{what} is {_told(value)}, not an array of real numbers")
     numbers: Array = array.astype(float)
     return numbers
+
+
+def _is_symmetric(covariance: Array) -> bool:
+    """Whether a covariance is the same across its diagonal; NaN is no difference."""
+    sigma = np.sqrt(np.abs(np.diagonal(covariance)))
+    with np.errstate(invalid="ignore", over="ignore"):
+        return not (np.abs(covariance - covariance.T) > SYMMETRY * np.outer(sigma, sigma)).any()
 
 
 def _status(value: Any, what: str) -> Status:

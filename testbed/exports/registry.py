@@ -53,7 +53,9 @@ FORMATS: dict[str, Format] = {
             "PX4's EKF2 replay (1.16), pyulog, Flight Review, PlotJuggler, Foxglove",
             version="1.16",
         ),
-        Format("ulg-1.15", ".ulg", "px4", "the same by the messages of PX4 1.15", "EKF2 replay (1.15)", version="1.15"),
+        Format(
+            "ulg-1.15", "-1.15.ulg", "px4", "the same by the messages of PX4 1.15", "EKF2 replay (1.15)", version="1.15"
+        ),
         Format(
             "bin",
             ".bin",

@@ -20,7 +20,7 @@ import time
 import tomllib
 import traceback
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -29,8 +29,8 @@ import numpy as np
 
 from nav.samples import Array
 from testbed.data import write_file
-from testbed.errors import UserError, shown
-from testbed.many import pool, progress
+from testbed.errors import UserError
+from testbed.many import given, pool, progress
 from testbed.many.draws import DRAW, require_draw
 from testbed.many.folder import claim, code, own, require_code, require_own_code, versions
 from testbed.many.shared_flight import log_digests, require_control, share_truth
@@ -38,7 +38,7 @@ from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
-from testbed.scenario import Scenario, keypath
+from testbed.scenario import Scenario
 from testbed.score import accuracy, metrics
 
 if TYPE_CHECKING:
@@ -247,23 +247,17 @@ def campaign(
     A run that fails is in ``failures`` and stops no other. Raises UserError when anything given is wrong, when ``out``
     can't be written or holds another campaign, or when the scheduler can't be reached.
     """
-    if not isinstance(scenario, str | Path):
-        raise UserError(f"campaign: give the file or the name of a scenario, not {type(scenario).__name__}")
-    if isinstance(overrides, Mapping):
-        overrides = [keypath.override(*one) for one in overrides.items()]
-    varied = {key: _written(key, listed) for key, listed in (vary or {}).items()}
+    given.require_path("scenario", scenario, "the file or the name of a scenario")
+    if out is not None:
+        given.require_path("out", out, "a folder")
+    runs, draw, workers = given.whole("runs", runs), given.whole("draw", draw), given.crew(workers)
+    varied, overrides = given.varied(vary), given.overrides(overrides)
     folder = usual_folder(scenario, draw) if out is None else Path(out)
     from rich.console import Console
 
     with progress.shown(Console(stderr=True), str(scenario)) as tell:
         plan = Plan(scenario, runs, folder, varied, overrides, draw)
         return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
-
-
-def _written(key: str, listed: Any) -> Sequence[str]:
-    if isinstance(listed, str) or not isinstance(listed, Iterable):
-        raise UserError(f"vary {key}: {shown(str(listed))} is one value: give a list of values, such as [0, 5]")
-    return [one if isinstance(one, str) else keypath.as_toml(key, one) for one in listed]
 
 
 def usual_folder(scenario: str | Path, draw: int) -> Path:

@@ -33,7 +33,7 @@ from testbed.report import page as report
 from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score.accuracy import column
-from testbed.score.remarks import not_finite
+from testbed.score.remarks import LOST, not_finite
 
 if TYPE_CHECKING:
     from junitparser import Error, Failure
@@ -220,13 +220,13 @@ def _rounded(value: float) -> float:
 
 
 def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> list[Row]:
-    """Each expected metric beside its bounds. One that is missing, or NaN, exceeds them."""
-    return [
-        Row(
-            key, str(bounds), metrics.get(key), "kept" if bounds.hold(metrics.get(key, math.nan)) else "exceeded", False
-        )
-        for key, bounds in expect.items()
-    ]  # fmt: skip
+    """Each expected metric beside its bounds. One that is missing, or NaN, exceeds them, but for a count of none."""
+    rows = []
+    for key, bounds in expect.items():
+        now = metrics.get(key, 0.0 if key.endswith(LOST) else None)
+        kept = bounds.hold(math.nan if now is None else now)
+        rows.append(Row(key, str(bounds), now, "kept" if kept else "exceeded", False))
+    return rows
 
 
 def against_golden(golden: Mapping[str, float], metrics: Mapping[str, float]) -> list[Row]:

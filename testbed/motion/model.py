@@ -95,7 +95,10 @@ fdm.set_debug_level(0)
 fdm.set_aircraft_path(sys.argv[2])
 fdm.set_engine_path("engine")
 fdm.set_systems_path("systems")
-sys.exit(not fdm.load_model(sys.argv[3]))
+try:
+    sys.exit(not fdm.load_model(sys.argv[3]))
+except jsbsim.BaseError as error:
+    sys.exit(str(error))
 """
 SAID = 40  # last words of JSBSim that are passed on
 
@@ -359,7 +362,7 @@ def _probe(shipped: Path, folder: Path) -> None:
     words = [sys.executable, "-c", PROBE, str(shipped), str(folder.parent), folder.name]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = " ".join((done.stdout + done.stderr).split()[-SAID:]) or "it says nothing"
+        said = " ".join((done.stdout.split() or done.stderr.split())[-SAID:]) or "it says nothing"
         raise UserError(f"{folder / folder.name}.xml: JSBSim can't read it: {said}")
 
 

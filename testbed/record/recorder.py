@@ -72,7 +72,7 @@ class Recorder:
             "Conventions": "CF-1.8",
             "title": scenario.title,
             "scenario": scenario.text,
-            "scenario_path": str(scenario.path or ""),
+            "scenario_path": str(Path(scenario.path).absolute()) if scenario.path else "",  # found from everywhere
             "overrides": json.dumps(scenario.overrides),
             "seed": seed,
             "duration_s": float(scenario.duration_s),

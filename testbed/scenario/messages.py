@@ -7,16 +7,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from testbed.errors import choice, near, short, shown, unknown
-from testbed.estimators import registry
+from testbed.estimators import custom, registry
 from testbed.estimators.federated import LocalSection
 from testbed.estimators.section import DEFAULT_ESTIMATOR
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
-from testbed.schema import Section
 from testbed.sensors import registry as sensor_registry
 
 ERRORS_SHOWN = 20
@@ -34,7 +33,7 @@ class Written(NamedTuple):
     folder: Path
 
 
-def report(error: ValidationError, root: type[Section], written: Written) -> str:
+def report(error: ValidationError, root: type[BaseModel], written: Written) -> str:
     """Every error on a line of its own: file, line, key path, what is wrong and what to do; ``root`` is the whole's."""
     _, text, place, set_paths, _ = written
     said: dict[KeyPath, list[str]] = {}
@@ -63,7 +62,7 @@ def report(error: ValidationError, root: type[Section], written: Written) -> str
     return "\n".join(told)
 
 
-def _locate(details: ErrorDetails, root: type[Section], written: Written) -> tuple[KeyPath, list[type[Section]]]:
+def _locate(details: ErrorDetails, root: type[BaseModel], written: Written) -> tuple[KeyPath, list[type[BaseModel]]]:
     """The key path of an error, and the sections whose keys may stand beside it.
 
     Pydantic's location also names the branch that it took in a union, which is no part of the file's path.
@@ -73,7 +72,7 @@ def _locate(details: ErrorDetails, root: type[Section], written: Written) -> tup
         loc = (*loc, details["ctx"]["discriminator"].strip("'"))
     here: Any = written.data
     path: KeyPath = ()
-    models: list[type[Section]] = [root]
+    models: list[type[BaseModel]] = [root]
     for step in loc[:-1]:
         if isinstance(here, dict) and len(models) > 1 and step in (here.get(key) for key in TAG_KEYS):
             models = [m for m in models if any(step in _tags(m, key) for key in TAG_KEYS)]
@@ -83,7 +82,10 @@ def _locate(details: ErrorDetails, root: type[Section], written: Written) -> tup
             if len(path) == 2 and path[0] == "sensors":
                 models = [sensor_registry.find(here["kind"], written.folder).section]
             elif len(path) == 2 and path[0] == "estimator":
-                models = [registry.find(here.get("kind", DEFAULT_ESTIMATOR)).section]
+                kind = here.get("kind", DEFAULT_ESTIMATOR)
+                models = [registry.find(kind).section]
+                options = custom.options_of(kind, written.folder) if models == [custom.CustomSection] else None
+                models += [options] if options else []
             elif isinstance(step, str):
                 fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
                 models = [model for annotation in fields for model in _sections(annotation)]
@@ -98,18 +100,18 @@ def _holds(here: Any, step: str | int) -> bool:
     return step in here if isinstance(here, dict) else isinstance(here, list) and isinstance(step, int)
 
 
-def _sections(annotation: Any) -> list[type[Section]]:
+def _sections(annotation: Any) -> list[type[BaseModel]]:
     """The sections inside a type annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, Section):
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [section for argument in get_args(annotation) for section in _sections(argument)]
 
 
-def _tags(model: type[Section], key: str) -> tuple[Any, ...]:
+def _tags(model: type[BaseModel], key: str) -> tuple[Any, ...]:
     return get_args(model.model_fields[key].annotation) if key in model.model_fields else ()
 
 
-def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) -> str:
+def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[BaseModel]]) -> str:
     """What is wrong and what to do, in the words of this house."""
     kind, given, context = details["type"], details["input"], details.get("ctx", {})
     match kind:
@@ -152,14 +154,14 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[Section]]) 
     return f"{details['msg'].replace('Input should be', 'must be')}, not {shown(given)}"
 
 
-def _missing(path: KeyPath, models: Sequence[type[Section]]) -> str:
+def _missing(path: KeyPath, models: Sequence[type[BaseModel]]) -> str:
     """That a key has to be added, and what it is."""
     fields = [model.model_fields[key] for model in models for key in path[-1:] if key in model.model_fields]
     what = next((field.description for field in fields if field.description), None)
     return f"{MISSING} ({what})" if what else MISSING
 
 
-def _elsewhere(path: KeyPath, models: Sequence[type[Section]]) -> str:
+def _elsewhere(path: KeyPath, models: Sequence[type[BaseModel]]) -> str:
     """That a key of an estimator is one of other kinds, empty when it is of none."""
     if len(path) != 3 or path[0] != "estimator":
         return ""
@@ -173,5 +175,5 @@ def _elsewhere(path: KeyPath, models: Sequence[type[Section]]) -> str:
     return f"is a key of kind {' or '.join(map(repr, owners))}, not of {here[0]!r}: {todo}"
 
 
-def _keys(models: Sequence[type[Section]]) -> list[str]:
+def _keys(models: Sequence[type[BaseModel]]) -> list[str]:
     return list(dict.fromkeys(key for model in models for key in model.model_fields))

@@ -26,7 +26,7 @@ from pydantic import (
     ValidationInfo,
     model_validator,
 )
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic_core import InitErrorDetails, PydanticCustomError, to_json
 
 from testbed import plugins
 from testbed.data import data_dir
@@ -59,11 +59,14 @@ def _sensor(table: object, info: ValidationInfo) -> Section:
         section = sensor_registry.find(_text(table.get("kind")), folder).section
     except UserError as error:
         raise PydanticCustomError("sensor_kind", "{text}", {"text": str(error)}) from None
-    return section.model_validate(table, strict=True)
+    if table["kind"] in sensor_registry.BUILT_IN:
+        return section.model_validate(table, strict=True)
+    # The user's fields may be lists as well as tuples: what is read as JSON becomes either.
+    return section.model_validate_json(to_json(table), strict=True)
 
 
-def _estimator(table: object) -> EstimatorSection:
-    """One ``[[estimator]]`` table, by its kind."""
+def _estimator(table: object, info: ValidationInfo) -> EstimatorSection:
+    """One ``[[estimator]]`` table, by its kind, with the keys of a class of the user's if that is asked for."""
     if not isinstance(table, dict):
         raise PydanticCustomError("dict_type", "Input should be a table")
     kind = table.get("kind", DEFAULT_ESTIMATOR)
@@ -71,7 +74,17 @@ def _estimator(table: object) -> EstimatorSection:
         section = registry.find(_text(kind)).section
     except UserError as error:
         raise PydanticCustomError("estimator_kind", "{text}", {"text": str(error)}) from None
-    return section.model_validate({**table, "kind": kind}, strict=True)
+    found = section.model_validate({**table, "kind": kind}, strict=True)
+    if isinstance(found, custom.CustomSection) and (folder := (info.context or {}).get("options")) is not None:
+        options = custom.options_of(found.kind, folder)
+        try:
+            if options is not None:
+                options.model_validate(found.options)
+        except ValidationError:
+            raise
+        except Exception as error:  # a validator of the user's
+            raise PydanticCustomError("estimator_kind", "{text}", {"text": plugins.raised(error)}) from None
+    return found
 
 
 def _text(kind: object) -> str:
@@ -207,11 +220,18 @@ class Scenario(Section):
         path = _find(path_or_name)
         if isinstance(overrides, Mapping):
             overrides = [keypath.override(key, value) for key, value in overrides.items()]
-        return cls.parse(_read(path), overrides, path)
+        return cls._parsed(_read(path), overrides, path, {"options": path.parent})
 
     @classmethod
     def parse(cls, text: str, overrides: Sequence[str] = (), path: Path | None = None) -> Scenario:
-        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does."""
+        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does.
+
+        The keys of an estimator of the user's are left to its class, which may be another one by now.
+        """
+        return cls._parsed(text, overrides, path, {})
+
+    @classmethod
+    def _parsed(cls, text: str, overrides: Sequence[str], path: Path | None, context: Mapping[str, Path]) -> Scenario:
         place = str(path) if path else "scenario"
         data = _toml(text, place)
         if not data:
@@ -224,14 +244,11 @@ class Scenario(Section):
             if isinstance(table, dict):
                 table.setdefault("kind", name)
         try:
-            scenario = cls.model_validate(
-                _frozen(data), strict=True, context={"folder": path.parent if path else Path()}
-            )
+            folder = path.parent if path else Path()
+            scenario = cls.model_validate(_frozen(data), strict=True, context={"folder": folder, **context})
         except ValidationError as error:
             raise UserError(
-                messages.report(
-                    error, cls, messages.Written(data, text, place, set_paths, path.parent if path else Path())
-                )
+                messages.report(error, cls, messages.Written(data, text, place, set_paths, folder))
             ) from None
         except RecursionError:
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
@@ -240,13 +257,15 @@ class Scenario(Section):
 
     @classmethod
     def of_record(cls, said: Mapping[Any, Any]) -> Scenario:
-        """The scenario of a record, by the record's attributes; an aircraft in a folder is looked for where it was.
+        """The scenario of a record, by the record's attributes; what is the user's is looked for where it was.
+
+        Where that is older records don't say in full: it is seen from the working folder.
 
         Raises KeyError or ValueError where the attributes are no record's, UserError as `load` does.
         """
         path = str(said.get("scenario_path", ""))
         overrides = json.loads(said.get("overrides", "[]"))
-        return cls.parse(str(said["scenario"]), overrides, Path(path) if path else None)
+        return cls.parse(str(said["scenario"]), overrides, Path(path).absolute() if path else None)
 
     def changed(self, values: Mapping[str, Any]) -> Scenario:
         """The same with further values by key, which belong to it from then on. Raises UserError as `load` does."""

@@ -32,10 +32,11 @@ class Errors:
 
     ``t`` (N,) [s]; ``position`` (N, 3) NED [m]; ``velocity`` (N, 3) NED [m/s]; ``attitude`` (N, 3) phi in n [rad];
     ``angles`` (N, 3) differences of roll, pitch and heading [rad]; ``sigma_*`` (N, 3) what the estimator claimed;
-    ``*_nees`` (N,) normalised squared error over 3, NaN where the covariance is singular; ``aligned_s`` time of
-    alignment, None when never; ``attitude_only`` whether position and velocity are NaN by design; ``nonfinite`` (N,)
-    rows that should be numbers and are not; ``valid`` (N,) rows that count. Of a recorded flight the reference stands
-    for truth: where it is unknown an error is NaN, which is not judged, and its own covariance is part of ``*_nees``.
+    ``*_nees`` (N,) normalised squared error over 3, NaN where the covariance is unknown or not positive definite;
+    ``aligned_s`` time of alignment, None when never; ``attitude_only`` whether position and velocity are NaN by design;
+    ``nonfinite`` (N,) rows that should be numbers and are not; ``valid`` (N,) rows that count. A position or a velocity
+    that is never told is NaN in all of them, and not judged. Of a recorded flight the reference stands for truth: where
+    it is unknown an error is NaN, which is not judged, and its own covariance is part of ``*_nees``.
     """
 
     t: Array
@@ -134,13 +135,15 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     covariance = estimated("covariance")
     status = column(dataset, f"{own}/status")[rows]
     aligned = (status & Status.ALIGNED) != 0
-    attitude_only = bool(np.any(aligned & ((status & Status.ATTITUDE_ONLY) != 0)))
-    judged = slice(6 if attitude_only else 0, 9)
-    said = np.column_stack([estimated(name) for name in ("lat", "lon", "h", "v_n", "q_nb")])
-    finite = np.isfinite(said[:, 6 if attitude_only else 0 :]).all(axis=1)
-    claimed = np.isfinite(covariance[:, judged, judged]).all(axis=(1, 2))
-    if claimed.any():  # one that never claims a covariance is judged by its errors alone
-        finite &= claimed
+    whole = aligned & ((status & Status.ATTITUDE_ONLY) == 0)
+    attitude_only = bool(aligned.any() and not whole.any())
+    finite = np.asarray(np.isfinite(estimated("q_nb")).all(axis=1))
+    # An attitude may be known before a position is; what is left out throughout was never claimed.
+    begun = np.logical_or.accumulate(whole)
+    for said in (np.column_stack([estimated(name) for name in ("lat", "lon", "h")]), estimated("v_n")):
+        known = np.asarray(np.isfinite(said).all(axis=1))
+        if known[aligned].any():
+            finite &= known | ~begun
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
     settled = since if aligned_s is None else t >= aligned_s + settling_s
     own_n = np.array(json.loads(dataset.attrs.get("reference_sigma_n", "[0, 0, 0, 0, 0, 0]"))) ** 2
@@ -208,10 +211,11 @@ def wrapped(angle: Array) -> Array:
 
 
 def nees(error: Array, covariance: Array) -> Array:
-    """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) of covariances (N, n, n), NaN where singular.
+    """Normalised squared error e' P^-1 e / n (N,) of errors (N, n) of covariances (N, n, n).
 
     With the correlations C = L diag(d) L' and y = L^-1 of the errors over their sigmas it is the mean of y^2 / d: for
-    all N at once, where a library would solve one after the other.
+    all N at once, where a library would solve one after the other. NaN where the covariance is singular, or not
+    positive definite: then some d is not positive.
     """
     n = error.shape[1]
     L: dict[tuple[int, int], Array] = {}
@@ -229,7 +233,7 @@ def nees(error: Array, covariance: Array) -> Array:
             y.append(y_i)
             d.append(d_i)
         result: Array = sum(y_i**2 / d_i for y_i, d_i in zip(y, d, strict=True)) / n
-    result[~(np.isfinite(result) & (np.prod(d, axis=0) > SINGULAR))] = np.nan
+    result[~(np.isfinite(result) & (np.min(d, axis=0) > 0) & (np.prod(d, axis=0) > SINGULAR))] = np.nan
     return result
 
 

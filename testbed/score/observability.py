@@ -3,7 +3,8 @@
 The filters are built from the run's scenario as they were for it. Truth gives the motion; the record says which
 measurements each of them used (`UpdateReport`): what was not used, in an outage, out of a transponder's range, or as
 its sensor was faulty or isolated, shows nothing here either. See `nav.observability.visibility`, whose prior is the
-estimator's own 1-sigma once aligned.
+estimator's own 1-sigma once aligned. Nobody knows what samples a sensor of the user's would give here: what those show
+of the states is left out.
 
 A federated filter is judged as one filter with the common states and the aids of all its locals: by what can be seen
 at all. What one local filter sees of its own is less.
@@ -62,6 +63,7 @@ from testbed.estimators.outside import OutsideSection
 from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
 from testbed.score.accuracy import column
+from testbed.sensors.custom import is_own_aid
 
 if TYPE_CHECKING:
     import xarray
@@ -197,6 +199,7 @@ def _of_filter(
     parts = [
         (sensor, aid, part[0], _used(dataset, name, way.t, part, sensor))
         for sensor, aid in aids.items()
+        if not is_own_aid(aid)
         for part in aid.parts
     ]
     accuracy: dict[str, tuple[Array, Array] | None] = {

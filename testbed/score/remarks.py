@@ -49,6 +49,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *_refusing(dataset),
         *unfinished_leg(dataset),
         *_impossible(dataset),
+        *_unjudged(dataset),
         *astray.values(),
         *_overconfident(dataset, metrics, trusted),
     ]
@@ -97,6 +98,30 @@ def _impossible(dataset: xarray.DataTree) -> Iterator[str]:
             yield (
                 f"{name} claims a variance of 0 or below in {rows.sum()} of {aligned.sum()} estimates ({which}): no "
                 f"NEES and no 3 σ there"
+            )
+
+
+def _unjudged(dataset: xarray.DataTree) -> Iterator[str]:
+    """Whose covariances give no NEES though all their variances are positive, or end before the estimates do."""
+    for name in accuracy.names(dataset):
+        own = f"estimators/{name}"
+        status, covariance = (accuracy.column(dataset, f"{own}/{what}") for what in ("status", "covariance"))
+        aligned = (status & Status.ALIGNED) != 0
+        positive = (np.diagonal(covariance, axis1=1, axis2=2) > 0) & aligned[:, None]
+        for k, what in enumerate(("position", "velocity", "attitude")):
+            block = slice(3 * k, 3 * k + 3)
+            known = positive[:, block].all(axis=1)
+            unformed = np.isnan(accuracy.nees(np.zeros((len(known), 3)), covariance[:, block, block])) & known
+            if unformed.any():
+                yield (
+                    f"{name} claims a covariance of {what} that is not positive definite in {unformed.sum()} of "
+                    f"{aligned.sum()} estimates: no NEES there"
+                )
+        told = np.isfinite(accuracy.column(dataset, f"{own}/q_nb")).all(axis=1) & aligned
+        silent = told & ~np.isfinite(covariance[:, 6:, 6:]).all(axis=(1, 2))
+        if silent.any() and (told & ~silent).any():
+            yield (
+                f"{name} claims no covariance in {silent.sum()} of {aligned.sum()} estimates: no NEES and no 3 σ there"
             )
 
 

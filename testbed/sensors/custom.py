@@ -4,9 +4,11 @@ run with its name and why.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Iterable
+from functools import cache
 from numbers import Real
 from typing import Any, cast
 
@@ -43,7 +45,7 @@ def made(name: str, section: Section, *given: Any) -> Any:
 def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any:
     """What a sensor of the user's says that it is to filters, None where nothing. Raises UserError where no aid.
 
-    One of a class of the user's is guarded, one of `nav.aids`, or made of one, is what it is.
+    One of a class of the user's is guarded, also where that is made of one of `nav.aids`; one of these is what it is.
     """
     try:
         found = maker(name, section, imu)
@@ -58,13 +60,53 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
         raise UserError(f"{_called(name, section)}: aid gave {_type(found)}, which lacks {', '.join(missing)}")
     if found.sensor != name:
         raise UserError(f"{_called(name, section)}: aid gave one of sensor {shown(found.sensor)}, not {shown(name)}")
-    return found if _is_ours(found) else AidGuard(name, section, found)
+    if _is_ours(type(found)):
+        return found
+    if any(map(_is_ours, type(found).__mro__)):
+        return _as_made(found, getattr(section, "kind", ""))
+    return AidGuard(name, f"{_called(name, section)}: aid", found)
 
 
-def _is_ours(aid: Any) -> bool:
-    """Whether it is one of `nav.aids`, or made of one, which filters know by its class."""
-    bases = {one.__module__ for one in type(aid).__mro__} - {nav.aids.base.__name__}
-    return any(module.startswith(f"{nav.aids.__name__}.") for module in bases)
+def is_own_aid(aid: Any) -> bool:
+    """Whether an aid is of a class of the user's."""
+    return not _is_ours(type(aid))
+
+
+def _is_ours(kind: type) -> bool:
+    """Whether a class is one of `nav.aids`, which filters know."""
+    return kind.__module__.startswith(f"{nav.aids.__name__}.") and kind.__module__ != nav.aids.base.__name__
+
+
+def _as_made(found: Any, of: str) -> Any:
+    """A copy of an aid made of one of ours, guarded as `AidGuard` does, which filters still know by its class."""
+    kind: Any = type(found)
+    guarded = copy.copy(found)
+    object.__setattr__(guarded, "__class__", _guarding(kind, of))  # it may be frozen
+    return guarded
+
+
+@cache
+def _guarding(kind: Any, of: str) -> type:
+    """The guarded class of a class made of one of ours, which the sensor's kind gives: one, as filters compare them.
+
+    What takes the place of `measure` where it is ours is off: no kernel knows what the user's measures.
+    """
+
+    class Guarded(kind):  # type: ignore[misc]
+        __slots__ = ()
+        plain = None
+
+        def blocks(self) -> list[Block]:
+            return _blocks(f"sensor {self.sensor}: {of}: aid", super().blocks)
+
+        def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
+            called = f"sensor {self.sensor}: {of}: aid"
+            return _measured(called, dict(self.parts)[part], super().measure, part, sample, at)
+
+        def at_points(self, *_: Any) -> None:  # one by one
+            return None
+
+    return Guarded
 
 
 class AidGuard:
@@ -73,39 +115,52 @@ class AidGuard:
     Raises UserError where it gives anything else, or raises.
     """
 
-    def __init__(self, name: str, section: Section, own: Any) -> None:
-        self.sensor, self._called, self._aid = name, f"{_called(name, section)}: aid", own
+    def __init__(self, name: str, called: str, own: Any) -> None:
+        self.sensor, self._called, self._aid = name, called, own
         try:
             self.parts: tuple[tuple[str, int], ...] = tuple((str(part), int(axes)) for part, axes in own.parts)
             self.states: tuple[str, ...] = tuple(map(str, own.states))
         except (TypeError, ValueError):
             given = f"parts = {shown(str(own.parts))} and states = {shown(str(own.states))}"
-            raise UserError(f"{self._called}: {given}: give pairs of a name and its axes, and names") from None
+            raise UserError(f"{called}: {given}: give pairs of a name and its axes, and names") from None
 
     def blocks(self) -> list[Block]:
         """Its error states."""
-        found = self._asked("blocks")
-        if not (isinstance(found, list) and all(isinstance(one, Block) for one in found)):
-            raise UserError(f"{self._called}: blocks gave {shown(str(found))}: give a list of nav.error_model.Block")
-        return found
+        return _blocks(self._called, self._aid.blocks)
 
     def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
         """One part of a sample."""
-        given = self._asked("measure", part, sample, at)
-        if given is None:
-            return None
-        if wrong := _no_measurement(given, dict(self.parts)[part], len(at.x)):
-            raise UserError(f"{self._called}: measure gave {wrong} of {shown(part)} at {sample.t:g} s")
-        nu, H, R = (np.array(numbers, dtype=float) for numbers in (given.nu, given.H, given.R))
-        return cast("Measurement", given._replace(nu=nu, H=H, R=R))
+        return _measured(self._called, dict(self.parts)[part], self._aid.measure, part, sample, at)
 
-    def _asked(self, method: str, *given: Any) -> Any:
-        try:
-            return getattr(self._aid, method)(*given)
-        except UserError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise UserError(f"{self._called}: {plugins.raised(error)}") from error
+
+def _blocks(called: str, ask: Callable[[], Any]) -> list[Block]:
+    """The error states that an aid gives."""
+    found = _asked(called, ask)
+    if not (isinstance(found, list) and all(isinstance(one, Block) for one in found)):
+        raise UserError(f"{called}: blocks gave {shown(str(found))}: give a list of nav.error_model.Block")
+    return found
+
+
+def _measured(
+    called: str, axes: int, ask: Callable[..., Any], part: str, sample: Any, at: OperatingPoint
+) -> Measurement | None:
+    """What an aid makes of one part of a sample."""
+    given = _asked(called, ask, part, sample, at)
+    if given is None:
+        return None
+    if wrong := _no_measurement(given, axes, len(at.x)):
+        raise UserError(f"{called}: measure gave {wrong} of {shown(part)} at {sample.t:g} s")
+    nu, H, R = (np.array(numbers, dtype=float) for numbers in (given.nu, given.H, given.R))
+    return cast("Measurement", given._replace(nu=nu, H=H, R=R))
+
+
+def _asked(called: str, ask: Callable[..., Any], *given: Any) -> Any:
+    try:
+        return ask(*given)
+    except UserError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise UserError(f"{called}: {plugins.raised(error)}") from error
 
 
 def _no_measurement(given: Any, axes: int, states: int) -> str:
@@ -121,7 +176,7 @@ def _no_measurement(given: Any, axes: int, states: int) -> str:
             return f"{what} of shape {numbers.shape}, not {shape},"
         if not np.isfinite(numbers).all():
             return f"{what} = {numbers.tolist()}"
-    return "" if (np.asarray(given.R) >= 0).all() else f"variances R = {np.asarray(given.R).tolist()}"
+    return "" if (np.asarray(given.R) > 0).all() else f"variances R = {np.asarray(given.R).tolist()}, not above 0,"
 
 
 class Guard:

@@ -4,6 +4,7 @@ import json
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ MINE = """
 import sys
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, field_validator
 from nav.samples import Estimate, GnssSample
 
 
@@ -32,6 +33,13 @@ class Mine:
         model_config = ConfigDict(extra="forbid")
         after_s: float = 1e9
         how: str = "raise"
+
+        @field_validator("how")
+        @classmethod
+        def _known(cls, how):
+            if how == "spoilt":
+                raise ValueError("there is no such way")
+            return how if how != "divide" else 1 / 0
 
     def __init__(self, rig, after_s, how):
         self.t, self.fix, self.after_s, self.how, self.times = 0.0, None, after_s, how, []
@@ -195,6 +203,7 @@ def test_an_estimate_is_made_of_what_is_given() -> None:
         ("inss", "did you mean ins?"),
         ("./none.py:Mine", "can't be read: No such file or directory: a path is relative to the scenario file"),
         ("./filters.py:Mind", 'there is no class in ./filters.py "Mind": did you mean Mine?'),
+        ("./filters.py:Nope", 'there is no class in ./filters.py "Nope": choose from Mine, Bare'),
         ("nowhere.filters:Mine", "there is no module nowhere.filters: install it, or give its file, such as"),
         ("./filters.py:Bare", "./filters.py:Bare lacks propagate, update, estimate"),
         ("math:pi", "math:pi can't be made: TypeError"),
@@ -210,8 +219,10 @@ def test_what_is_wrong_with_a_kind_is_said(folder: Path, kind: str, says: str) -
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"after": 3}, "estimator mine: after: unknown key: did you mean after_s?"),
-        ({"after_s": "soon"}, "estimator mine: after_s: "),
+        ({"after": 3}, "own.toml (--set estimator[1].after=3): estimator[1].after: unknown key: did you mean after_s?"),
+        ({"after_s": "soon"}, "estimator[1].after_s: must be a valid number"),
+        ({"how": "spoilt"}, "estimator[1].how: there is no such way"),
+        ({"how": "divide"}, "ZeroDivisionError: division by zero (filters.py, line"),
         ({"aids": ["gnss2"]}, 'there is no sensor "gnss2"'),
         ({"imu": "gnss"}, 'there is no IMU "gnss"'),
     ],
@@ -220,6 +231,20 @@ def test_what_is_wrong_with_its_keys_is_said(folder: Path, options: dict[str, ob
     with pytest.raises(UserError) as told:
         flown(folder, **options)
     assert says in str(told.value)
+
+
+def test_all_that_is_wrong_with_its_keys_is_said_with_its_line(folder: Path) -> None:
+    text = (folder / "own.toml").read_text("utf-8").replace("seed = 1", "seeds = 1", 1)
+    (folder / "wrong.toml").write_text(f"{text}after = 3\nafter_s = 'soon'\nhow = 3\n", "utf-8")
+    first = text.count("\n") + 1
+    with pytest.raises(UserError) as told:
+        Scenario.load(folder / "wrong.toml")
+    *others, after, after_s, how = str(told.value).splitlines()
+    assert any("seeds: unknown key" in one for one in others)
+    assert after.startswith(f"{folder}/wrong.toml:{first}: estimator[1].after: unknown key: did you mean after_s?")
+    assert after_s.startswith(f"{folder}/wrong.toml:{first + 1}: estimator[1].after_s: must be a valid number")
+    assert how.startswith(f"{folder}/wrong.toml:{first + 2}: estimator[1].how: must be")
+    Scenario.parse(text.replace("seeds", "seed") + "after = 3\n", [], folder / "wrong.toml")  # as of a record
 
 
 def test_a_file_that_does_not_run_says_where(tmp_path: Path) -> None:
@@ -276,3 +301,21 @@ def test_external() -> None:
     print(result.metrics)
     assert result.metrics["own.position_horizontal_rms_m"] < 10.0
     assert not [one for one in result.remarks if "has ended" in one]
+
+
+@pytest.mark.ci
+def test_garbage_of_an_external_program_is_shown() -> None:
+    program = "import sys\nfor line in sys.stdin:\n if line == 'estimate\\n': print('oops', flush=True)"
+    result, _ = example("external.py", "External", command=[sys.executable, "-c", program])
+    (ended,) = [one for one in result.remarks if "has ended" in one]
+    assert "RuntimeError: the program has answered 'oops\\n' (external.py, line " in ended
+
+
+@pytest.mark.ci
+def test_an_external_program_that_hangs_does_not_outlive_the_run() -> None:
+    made = plugins.load("./external.py:External", EXAMPLES, "none")
+    own = made(SimpleNamespace(folder=EXAMPLES), [sys.executable, "-c", "import time; time.sleep(100)"])
+    program = own.program
+    own.tell("barometer", 0.0, 1e5)
+    del own
+    assert program.returncode is not None

@@ -16,7 +16,9 @@ from testbed.record import columns
 from testbed.record.reader import load
 from testbed.score.accuracy import column
 
+TICK_S = 0.005
 IMU = ImuSamples(np.array([1.0]), np.array([0.01]), np.zeros((1, 3)), np.zeros((1, 3)))
+LATER = dataclasses.replace(IMU, t=np.array([2.0]))
 SAMPLE = BarometerSample(1.0, 1.0, 1e5)
 SOUND = Estimate.of(1.0, q_nb=np.array([1.0, 0, 0, 0]), lla=np.zeros(3), v_n=np.ones(3), covariance=np.eye(9))
 REPORT = UpdateReport(1.0, "gnss", "gnss_position", np.zeros(3), np.eye(3), 1.0, 10.0, 1.0, Outcome.FUSED)
@@ -38,12 +40,12 @@ class Giving:
 
 
 def told(**changes: Any) -> tuple[Estimate, str]:
-    adapter = Adapter(Giving(dataclasses.replace(SOUND, **changes)))
+    adapter = Adapter(Giving(dataclasses.replace(SOUND, **changes)), TICK_S)
     return adapter.estimate(), adapter.failure
 
 
 def reported(given: Any) -> tuple[list[UpdateReport], str]:
-    adapter = Adapter(Giving(reports=given))
+    adapter = Adapter(Giving(reports=given), TICK_S)
     return adapter.update(SAMPLE), adapter.failure
 
 
@@ -64,6 +66,9 @@ def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
         ({"v_n": [[1.0], [2.0, 3.0]]}, "estimate: v_n is a list, not an array of numbers"),
         ({"v_n": np.ones((3, 1))}, "estimate: v_n has shape (3, 1), not (3,)"),
         ({"covariance": np.eye(6)}, "estimate: covariance has shape (6, 6), not (9, 9)"),
+        ({"lat": 47.0}, "estimate: lat is 47: latitude and longitude are in radians"),
+        ({"lon": -8.0}, "estimate: lon is -8: latitude and longitude are in radians"),
+        ({"covariance": np.triu(np.ones((9, 9)))}, "estimate: covariance is not symmetric: give 0.5 * (P + P.T)"),
         ({"q_nb": np.zeros(4)}, "estimate: q_nb has length 0, not 1"),
         ({"q_nb": 2 * SOUND.q_nb}, "estimate: q_nb has length 2, not 1"),
         ({"status": None}, "estimate: status is None, not a nav.samples.Status"),
@@ -105,6 +110,49 @@ def test_what_only_has_another_type_is_taken() -> None:
 def test_unknown_is_no_mistake() -> None:
     for changes in ({"q_nb": np.full(4, np.nan)}, {"lat": np.nan}, {"covariance": np.full((9, 9), np.nan)}):
         assert told(**changes)[1] == ""
+
+
+def test_a_covariance_may_be_rounded() -> None:
+    rounded = np.diag(np.logspace(-6, 6, 9))
+    rounded[0, 8] = 1e-4  # of a correlation
+    assert told(covariance=rounded)[1] == ""
+    assert told(covariance=-rounded)[1] == ""  # which a remark says
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        (lambda a: a.estimate(), "estimate is of 1 s, not of 2 s, the end of the last increment"),
+        (lambda a: a.predict(LATER), "estimate is of 1 s, not of 2 s, the end of the last increment"),
+    ],
+)
+def test_an_estimate_of_another_time_is_named(asked: Callable[[Adapter], Any], says: str) -> None:
+    """A state of the past was judged as if it were of now, though it said so."""
+    adapter = Adapter(Giving(), TICK_S)
+    adapter.propagate(IMU)
+    assert adapter.estimate().status & Status.ALIGNED
+    adapter.propagate(LATER)
+    asked(adapter)
+    assert adapter.failure == says
+
+
+def test_a_prediction_is_of_the_end_of_its_increments() -> None:
+    class Predicting(Giving):
+        def predict(self, imu: ImuSamples) -> Any:
+            return self.given
+
+    adapter = Adapter(Predicting(), TICK_S)
+    adapter.propagate(IMU)
+    adapter.predict(LATER)
+    assert adapter.failure == "predict is of 1 s, not of 2 s, the end of the last increment"
+
+
+def test_the_time_may_be_unknown_or_a_tick_off_or_any_before_alignment() -> None:
+    for changes in ({"t": np.nan}, {"t": 0.995}, {"t": 1.005}, {"t": 0.0, "status": Status.ALIGNING}):
+        adapter = Adapter(Giving(dataclasses.replace(SOUND, **changes)), TICK_S)
+        adapter.propagate(IMU)
+        adapter.estimate()
+        assert adapter.failure == ""
 
 
 @pytest.mark.parametrize(
@@ -159,7 +207,7 @@ def test_the_names_of_all_dimensions_are_taken() -> None:
 
 def test_lengths_stay_as_they_were() -> None:
     inner = Giving(dataclasses.replace(SOUND, extra={"b": pair(2)}), REPORT)
-    adapter = Adapter(inner)
+    adapter = Adapter(inner, TICK_S)
     adapter.update(SAMPLE)
     inner.reports = dataclasses.replace(REPORT, innovation=np.empty(0), S=np.empty((0, 0)))  # refused before
     adapter.update(SAMPLE)
@@ -167,7 +215,7 @@ def test_lengths_stay_as_they_were() -> None:
     inner.reports = dataclasses.replace(REPORT, innovation=np.zeros(2), S=np.eye(2))
     adapter.update(SAMPLE)
     assert adapter.failure == "update: a report's innovation of gnss_position has 2 numbers, and had 3 before"
-    adapter = Adapter(inner)
+    adapter = Adapter(inner, TICK_S)
     adapter.estimate()
     inner.given = dataclasses.replace(SOUND, extra={"b": pair(1)})
     adapter.estimate()
@@ -199,7 +247,7 @@ ASKED: list[Callable[[Adapter], Any]] = [
 @pytest.mark.parametrize("ask", ASKED)
 @pytest.mark.parametrize("error", [RuntimeError("no"), SystemExit(3), GeneratorExit("no")])
 def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any], error: BaseException) -> None:
-    adapter = Adapter(Raising(error))
+    adapter = Adapter(Raising(error), TICK_S)
     ask(adapter)
     assert adapter.failure.startswith(f"{type(error).__name__}: {error} (test_given.py, line")
     assert not adapter.listening
@@ -207,7 +255,7 @@ def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any]
 
 
 def test_what_it_raises_is_told_on_one_line() -> None:
-    adapter = Adapter(Raising(ValueError("two\nlines, one \x1b[31mred")))
+    adapter = Adapter(Raising(ValueError("two\nlines, one \x1b[31mred")), TICK_S)
     adapter.predict(IMU)
     assert adapter.failure.startswith(r"ValueError: two\nlines, one \x1b[31mred (test_given.py, line")
 
@@ -219,7 +267,7 @@ def test_a_method_that_cant_be_called_so_is_named() -> None:
         def update(self) -> None:  # type: ignore[override]
             ...
 
-    adapter = Adapter(Short())
+    adapter = Adapter(Short(), TICK_S)
     adapter.update(SAMPLE)
     assert adapter.failure.startswith("TypeError: ")
     assert adapter.failure.endswith("Short.update() takes 1 positional argument but 2 were given")
@@ -227,7 +275,7 @@ def test_a_method_that_cant_be_called_so_is_named() -> None:
 
 def test_who_stops_the_run_stops_it() -> None:
     with pytest.raises(KeyboardInterrupt):
-        Adapter(Raising(KeyboardInterrupt())).listening  # noqa: B018
+        Adapter(Raising(KeyboardInterrupt()), TICK_S).listening  # noqa: B018
 
 
 UNUSUAL = """

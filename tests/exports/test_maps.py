@@ -179,3 +179,4 @@ def test_toolboxes_need_inertial_samples(tmp_path: Path) -> None:
 def test_each_format_says_who_reads_it() -> None:
     assert set(FORMATS) >= {"csv", "mat", "ulg", "bin", "mcap", "kml", "czml", "gpx", "pos", "navego", "psins"}
     assert all(one.holds and one.readers for one in FORMATS.values())
+    assert len({one.ending for one in FORMATS.values()}) == len(FORMATS)  # none takes another's place

@@ -638,6 +638,29 @@ def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"vary": {"sensors.gnss.rate_hz": np.array(5.0)}}, '"5.0" is one value: give a list of values'),
+        ({"vary": [1, 2]}, "vary: give lists of values by key, such as .*, not list"),
+        ({"vary": {3: [1]}}, "vary: a key is a text, not 3"),
+        ({"overrides": 3}, "overrides: give values by key, such as .*, not 3"),
+        ({"overrides": "duration_s=3"}, "overrides: give values by key, such as .*, not .duration_s=3"),
+        ({"overrides": [3]}, "overrides: give values by key, such as .*, not list"),
+        ({"overrides": {3: 4}}, "overrides: a key is a text, not 3"),
+        ({"runs": "2"}, 'runs: give a whole number, not "2"'),
+        ({"runs": 2.0}, r"runs: give a whole number, not 2\.0"),
+        ({"draw": None}, "draw: give a whole number, not NoneType"),
+        ({"workers": 1.5}, r"workers: give a whole number, not 1\.5"),
+        ({"out": 3}, "out: give a folder, not int"),
+    ],
+)
+def test_what_is_of_no_such_type_is_told(at_rest: Path, tmp_path: Path, wrong: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        campaign(at_rest, **{"runs": 1, "out": tmp_path / "out", **wrong})
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
     ("vary", "message"),
     [
         ({"seed": ["1", "2"]}, "use --runs"),

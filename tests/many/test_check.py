@@ -126,6 +126,12 @@ def test_judge() -> None:
     assert [row.verdict for row in judge(expect, {"a": float("nan"), "b": 2.0, "c": 0})] == ["exceeded", "kept", "kept"]
 
 
+def test_a_count_of_lost_estimates_that_is_missing_is_none() -> None:
+    """Who allows for a filter that may turn NaN failed where it did not."""
+    (row,) = judge({"mine.nonfinite_samples": Bounds(max=100.0)}, {"mine.aligned_s": 1.0})
+    assert (row.verdict, row.now) == ("kept", 0.0)
+
+
 # --- golden files
 
 

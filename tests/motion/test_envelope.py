@@ -89,6 +89,25 @@ def test_a_model_that_jsbsim_cannot_fly_is_told(mine: Path) -> None:
         Aircraft(str(mine), 200.0)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("</fdm_config>", "", "line {last} XML parse error: no element found"),
+        ("<metrics>", "<metric>", "line {metrics} XML parse error: mismatched tag"),
+    ],
+)
+def test_a_damaged_model_is_told_in_jsbsim_s_words(mine: Path, old: str, new: str, says: str) -> None:
+    """A traceback's text stood there."""
+    model = mine / "mine.xml"
+    text = model.read_text("utf-8")
+    model.write_text(text.replace(old, new), "utf-8")
+    with pytest.raises(UserError) as told:
+        Aircraft(str(mine), 200.0)
+    last = text.count("\n") + 1
+    at = says.format(last=last, metrics=text[: text.index("</metrics>")].count("\n") + 1)
+    assert str(told.value) == f"{model}: JSBSim can't read it: In file {model}: {at}"
+
+
 def test_a_folder_is_seen_from_the_scenario_file(mine: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "scenario.toml"
     file.write_text(SCENARIO.format(aircraft="./mine"))
@@ -101,6 +120,7 @@ def test_a_folder_is_seen_from_the_scenario_file(mine: Path, tmp_path: Path, mon
     assert Scenario.of_record(said).truth == scenario.truth
     monkeypatch.chdir(tmp_path)
     assert Scenario.parse(scenario.text).truth == scenario.truth
+    assert Scenario.of_record({**said, "scenario_path": file.name}).truth == scenario.truth  # of an older record
     shutil.rmtree(mine)
     with pytest.raises(UserError, match=r'truth\.aircraft: there is no aircraft "./mine".* path of its folder'):
         Scenario.of_record(said)

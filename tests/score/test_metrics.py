@@ -18,7 +18,7 @@ from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
 from nav.columns import Estimates
-from nav.samples import NO_SENSOR, FixType, GnssSample, Outcome
+from nav.samples import NO_SENSOR, FixType, GnssSample, Outcome, Status
 from testbed import Scenario
 from testbed import run as fly
 from testbed.errors import UserError
@@ -153,6 +153,9 @@ def test_nees_is_the_quadratic_form_and_nan_where_singular() -> None:
     assert np.isnan(accuracy.nees(e[:1], np.zeros((1, 3, 3)))).all()
     assert np.isnan(accuracy.nees(e[:1], np.ones((1, 3, 3)))).all()
     assert np.isnan(accuracy.nees(e[:1], np.full((1, 3, 3), np.nan))).all()
+    indefinite = np.array([[1.0, 2.0, 2.0], [2.0, 1.0, 4.5], [2.0, 4.5, 1.0]])  # of two negative pivots
+    assert np.linalg.det(indefinite) > 0
+    assert np.isnan(accuracy.nees(e[:1], indefinite[None])).all()
 
 
 def test_consistent_errors_give_one_and_overconfident_ones_their_square() -> None:
@@ -411,6 +414,48 @@ def test_nothing_counts_before_alignment_and_settling(computed: dict[str, float]
 def test_settling_time_can_be_chosen() -> None:
     run = synthetic_run.dataset(30.0)
     assert "ins.position_horizontal_rms_m" in metrics.compute(run, settling_s=1.0)
+
+
+def test_an_attitude_before_a_position_does_not_make_it_one_of_attitude_only() -> None:
+    """One row of attitude alone took position and velocity out of all scores."""
+    run = synthetic_run.dataset(100.0)
+    own = run["estimators/ins"]
+    first = (own["time"].values >= 5.0) & (own["time"].values < 8.0)
+    own["status"].values[first] |= Status.ATTITUDE_ONLY
+    for name in ("lat", "lon", "h", "v_n"):
+        own[name].values[first] = np.nan
+    found = metrics.compute(run)
+    assert found["ins.aligned_s"] == 5.0
+    assert found["ins.position_horizontal_rms_m"] == pytest.approx(2**0.5, rel=0.2)
+    assert "ins.nonfinite_samples" not in found
+    last = own["time"].values >= 95.0  # a position that is lost again is missing
+    own["status"].values[last] |= Status.ATTITUDE_ONLY
+    own["lat"].values[last] = np.nan
+    assert metrics.compute(run)["ins.nonfinite_samples"] == last.sum()
+
+
+def test_errors_are_judged_without_a_covariance() -> None:
+    """A covariance that ends took the errors with it, and the estimates were called not finite."""
+    run = synthetic_run.dataset(130.0)
+    whole = metrics.compute(run)
+    own = run["estimators/ins"]
+    late = own["time"].values >= 80.0
+    for name in ("covariance", "sigma_position_n", "sigma_velocity_n", "sigma_attitude_n"):
+        own[name].values[late] = np.nan
+    found = metrics.compute(run)
+    assert "ins.nonfinite_samples" not in found
+    assert found["ins.position_horizontal_rms_m"] == whole["ins.position_horizontal_rms_m"]
+    assert found["ins.position_nees_mean"] != whole["ins.position_nees_mean"]
+
+
+def test_what_is_left_out_throughout_is_not_missing() -> None:
+    run = synthetic_run.dataset(100.0)
+    whole = metrics.compute(run)
+    run["estimators/ins/v_n"].values[:] = np.nan
+    found = metrics.compute(run)
+    gone = {key for key in whole if ".velocity" in key and "bound" not in key}
+    assert found == {key: value for key, value in whole.items() if key not in gone}
+    assert len(gone) > 10
 
 
 def test_estimates_that_turn_nan_are_counted_not_averaged() -> None:

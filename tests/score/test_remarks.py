@@ -110,6 +110,19 @@ def test_a_few_large_innovations_tell_nothing() -> None:
     assert doubts(run, metrics.compute(run)) == []
 
 
+def test_covariances_that_give_no_nees_are_told() -> None:
+    """An indefinite one gave none without a word, or a negative one; one that ended was not missed."""
+    run = flown()
+    covariance = accuracy.column(run, "estimators/other/covariance")
+    covariance[-100:, 0, 1] = covariance[-100:, 1, 0] = 2.0 * covariance[-100:, 0, 0]
+    text = f"other claims a covariance of position that is not positive definite in 100 of {len(covariance)} estimates"
+    assert doubts(run, metrics.compute(run)) == [f"{text}: no NEES there"]
+    covariance[-50:] = np.nan
+    assert doubts(run, metrics.compute(run))[1:] == [
+        f"other claims no covariance in 50 of {len(covariance)} estimates: no NEES and no 3 σ there"
+    ]
+
+
 @pytest.mark.parametrize(("variance", "told"), [(1.0, False), (np.nan, False), (0.0, True), (-1.0, True)])
 def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> None:
     """Of those there is no NEES, nor what is judged against three sigma. NaN claims none."""
@@ -120,8 +133,8 @@ def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> N
         f"other claims a variance of 0 or below in 100 of {len(covariance)} estimates (north position, down attitude): "
         "no NEES and no 3 σ there"
     )
-    unscored = "other: 100 estimates since its alignment are not finite, and not scored"
-    assert doubts(run, metrics.compute(run)) == ([unscored] * bool(np.isnan(variance)) + [text] * told)
+    silent = f"other claims no covariance in 100 of {len(covariance)} estimates: no NEES and no 3 σ there"
+    assert doubts(run, metrics.compute(run)) == ([silent] * bool(np.isnan(variance)) + [text] * told)
 
 
 def test_an_estimator_of_attitude_alone_claims_no_position() -> None:

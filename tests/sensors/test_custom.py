@@ -1,5 +1,6 @@
 """Anybody's sensor: found, sensed, recorded, and aiding the filters."""
 
+import dataclasses
 import pickle
 import re
 import shutil
@@ -13,6 +14,7 @@ from nav.aids import GnssAid
 from nav.aids.base import Aid
 from testbed import Scenario, run
 from testbed.errors import UserError
+from testbed.report import page as report
 from testbed.sensors import custom, registry
 from testbed.sensors.magnetometer import MagnetometerConfig
 
@@ -22,6 +24,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from pydantic import Field
 
+from nav.earth import isa_pressure
+from nav.samples import BarometerSample
+from nav.aids import BarometerAid
 from nav.aids.base import Measurement
 from testbed.noise import Process, stream
 from testbed.sensors.magnetometer import Magnetometer, MagnetometerConfig
@@ -44,6 +49,8 @@ class Timeless:
 class Radar:
     class Section(AidingTiming):
         noise_m: float = Field(0.5, ge=0, description="1 sigma")
+        beams: list[list[float]] = []
+        arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
         how: str = ""
 
     def __init__(self, name, section, tick_rate_hz, seed):
@@ -115,11 +122,39 @@ class HeightAid:
                 H = np.zeros((1, 3))
             case "aid R":
                 R[0] = -1.0
+            case "aid R0":
+                R[0] = 0.0
             case "aid text":
                 R = ["wide"]
             case "aid lists":
                 nu, H, R = [0], H.tolist(), [1]
         return None if self.how == "aid none" else Measurement(nu, H, R)
+
+
+# made of one of ours: what it measures is wrong by 20, unless it is told otherwise
+class HalfAid(BarometerAid):
+    how = ""
+
+    def measure(self, part, sample, at):
+        found = super().measure(part, sample, at)
+        match type(self).how:
+            case "made raise":
+                return at.no_such_thing
+            case "made nan":
+                return found._replace(nu=np.array([np.nan]))
+        return found._replace(nu=found.nu - 20.0)
+
+
+class Halved(Radar):
+    def sense(self, truth):
+        return [
+            BarometerSample(one.t, one.t_arrival, float(isa_pressure(one.height)), self.name)
+            for one in super().sense(truth)
+        ]
+
+    @staticmethod
+    def aid(name, section, imu):
+        return type("HalfAid", (HalfAid,), {"how": section.how})(name)
 
 
 class Aided(Radar):
@@ -188,6 +223,11 @@ def test_it_is_recorded_with_unit_and_noise(scenario: Path) -> None:
     ("overrides", "says"),
     [
         ({"sensors.radar.noise": 1.0}, "sensors.radar.noise: unknown key: did you mean noise_m?"),
+        ({"sensors.radar.arm_m": [0.0, 1.0]}, "sensors.radar.arm_m[2]: is missing: this item needs one more value"),
+        ({"sensors.radar.beams": [1]}, "sensors.radar.beams[0]: must be a list, not 1"),
+        ({"sensors.radar.beams": [[1.0, "a"]]}, 'sensors.radar.beams[0][1]: must be a number, not "a"'),
+        ({"sensors.radar.beams": [[1.0, float("inf")]]}, "sensors.radar.beams[0][1]: must be a finite number, not inf"),
+        ({"sensors.radar.noise_m": "1"}, 'sensors.radar.noise_m: must be a number, not "1"'),
         ({"sensors.radar.noise_m": -1.0}, "sensors.radar.noise_m: must be greater than or equal to 0"),
         ({"sensors.radar.kind": "./radar.py:Rader"}, 'there is no class in ./radar.py "Rader": did you mean Radar?'),
         ({"sensors.radar.kind": "./radar.py:HeightSample"}, "lacks a Section"),
@@ -198,6 +238,13 @@ def test_what_is_wrong_is_said(scenario: Path, overrides: dict[str, object], say
     with pytest.raises(UserError) as told:
         Scenario.load(scenario, overrides)
     assert says in str(told.value)
+
+
+def test_its_lists_may_be_lists_or_tuples(scenario: Path) -> None:
+    keys = {"sensors.radar.beams": [[1, 0.1], [2.5]], "sensors.radar.arm_m": [0.1, 0.1, 0.2]}
+    own = Scenario.load(scenario, keys).sensors["radar"]
+    assert own.beams == [[1.0, 0.1], [2.5]]
+    assert own.arm_m == (0.1, 0.1, 0.2)
 
 
 def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,7 +313,8 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
         ("aid dict", 'measure gave dict where a Measurement or None was expected of "radar" at '),
         ("aid nan", 'measure gave nu = [nan] of "radar" at '),
         ("aid H", "measure gave H of shape (1, 3), not (1, "),
-        ("aid R", 'measure gave variances R = [-1.0] of "radar" at '),
+        ("aid R", 'measure gave variances R = [-1.0], not above 0, of "radar" at '),
+        ("aid R0", 'measure gave variances R = [0.0], not above 0, of "radar" at '),
         ("aid text", "measure gave R = "),
     ],
 )
@@ -290,8 +338,49 @@ def test_an_aid_made_of_one_of_ours_is_known_as_that() -> None:
         pass
 
     made = custom.aid(lambda *_: Mine("mine"), "mine", MagnetometerConfig(), None)
-    assert type(made) is Mine
+    assert isinstance(made, Mine)
+    assert type(made) is type(custom.aid(lambda *_: Mine("other"), "other", MagnetometerConfig(), None))
+    assert made == made
+    assert dataclasses.replace(made, course=None).sensor == "mine"
+    assert made.plain is None  # no kernel knows what it measures
+    ours = GnssAid("mine")
+    assert custom.aid(lambda *_: ours, "mine", MagnetometerConfig(), None) is ours
     assert isinstance(custom.aid(lambda *_: Own(), "mine", MagnetometerConfig(), None), custom.AidGuard)
+
+
+MADE = {
+    "sensors.radar.kind": "./radar.py:Halved",
+    "estimator[0].aids": ["gnss", "magnetometer", "radar"],
+    "duration_s": 20,
+}
+
+
+@pytest.mark.parametrize("unscented", [False, True])
+def test_what_an_aid_made_of_one_of_ours_measures_is_asked_however_the_run_is_cut(
+    scenario: Path, unscented: bool
+) -> None:
+    """Kernels of ours took its place in a batch, so that what it gave depended on the blocks."""
+    keys = {**MADE, **({"estimator[0].engine": "unscented"} if unscented else {})}
+    loaded = Scenario.load(scenario.with_name("rest.toml"), keys)
+    batch, live = run(loaded), run(loaded, realtime=100.0)
+    own = [one.dataset["estimators/ins"] for one in (batch, live)]
+    nu = own[0]["innovations/barometer"]["innovation"].values[:, 0]
+    assert nu[0] < -15.0
+    for name in ("lat", "h", "covariance"):
+        np.testing.assert_array_equal(own[0][name].values, own[1][name].values)
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        ("made raise", "AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' (radar.py, line "),
+        ("made nan", 'measure gave nu = [nan] of "barometer" at '),
+    ],
+)
+def test_an_aid_made_of_one_of_ours_is_guarded(scenario: Path, how: str, says: str) -> None:
+    with pytest.raises(UserError) as told:
+        run(Scenario.load(scenario.with_name("rest.toml"), {**MADE, "sensors.radar.how": how}))
+    assert f"sensor radar: ./radar.py:Halved: aid: {says}" in str(told.value)
 
 
 class Own(Aid):
@@ -344,3 +433,18 @@ def test_the_example_of_the_manual_aids_a_filter(scenario: Path, tmp_path: Path)
     assert (beside["innovations/radar"]["outcome"] == 0).mean() > 0.98
     sigma = [float(np.sqrt(one["covariance"].values[-1, 2, 2])) for one in (without, beside)]  # of height
     assert sigma[1] < 0.5 * sigma[0]
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_a_run_with_the_example_of_the_manual_has_a_report(scenario: Path, tmp_path: Path, kind: str) -> None:
+    """It ended in a TypeError: nobody knew what a sample of it would be."""
+    shutil.copy(Path(__file__).parents[2] / "docs/examples/radar.py", tmp_path)
+    shutil.copy(scenario.with_name("rest.toml"), tmp_path)
+    own = {"name": "mine", "kind": kind} | (
+        {"aids": ["gnss", "magnetometer", "radar"]}
+        if kind == "ins"
+        else {"locals": [{"name": "a", "aids": ["gnss", "magnetometer"]}, {"name": "b", "aids": ["radar"]}]}
+    )
+    result = run(Scenario.load(tmp_path / "rest.toml", {"duration_s": 20, "estimator": [own]}))
+    page = report.write_report(result.dataset, result.metrics, tmp_path / "report").read_text("utf-8")
+    assert "What own sensors measure is left out" in page

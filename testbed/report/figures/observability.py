@@ -64,7 +64,7 @@ PLOTS = (
         "visibility",
         "Which states can be seen, and when. Full colour: by what was measured at that time; pale: only together with"
         " what was measured before; blank: not at all, or not apart from others. A grey line: the estimator has no such"
-        " state.",
+        " state. What own sensors measure is left out.",
         visibility,
         pictured=True,
     ),
