@@ -136,6 +136,7 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
     assert all(np.array_equal(before[name], after[name], equal_nan=before[name].dtype.kind == "f") for name in before)
 
 
+@pytest.mark.ci
 def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None:
     """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure."""
     overrides = ["duration_s=8", "estimator[1].after_s=5", 'expect={"ins.aligned_s"=60}']

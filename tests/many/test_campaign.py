@@ -455,6 +455,7 @@ def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
     assert list(dataset["sensors.gnss.rate_hz"].values) == ["1", "1", "5", "5"]
 
 
+@pytest.mark.ci
 def test_values_may_be_given_as_they_are(at_rest: Path, tmp_path: Path, threads: str) -> None:
     """They were flown, and then ended in a traceback."""
     vary = {"sensors.gnss.denied": [[], [[70, 75]]], "sensors.gnss.rate_hz": [1, 5]}

@@ -121,6 +121,7 @@ def test_of_an_antenna_on_a_long_arm_the_place_goes_with_the_attitude():
     assert low < nees < high
 
 
+@pytest.mark.ci
 def test_what_an_alignment_made_of_them_goes_with_triad_and_soft_iron():
     """Two-sided 99 % bounds of the NEES of the attitude, and of it together with the errors that caused it.
 

@@ -152,11 +152,11 @@ def same(a, b):
     [
         ({}, 0.0, False),
         ({}, 0.0123, True),
-        ({"covariance_period": 3}, 0.0, True),
-        ({"aids": (*AIDS, PositionFixAid())}, 0.0, False),
-        ({"aids": AIDS[:2]}, 0.0, True),
-        ({"aids": ()}, 0.0, False),
-        ({"false_rejection": 0.0}, 0.0, False),
+        pytest.param({"covariance_period": 3}, 0.0, True, marks=pytest.mark.ci),
+        pytest.param({"aids": (*AIDS, PositionFixAid())}, 0.0, False, marks=pytest.mark.ci),
+        pytest.param({"aids": AIDS[:2]}, 0.0, True, marks=pytest.mark.ci),
+        pytest.param({"aids": ()}, 0.0, False, marks=pytest.mark.ci),
+        pytest.param({"false_rejection": 0.0}, 0.0, False, marks=pytest.mark.ci),
     ],
 )
 def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
@@ -209,8 +209,8 @@ def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
     [
         ({}, lambda: ChiSquare(1e-3)),
         ({"structure": "full_reset", "fusion_period_s": 0.25}, lambda: ChiSquare(1e-2)),
-        ({"recall_s": 5.0, "cross_check": True}, lambda: ChiSquare(1e-3)),
-        ({"weighting": "normalised"}, lambda: Eraim(1e-3)),
+        pytest.param({"recall_s": 5.0, "cross_check": True}, lambda: ChiSquare(1e-3), marks=pytest.mark.ci),
+        pytest.param({"weighting": "normalised"}, lambda: Eraim(1e-3), marks=pytest.mark.ci),
     ],
 )
 def test_so_does_a_federation(change, detector):
@@ -248,12 +248,30 @@ FURTHER = {"gyro_misalignment_sigma": 3e-3, "accel_bias_sigma": 0.03, "gust_sigm
         ({}, 0.0, False, False),
         ({}, 0.0123, True, False),
         ({"aids": THREE}, 0.0, True, True),
-        ({"aids": THREE[1:], "heading": 1.0, "compensated_motion": LowDynamics(2.0, 1.0, 1.0)}, 0.0123, True, False),
-        ({"aids": THREE, **FURTHER, "period_s": 0.37, "gyro_bias_feedback": False}, 0.0, True, False),
-        ({"aids": ()}, 0.0, True, False),
-        ({"motion": LowDynamics(4.0, 0.3, 0.3, "vector"), "correction_sigma": 1e-4}, 0.0, False, False),
+        pytest.param(
+            {"aids": THREE[1:], "heading": 1.0, "compensated_motion": LowDynamics(2.0, 1.0, 1.0)},
+            0.0123,
+            True,
+            False,
+            marks=pytest.mark.ci,
+        ),
+        pytest.param(
+            {"aids": THREE, **FURTHER, "period_s": 0.37, "gyro_bias_feedback": False},
+            0.0,
+            True,
+            False,
+            marks=pytest.mark.ci,
+        ),
+        pytest.param({"aids": ()}, 0.0, True, False, marks=pytest.mark.ci),
+        pytest.param(
+            {"motion": LowDynamics(4.0, 0.3, 0.3, "vector"), "correction_sigma": 1e-4},
+            0.0,
+            False,
+            False,
+            marks=pytest.mark.ci,
+        ),
         ({"any_motion": AnyMotion(), "period_s": 0.2}, 0.0, True, False),
-        ({"correction": lambda phi, limit: 0.5 * phi}, 0.0, False, False),
+        pytest.param({"correction": lambda phi, limit: 0.5 * phi}, 0.0, False, False, marks=pytest.mark.ci),
     ],
 )
 def test_so_does_an_attitude_filter(change, offset_s, spoilt, advised):

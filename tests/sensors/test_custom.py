@@ -435,7 +435,7 @@ def test_the_example_of_the_manual_aids_a_filter(scenario: Path, tmp_path: Path)
     assert sigma[1] < 0.5 * sigma[0]
 
 
-@pytest.mark.parametrize("kind", ["ins", "federated"])
+@pytest.mark.parametrize("kind", ["ins", pytest.param("federated", marks=pytest.mark.ci)])
 def test_a_run_with_the_example_of_the_manual_has_a_report(scenario: Path, tmp_path: Path, kind: str) -> None:
     """It ended in a TypeError: nobody knew what a sample of it would be."""
     shutil.copy(Path(__file__).parents[2] / "docs/examples/radar.py", tmp_path)
