@@ -466,7 +466,7 @@ class Ahrs:
         phi = x[:, PHI : PHI + 3]
         covariance = np.full((N, 9, 9), np.nan)
         covariance[:, 6:, 6:] = P[:, PHI : PHI + 3, PHI : PHI + 3] + phi[:, :, None] * phi[:, None] + self._floor
-        turned = np.square(wholes[:, TURN_RATE] / AVERAGING)
+        turned = np.square(wholes[:, 40:45][:, TURN_RATE] / AVERAGING)
         covariance[:, 8, 8] = np.maximum(covariance[:, 8, 8], self.config.iron_sigma**2 * np.exp(-turned))
         sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         accel_bias, sigma_accel_bias = np.zeros((N, 3)), np.tile(self._sigma_accel_bias, (N, 1))

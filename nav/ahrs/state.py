@@ -17,7 +17,7 @@ PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there 
 UNKNOWN = np.full(3, np.nan)
 FIXED = 54  # numbers in a `State` of any size
 PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
-TURN_RATE = 44  # and in the whole
+TURN_RATE = 4  # and in `State.elapsed`
 
 
 @dataclasses.dataclass

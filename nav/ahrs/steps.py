@@ -22,6 +22,7 @@ from nav.ahrs.state import (
     PERIOD_END,
     PHI,
     STATES,
+    TURN_RATE,
     parts,
     propagate,
     transition,
@@ -115,7 +116,7 @@ def settle(
                 Phi[j, i] = first[j, i]
     misaligned(Phi, turned, angle[2] / elapsed[1], places[MISALIGNMENT])
     turn = (turned[2, 0] * angle[0] + turned[2, 1] * angle[1] + turned[2, 2] * angle[2]) / (elapsed[1] * T)
-    elapsed[4] -= math.expm1(-T / TURN_MEMORY_S) * (turn - elapsed[4])
+    elapsed[TURN_RATE] -= math.expm1(-T / TURN_MEMORY_S) * (turn - elapsed[TURN_RATE])
     for i in range(3):
         half_noise[PHI + i] += turning
     for i in range(3):
