@@ -33,7 +33,7 @@ from testbed.report import page as report
 from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score.accuracy import column
-from testbed.score.remarks import LOST, not_finite
+from testbed.score.remarks import LOST
 
 if TYPE_CHECKING:
     from junitparser import Error, Failure
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 OUT = Path("runs/check")
 GOLDEN = Path("tests/golden")  # of a checkout; they are not shipped
 _ANEW = "delete it, and make it again with `testbed check --update`"
+NONE = Bounds(max=0.0)
 DIGITS = 4  # of a golden metric; tolerances are a hundred times that
 QUIET = ("kept", "same")  # the verdicts that nobody has to read
 SOUND = (*QUIET, "better", "updated")  # and all that are no failure
@@ -219,6 +220,9 @@ def _rounded(value: float) -> float:
     return value if value == round(value) else float(f"{value:.{DIGITS}g}")
 
 
+NONE = Bounds(max=0.0)
+
+
 def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> list[Row]:
     """Each expected metric beside its bounds. One that is missing, or NaN, exceeds them, but for a count of none."""
     rows = []
@@ -258,11 +262,11 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
             wrong = [f"the flight ended after {t:.0f} s: {result.failure}"]
-        named = set(task.scenario.expect) | set(task.golden or ())
-        lost = not_finite({key: count for key, count in result.metrics.items() if key not in named})
         ended = [f"{name} has ended: {why}" for name, why in result.ended.items()]
-        failure = "\n".join([*wrong, *ended, *lost])
-        rows = judge(task.scenario.expect, result.metrics)
+        failure = "\n".join([*wrong, *ended])
+        # estimates that are no numbers are in no other metric: there must be none, unless it is said
+        lost = {key for key in result.metrics if key.endswith(LOST)} - set(task.golden or ())
+        rows = judge(dict.fromkeys(sorted(lost), NONE) | task.scenario.expect, result.metrics)
         if task.golden is not None:
             rows += against_golden(task.golden, result.metrics)
         outcome = Outcome(task, rows, result.metrics, failure, time.perf_counter() - started)

@@ -19,6 +19,7 @@ SETTLING_S = 60.0  # after alignment, before errors count: biases and heading se
 RECOVERY_WINDOW_S = 10.0
 SAME_TIME_S = 1e-6
 SINGULAR = 1e-12  # determinant of correlations
+LARGEST = 1e100  # of a number that is scored: of larger ones no sum of squares is a number
 AXES = ("north", "east", "down")
 
 
@@ -141,7 +142,7 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     # An attitude may be known before a position is; what is left out throughout was never claimed.
     begun = np.logical_or.accumulate(whole)
     for said in (np.column_stack([estimated(name) for name in ("lat", "lon", "h")]), estimated("v_n")):
-        known = np.asarray(np.isfinite(said).all(axis=1))
+        known = np.asarray((np.abs(said) < LARGEST).all(axis=1))  # false for NaN
         if known[aligned].any():
             finite &= known | ~begun
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s

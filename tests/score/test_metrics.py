@@ -464,6 +464,15 @@ def test_estimates_that_turn_nan_are_counted_not_averaged() -> None:
     assert np.isfinite(list(found.values())).all()
 
 
+def test_estimates_too_large_to_be_squared_are_counted_not_averaged() -> None:
+    """A filter that diverges for minutes comes to 1e200: metrics ended in an overflow."""
+    run = synthetic_run.dataset(100.0)
+    run["estimators/ins/v_n"].values[-101:] = 1e200
+    found = metrics.compute(run)
+    assert found["ins.nonfinite_samples"] == 101
+    assert np.isfinite(list(found.values())).all()
+
+
 def recovering(path: Path, bad_until: float, relapse: float | None = None) -> dict[str, float]:
     """An estimator 20 m off until ``bad_until``, and again for a second from ``relapse``."""
     truth = circle(200.0)
