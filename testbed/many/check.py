@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 OUT = Path("runs/check")
 GOLDEN = Path("tests/golden")  # of a checkout; they are not shipped
 _ANEW = "delete it, and make it again with `testbed check --update`"
-NONE = Bounds(max=0.0)
 DIGITS = 4  # of a golden metric; tolerances are a hundred times that
 QUIET = ("kept", "same")  # the verdicts that nobody has to read
 SOUND = (*QUIET, "better", "updated")  # and all that are no failure
@@ -266,6 +265,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         failure = "\n".join([*wrong, *ended])
         # estimates that are no numbers are in no other metric: there must be none, unless it is said
         lost = {key for key in result.metrics if key.endswith(LOST)} - set(task.golden or ())
+        lost -= {name + LOST for name in result.ended}  # which have failed already
         rows = judge(dict.fromkeys(sorted(lost), NONE) | task.scenario.expect, result.metrics)
         if task.golden is not None:
             rows += against_golden(task.golden, result.metrics)
