@@ -16,7 +16,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from nav._jit import njit
 from nav.aids import Aid, AirspeedAid, GnssAid, MagnetometerAid
@@ -34,10 +33,9 @@ from nav.rotation import (
     quat_rotate,
     skew,
 )
-from nav.samples import Array, GnssSample, ImuSamples
+from nav.samples import Array, GnssSample, ImuSamples, usable
 from nav.velocity_matching import Matched, VelocityMatching
 
-RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 REST_SPEED = 0.5  # slower than this is standing [m/s]
 COURSE_SPEED = 8.0  # faster than this is flying, and the course tells the heading [m/s]
 COURSE_SIGMA_LIMIT = math.radians(40.0)  # beyond which, by wind, it does not: filters are linear
@@ -46,7 +44,7 @@ DIFFERENCE_S, USUAL_ACCELERATION = 1.0, 3.0  # of positions that tell a velocity
 WITHOUT_VELOCITY_S = 10.0  # so long must it take then: as long as errors of such velocities are small beside gravity's
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
-UNCALIBRATED = 3.0  # times what a magnetometer is told to be wrong by: its field is of another length than the Earth's
+UNCALIBRATED = 2.0  # times what a magnetometer is told to be wrong by: a sound one has as much once in fifty
 FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
@@ -55,13 +53,6 @@ LONGEST_S = 6.0  # beyond which gyros drift too far within a pair of vectors for
 NORTH = np.array([1.0, 0.0, 0.0])
 ACCELERATION_ERROR = 0.1  # of such a pair: latency, scale and tilt of what manoeuvres [m/s^2]
 STEP = 1e-6  # of each input, relative, in the differences
-
-
-def usable(dtheta: Array, dv: Array, dt: Array) -> npt.NDArray[np.bool_]:
-    """Which of N increments an IMU could possibly report (N,): not those that are no numbers."""
-    sizes = np.maximum(np.abs(dtheta) / RATE_LIMIT, np.abs(dv) / FORCE_LIMIT).max(axis=1)
-    found: npt.NDArray[np.bool_] = sizes <= dt
-    return found
 
 
 @dataclass(frozen=True)
@@ -232,7 +223,7 @@ class Alignment:
             self._matching.forget()
             self._restart(fix)
             return None
-        field_bias = self._field_bias(field_n)
+        field_bias = self._field_bias(dv_n, field_n, sigma_dv / float(np.linalg.norm(dv_n)))
         heading = None if self._by_accelerations else self._heading(C_b0, first, fix, T, field_n, field_bias)
         if heading is None and not self._compassing:
             heading = self._matched(C_b0, swing_b, first, fix, T)
@@ -275,17 +266,21 @@ class Alignment:
         change[2] -= gravity(fix.lat, 0.5 * (first.h + fix.h)) * T
         return change
 
-    def _field_bias(self, field_n: Array | None) -> float:
-        """The hard iron [T] that must be reckoned with: as told, or more where the field is not as long as the Earth's.
+    def _field_bias(self, dv_n: Array, field_n: Array | None, tilt: float) -> float:
+        """The hard iron per axis [T] that must be reckoned with: as told, or more of a magnetometer not calibrated.
 
-        The difference of the lengths is the least that the errors can be: a magnetometer that nobody has calibrated.
+        Specific force, known to ``tilt`` [rad], tells whatever the heading what of a field is along
+        it and what across: by how much both are off is a sample of two of the errors, whose rms is taken.
         """
         if self._fields == 0 or field_n is None or self.aids.field_bias == 0.0:
             return self.aids.field_bias
-        excess = abs(float(np.linalg.norm(self._field_0)) / self._fields - float(np.linalg.norm(field_n)))
-        bent = math.hypot(self.aids.field_anomaly, self.aids.field_error, self.aids.soft_iron * FIELD_SIZE)
-        known = math.hypot(self.aids.field_bias, self.aids.field, bent)
-        return excess if excess > UNCALIBRATED * known else self.aids.field_bias
+        off = _along_and_across(self._field_0 / self._fields, self._dv_0) - _along_and_across(field_n, dv_n)
+        bent = self.aids.field_anomaly, self.aids.field_error, self.aids.soft_iron * FIELD_SIZE, tilt * FIELD_SIZE
+        found, known = (
+            math.hypot(*off.tolist()) / math.sqrt(2.0),
+            math.hypot(self.aids.field_bias, self.aids.field, *bent),
+        )
+        return found if found > UNCALIBRATED * known else self.aids.field_bias
 
     def _heading(
         self, C_b0: Array, first: GnssSample, fix: GnssSample, T: float, field_n: Array | None, field_bias: float
@@ -443,6 +438,11 @@ def whole(reported: Array, correlated: Array) -> Array:
     white noise (`nav.aids.gnss.white`): with less, and correlated with them, it would be no covariance.
     """
     return np.maximum(reported**2, correlated**2 + WHITE_SHARE * reported**2)
+
+
+def _along_and_across(field: Array, force: Array) -> Array:
+    """What of a ``field`` (3,) is along ``force`` (3,), and the size of the rest (2,)."""
+    return np.array([field @ force, math.hypot(*cross(field, force).tolist())]) / math.hypot(*force.tolist())
 
 
 def _triad(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array) -> Array:

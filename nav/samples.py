@@ -18,6 +18,7 @@ import numpy.typing as npt
 Array: TypeAlias = npt.NDArray[np.float64]
 
 NO_SENSOR = "no sensor"  # that a report is of what is known without a sample
+RATE_LIMIT, FORCE_LIMIT = 100.0, 2000.0  # what an IMU could possibly report [rad/s, m/s^2]
 
 
 class FixType(IntEnum):
@@ -72,6 +73,13 @@ class ImuSamples:
 
     def __len__(self) -> int:
         return len(self.t)
+
+
+def usable(dtheta: Array, dv: Array, dt: Array) -> npt.NDArray[np.bool_]:
+    """Which of N increments an IMU could possibly report (N,): not those that are no numbers."""
+    sizes = np.maximum(np.abs(dtheta) / RATE_LIMIT, np.abs(dv) / FORCE_LIMIT).max(axis=1)
+    found: npt.NDArray[np.bool_] = sizes <= dt
+    return found
 
 
 @dataclass(frozen=True, slots=True)

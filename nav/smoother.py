@@ -22,9 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from nav._jit import njit
-from nav.alignment import usable
 from nav.error_model import MOTION, ErrorModel, Indices, sensor_errors, take_errors, transition
-from nav.samples import Array, ImuSamples
+from nav.samples import Array, ImuSamples, usable
 from nav.state import State, inject, integrate
 from nav.strapdown import step
 

@@ -11,12 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from nav._jit import inlined, lean, njit
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.earth import gravity, radii, wrap_longitude
 from nav.error_model import MOTION, PHI, POS, VEL, Indices, sensor_errors, take_errors, transition
 from nav.kalman import predict, update_in
 from nav.rotation import turn
-from nav.samples import Array
+from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array
 from nav.strapdown import step
 from nav.unscented import predict as predict_points
 from nav.unscented import remove

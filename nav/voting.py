@@ -23,10 +23,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.detection import Mask, chi_square_threshold
 from nav.error_model import ImuModel
-from nav.samples import Array, ImuSamples
+from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array, ImuSamples
 
 MOST = np.repeat([RATE_LIMIT, FORCE_LIMIT], 3)  # what a unit could possibly report
 

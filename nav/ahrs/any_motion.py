@@ -41,11 +41,10 @@ import numpy as np
 from nav.ahrs.config import MAGNETIC_HEADING, AhrsConfig, AnyMotion
 from nav.ahrs.further import RIGHT, FurtherStates
 from nav.ahrs.state import BIAS, PHI, STATES, State
-from nav.alignment import usable
 from nav.kalman import update
 from nav.realignment import LOST_TILT
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
-from nav.samples import Array, Outcome, UpdateReport
+from nav.samples import Array, Outcome, UpdateReport, usable
 
 REST_GATE = 16.3  # chi-square of three, 99.9 %
 MOST_TILT = math.radians(60)  # claimed of a first levelling

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from nav._jit import inlined, njit
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.rotation import rotation_coefficients
-from nav.samples import Array
+from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array
 from nav.state import turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`

@@ -50,7 +50,8 @@ from testbed.sensors.wind_report import WindReportConfig
 WARM_UP_K = 10.0  # how far the unit may be from the temperature it was calibrated at
 MANOEUVRE_S = 120.0  # between changes of turn and load
 METRES_PER_PASCAL = 1 / 12.0  # of pressure altitude near the ground
-SOFT_IRON_SHARE = 0.5  # of soft iron's field in each of: body axes, n axes, neither, where it is not a state
+SOFT_IRON_SHARE = 0.5  # of soft iron's field that is constant in n axes, where it is not a state
+SOFT_IRON_LASTS_S = 60.0  # for which what it does otherwise lasts, as long as a turn
 # Where a datasheet has no noise, as of grade "perfect", a filter is told of about that of the best real parts. Told of
 # none it would be sure of itself within a second, and refuse what integration and rounding leave.
 BEST_IMU = ImuModel(0.001 * DEG_PER_ROOT_H, 0.003 * MPS_PER_ROOT_H, 0.003 * DEG_PER_H, 0.01 * MG)
@@ -226,10 +227,10 @@ def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
     noise = m.noise or BEST_FIELD
     if not m.doubt:
         return MagnetometerAid(name, sigma=noise, bias_sigma=bias, soft_iron_sigma=m.soft_iron, error_sigma=motor)
-    iron = SOFT_IRON_SHARE * m.soft_iron * FIELD_SIZE
+    iron = m.soft_iron * FIELD_SIZE
     return MagnetometerAid(
-        name, sigma=noise, bias_sigma=bias, anomaly_sigma=iron, error_sigma=math.hypot(iron, motor), doubt=m.doubt,
-        follow_s=section.follow_s,
+        name, sigma=noise, bias_sigma=bias, anomaly_sigma=SOFT_IRON_SHARE * iron, error_sigma=math.hypot(iron, motor),
+        error_correlation_s=SOFT_IRON_LASTS_S, doubt=m.doubt, follow_s=section.follow_s,
     )  # fmt: skip
 
 

@@ -46,12 +46,13 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from nav import aids
-from nav.alignment import FORCE_LIMIT, RATE_LIMIT
 from nav.columns import Reports
 from nav.earth import gravity, pressure_altitude, radii, wrap_longitude
 from nav.motion import TrueAirspeed
 from nav.rotation import cross, euler_from_quat, quat_rotate
 from nav.samples import (
+    FORCE_LIMIT,
+    RATE_LIMIT,
     AirspeedSample,
     Array,
     BarometerSample,

@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from nav.alignment import usable
 from nav.earth import position_difference_n, radii, wrap_longitude
-from nav.samples import Array, GnssSample, ImuSamples
+from nav.samples import Array, GnssSample, ImuSamples, usable
 from testbed.feeds.log import Reference, Samples
 from testbed.feeds.stamps import Rows
 from testbed.motion.sections import ALTITUDES, LATITUDE_LIMIT_DEG

@@ -125,9 +125,14 @@ def aligned(seconds, hard_iron, **aids):
     return ins, estimate, -off.as_rotvec()
 
 
-def test_a_magnetometer_that_nobody_calibrated_tells_no_heading_but_is_learned():
-    """Hard iron as large as the field: the course begins, which knows no wind, and the samples then tell the bias."""
-    hard_iron = np.array([40e-6, -15e-6, 40e-6])
+LONGER, STEEPER = np.array([40e-6, -15e-6, 40e-6]), np.array([0.0, 0.0, -2 * FIELD_N[2]])
+
+
+@pytest.mark.parametrize("hard_iron", [LONGER, STEEPER], ids=["longer", "as-long"])
+def test_a_magnetometer_that_nobody_calibrated_tells_no_heading_but_is_learned(hard_iron: np.ndarray):
+    """Hard iron as large as the field, which makes it longer, or turns it: the course begins, which knows no wind, and
+    the samples then tell the bias.
+    """
     _, estimate, phi = aligned(30, hard_iron)
     bias, sigma = estimate.extra["magnetometer_bias"]
     assert (np.abs(bias - hard_iron) < 4 * sigma).all()
