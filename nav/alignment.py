@@ -44,8 +44,8 @@ DIFFERENCE_S, USUAL_ACCELERATION = 1.0, 3.0  # of positions that tell a velocity
 WITHOUT_VELOCITY_S = 10.0  # so long must it take then: as long as errors of such velocities are small beside gravity's
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
-UNCALIBRATED = 2.0  # times what a magnetometer is told to be wrong by: a sound one has as much once in fifty
-FIELD_HEADING_LIMIT = 0.5  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
+UNCALIBRATED = 2.5  # times what a magnetometer is told to be wrong by: a sound one is so once in twenty
+FIELD_HEADING_LIMIT = 0.7  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
 FEW, CLEARLY = 5, 0.9  # pairs, and the share of pushes that is explained, where nothing else is asked for a heading
@@ -269,17 +269,15 @@ class Alignment:
     def _field_bias(self, dv_n: Array, field_n: Array | None, tilt: float) -> float:
         """The hard iron per axis [T] that must be reckoned with: as told, or more of a magnetometer not calibrated.
 
-        Specific force, known to ``tilt`` [rad], tells whatever the heading what of a field is along
-        it and what across: by how much both are off is a sample of two of the errors, whose rms is taken.
+        Specific force, known to ``tilt`` [rad], tells whatever the heading what of a field is along it and what across.
+        What both are off by is the least that the errors can be.
         """
         if self._fields == 0 or field_n is None or self.aids.field_bias == 0.0:
             return self.aids.field_bias
         off = _along_and_across(self._field_0 / self._fields, self._dv_0) - _along_and_across(field_n, dv_n)
         bent = self.aids.field_anomaly, self.aids.field_error, self.aids.soft_iron * FIELD_SIZE, tilt * FIELD_SIZE
-        found, known = (
-            math.hypot(*off.tolist()) / math.sqrt(2.0),
-            math.hypot(self.aids.field_bias, self.aids.field, *bent),
-        )
+        known = math.hypot(self.aids.field_bias, self.aids.field, *bent)
+        found = math.hypot(*off.tolist())
         return found if found > UNCALIBRATED * known else self.aids.field_bias
 
     def _heading(
