@@ -45,6 +45,7 @@ from testbed.estimators.section import (
     TurnRate,
     WindWalk,
     aid_mistakes,
+    slip_mistakes,
 )
 from testbed.schema import IDENTIFIER, Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
@@ -191,6 +192,7 @@ class FederatedSection(EstimatorSection):
                 yield (*where, "name"), f"{local.name!r} is taken by a local filter above: give each its own name"
             for path, text in aid_mistakes(self.kind, local.aids, sensors, ONE_EACH | SEVERAL):
                 yield (*where, *path), text
+        yield from slip_mistakes(self.nonholonomic_mps, self.aiding(sensors), sensors)
         shares = [local.share for local in self.locals if local.share is not None]
         if shares and (len(shares) < len(names) or abs(sum(shares) - 1) > 1e-6):
             yield ("locals",), f"the shares of all local filters must add up to 1, not {sum(shares):g}: or give none"

@@ -32,6 +32,7 @@ from testbed.estimators.section import (
     WindWalk,
     aid_mistakes,
     second_of_a_kind,
+    slip_mistakes,
 )
 from testbed.schema import Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
@@ -101,6 +102,7 @@ class InsSection(EstimatorSection):
         for key in ("course", "sage_husa", "fading"):
             if getattr(self, key) is not None and not receivers:
                 yield (key,), "needs a GNSS receiver among the aids: add one, or leave it out"
+        yield from slip_mistakes(self.nonholonomic_mps, self.aids, sensors)
         yield from second_of_a_kind("ins", self.aids, sensors)
 
 

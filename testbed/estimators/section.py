@@ -122,6 +122,14 @@ def aid_mistakes(
             yield ("aids", index), f"{aid!r} {text}"
 
 
+def slip_mistakes(
+    slip_mps: float | None, aids: Sequence[str], sensors: Mapping[str, SensorConfig]
+) -> Iterator[Mistake]:
+    """A constraint of wheels that no aid meets."""
+    if slip_mps is not None and not any(sensors[aid].kind == "body_velocity" for aid in aids if aid in sensors):
+        yield ("nonholonomic_mps",), "is used with a body velocity: add such an aid, or leave it out"
+
+
 def second_of_a_kind(kind: str, aids: Sequence[str], sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
     """Aids that are one too many of their kind."""
     kinds = {name: sensor.kind for name, sensor in sensors.items()}

@@ -609,6 +609,8 @@ def test_only_clean_loads_or_clean_errors_at_length(text: str, overrides: list[s
 def test_keys_of_an_ins() -> None:
     blind = complaint(U_TURN, 'estimator.ins.aids=["barometer"]', "estimator.ins.course={}")
     assert "estimator[0].course: needs a GNSS receiver among the aids" in blind
+    wheels = complaint(U_TURN, "estimator.ins.nonholonomic_mps=0.1")
+    assert "estimator[0].nonholonomic_mps: is used with a body velocity: add such an aid, or leave it out" in wheels
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.engine="unscented"')
     assert "estimator[2].engine: is a key of kind 'ins', not of 'ahrs'" in ahrs
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.states="full"')
