@@ -88,6 +88,7 @@ def test_it_is_armed_once_it_has_said_where_it_is() -> None:
     assert far_end.armed
 
 
+@pytest.mark.ci
 def test_one_that_has_terminated_its_flight_is_told_of() -> None:
     voice = autopilots.Voice()
     peer = autopilots.Px4("stall", at=1000, voice=voice)

@@ -150,7 +150,7 @@ def same(a, b):
 @pytest.mark.parametrize(
     ("change", "offset_s", "spoilt"),
     [
-        ({}, 0.0, False),
+        pytest.param({}, 0.0, False, marks=pytest.mark.ci),
         ({}, 0.0123, True),
         pytest.param({"covariance_period": 3}, 0.0, True, marks=pytest.mark.ci),
         pytest.param({"aids": (*AIDS, PositionFixAid())}, 0.0, False, marks=pytest.mark.ci),
@@ -207,7 +207,7 @@ def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
 @pytest.mark.parametrize(
     ("change", "detector"),
     [
-        ({}, lambda: ChiSquare(1e-3)),
+        pytest.param({}, lambda: ChiSquare(1e-3), marks=pytest.mark.ci),
         ({"structure": "full_reset", "fusion_period_s": 0.25}, lambda: ChiSquare(1e-2)),
         pytest.param({"recall_s": 5.0, "cross_check": True}, lambda: ChiSquare(1e-3), marks=pytest.mark.ci),
         pytest.param({"weighting": "normalised"}, lambda: Eraim(1e-3), marks=pytest.mark.ci),

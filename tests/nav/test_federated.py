@@ -329,7 +329,7 @@ def test_nees_over_many_flights():
         pytest.param("eraim", "partial", False, marks=pytest.mark.ci),
         pytest.param("sprt", "no_reset", False, marks=pytest.mark.ci),
         pytest.param("sprt", "full_reset", True, marks=pytest.mark.ci),
-        ("glr", "no_reset", True),
+        pytest.param("glr", "no_reset", True, marks=pytest.mark.ci),
         pytest.param("glr", "full_reset", False, marks=pytest.mark.ci),
     ],
 )

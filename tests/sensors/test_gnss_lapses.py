@@ -20,6 +20,7 @@ def offsets_n(samples, truth):
     return np.array(ned)
 
 
+@pytest.mark.ci
 def test_jumps_come_at_random_last_exponentially_and_are_normal():
     truth = still(40_000, 1.0)
     config = GnssConfig(grade="perfect", rate_hz=1.0, jumps_per_h=30.0, jump_m=4.0, jump_s=20.0)
