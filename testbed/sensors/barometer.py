@@ -22,11 +22,11 @@ GRADES: dict[str, dict[str, Any]] = {
     # oversampling. Drift, from temperature inside its +-2.5 mbar error band and from the weather, assumed.
     "mems": {"bias_pa": 50.0, "drift_pa": 15.0, "drift_time_s": 1800.0, "noise_pa": 1.2},
     # The same in a fuselage without a static port: cabin pressure changes with airspeed, sideslip and propeller.
-    # Measured on three recorded aeroplanes against GNSS height, with errors of the receiver in it, 1.5 m: it changes by
-    # 1.2 to 3.3 m in 5 s, 1.7 to 4.0 m in 10 s, 2.4 to 5.8 m in 30 s and 3.2 to 6.7 m in a minute (root of half the mean
-    # square); 18 +- 5 and 44 +- 23 % of dynamic pressure are in the static one, and with 10 deg of sideslip 12 +- 14 %
-    # more (least squares beside a drift). White noise from sample to sample is 20 Pa on one and 1.2 Pa in a quadcopter:
-    # filters go by what they see of it.
+    # Measured on three recorded aeroplanes against GNSS height, with errors of the receiver in it, 1.5 m: it changes
+    # by 1.2 to 3.3 m in 5 s, 1.7 to 4.0 m in 10 s, 2.4 to 5.8 m in 30 s and 3.2 to 6.7 m in a minute (root of half the
+    # mean square); 18 +- 5 and 44 +- 23 % of dynamic pressure are in the static one, and with 10 deg of sideslip 12 +-
+    # 14 % more (least squares beside a drift). White noise from sample to sample is 20 Pa on one and 1.2 Pa in a
+    # quadcopter: filters go by what they see of it.
     "hobby": {
         "bias_pa": 100.0,
         "drift_pa": 80.0,

@@ -83,7 +83,8 @@ def test_unsteady_errors_are_gauss_markov_and_filters_know():
     rig = Scenario.load("u_turn", {"sensors.barometer.grade": "hobby", "sensors.airspeed.grade": "hobby"}).rig(1)
     told = {name: aid_of(name, rig, rig.imu("imu").errors(), rig.air(0.0)) for name in ("barometer", "airspeed")}
     wake = told["barometer"]
-    assert (wake.sigma, wake.error_sigma, wake.error_correlation_s) == pytest.approx((3 / 12, 40 / 12, 8.0))
+    assert (wake.sigma, wake.error_sigma, wake.error_correlation_s) == pytest.approx((3 / 12, 32 / 12, 8.0))
+    assert wake.bias_walk == pytest.approx(80 / 12 * np.sqrt(2 / 300))
     assert told["airspeed"].sigma == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
 
 
