@@ -79,4 +79,4 @@ lock:
 	$(COMPILE) --group clients --no-deps --constraint requirements.lock --output-file requirements-clients.lock
 
 clean:
-	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks

@@ -8,7 +8,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from worlds.sensor_truth import RATE_HZ, lively, still
 
+from testbed import Scenario
 from testbed.errors import UserError
+from testbed.estimators.datasheet import aid_of
 from testbed.sensors.magnetometer import FieldMap, Magnetometer, MagnetometerConfig, geomagnetic_field_n
 from testbed.sensors.site import Site
 
@@ -92,6 +94,18 @@ def test_iron_is_affine_and_constant():
     np.testing.assert_allclose(design @ fit, bent, atol=1e-15)
     assert np.abs(fit[:3] - np.eye(3)).max() > 0.01
     assert np.abs(fit[3] * 1e-5).max() > 1e-6
+
+
+@pytest.mark.ci
+def test_filters_are_told_how_far_iron_bends_the_field_of_a_doubted_compass():
+    start = lively(2)
+    exact = sense(MagnetometerConfig(grade="perfect"), start)[0]
+    bent = [sense(MagnetometerConfig(grade="perfect", soft_iron_percent=5.0), start, seed)[0] for seed in range(600)]
+    rig = Scenario.load("u_turn", {"sensors.magnetometer.grade": "hobby"}).rig(1)
+    told = aid_of("magnetometer", rig, rig.imu("imu").errors(), rig.air(0.0))
+    assert told.error_sigma == pytest.approx(np.std(bent - exact), rel=0.15)
+    assert told.anomaly_sigma == pytest.approx(told.error_sigma / 2)
+    assert told.error_correlation_s == 60.0
 
 
 def test_current_disturbs_in_proportion():
