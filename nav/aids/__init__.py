@@ -31,6 +31,7 @@ from nav.aids.position_fix import PositionFixAid
 from nav.aids.star_tracker import StarAid
 from nav.aids.terrain import OpticalFlowAid, RangefinderAid
 from nav.aids.wind_report import WindReportAid
+from nav.aids.zero_velocity import ZeroVelocityAid
 from nav.samples import (
     AirspeedSample,
     BarometerSample,
@@ -58,6 +59,7 @@ __all__ = [
     "RangefinderAid",
     "StarAid",
     "WindReportAid",
+    "ZeroVelocityAid",
     "problem",
 ]
 

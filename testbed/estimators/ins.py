@@ -10,9 +10,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from nav.aids import Aid, AirspeedAid, Course, GnssAid
+from nav.aids import Aid, AirspeedAid, Course, GnssAid, ZeroVelocityAid
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.standing import ZERO_VELOCITY, Standing
 from nav.unscented import Scaling
 from nav.weighting import Fading, SageHusa
 from testbed.estimators.datasheet import aid_of, imu_model
@@ -80,6 +81,13 @@ class InsSection(EstimatorSection):
     wind_walk_mps_per_sqrt_s: WindWalk = None
     handover: Handover | None = Field(default=None, description="how well the start is known; none: it aligns")
     nonholonomic_mps: Slip | None = None
+    zero_velocity_mps: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="how fast it moves when it stands, 1 sigma: used as a velocity of zero once a receiver has said so,"
+        " and while the IMU feels nothing since; none: not used",
+    )
     engine: Engine = "linear"
     course: CourseSection | None = Field(default=None, description="of its GNSS receiver; none: not used")
     sage_husa: SageHusaSection | None = Field(default=None, description="none: the receiver's sigmas are believed")
@@ -125,6 +133,10 @@ def build(section: InsSection, rig: Rig) -> Lane:
     if section.course is not None:
         aids = _with_course(aids, section.course)
     used = tuple(dict.fromkeys((*offered.values(), *(made.sensor for made in aids))))
+    standing = None
+    if section.zero_velocity_mps is not None:
+        aids.append(ZeroVelocityAid(ZERO_VELOCITY, section.zero_velocity_mps))
+        standing = Standing((errors.gyro_noise, errors.accel_noise))
     idle = [made for name in offered.values() if name not in singles and (made := aid(name)) is not None]
     learning, fading = section.sage_husa, section.fading
     ins = Ins(
@@ -148,6 +160,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
         used,
         handover_errors(section.handover, errors.lever_arm_b, rig.seed),
         voter,
+        standing=standing,
         spacing_s=rig.spacing_s(used),
     )
 

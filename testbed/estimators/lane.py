@@ -15,6 +15,7 @@ from nav.columns import Estimates, Reports
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
 from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
+from nav.standing import Standing
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
 from testbed.estimators.rig import Rig
@@ -67,7 +68,8 @@ class Lane:
 
     ``imus`` has how each IMU is mounted, C_sb (3, 3), by name; of several the ``voter`` makes one. The estimate is of
     the point where the first sits. ``commanded`` is for one that listens to the autopilot. With ``handover`` it does
-    not align but waits for `start`. Of sensors in ``spacing_s`` [s] it is handed only samples so far apart.
+    not align but waits for `start`. Of sensors in ``spacing_s`` [s] it is handed only samples so far apart, and of
+    ``standing`` what that makes of increments and samples.
     """
 
     horizon: FusionHorizon
@@ -76,6 +78,7 @@ class Lane:
     handover: HandoverErrors | None = None
     voter: Voter | None = None
     commanded: Callable[[Commanded], None] | None = None
+    standing: Standing | None = None
     spacing_s: Mapping[str, float] = field(default_factory=dict)
     _taken: dict[str, float] = field(default_factory=dict)
 
@@ -92,6 +95,8 @@ class Lane:
             self.commanded(commanded)
         increments, votes = self.increments(imu)
         handed = [sample for aid in self.sensors for sample in self._thinned(aid, samples[aid])]
+        if self.standing is not None:
+            handed += self.standing.heard(increments, handed)
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
 

@@ -30,6 +30,7 @@ from nav.aids import (
     RangefinderAid,
     StarAid,
     WindReportAid,
+    ZeroVelocityAid,
 )
 from nav.alignment import InitialState
 from nav.detection import ChiSquareGate
@@ -262,7 +263,7 @@ def _sample(
             return MagnetometerSample(t, t, reference.field_n(place), aid.sensor)
         case AirspeedAid():
             return AirspeedSample(t, t, airspeed, aid.sensor)
-        case BodyVelocityAid():
+        case BodyVelocityAid() | ZeroVelocityAid():
             return BodyVelocitySample(t, t, np.zeros(3), aid.sensor)
         case StarAid():
             return StarSample(t, t, np.array([1.0, 0.0, 0.0, 0.0]), aid.sensor)
