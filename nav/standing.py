@@ -18,7 +18,7 @@ from nav.samples import Array, BodyVelocitySample, GnssSample, ImuSamples, Sampl
 
 ZERO_VELOCITY = "zero velocity"  # in place of a sensor
 WINDOW_S = 1.0  # over which it is judged, and as often a velocity is told
-LEAST_ROWS, LEAST_SHARE = 10, 0.9  # of increments in a window, and of its time that they must cover
+LEAST_ROWS, LEAST_SHARE = 5, 0.9  # of increments in a window, and of its time that they must cover
 # The rms of what changes within a window, all axes together. Of eight recorded aircraft six stood with engines off, at
 # 0.0004 to 0.012 rad/s and 0.013 to 0.12 m/s^2 when quietest; in the air none was below 0.026 rad/s or 0.12 m/s^2.
 QUIET = np.array([0.015, 0.15])  # [rad/s], [m/s^2]

@@ -110,6 +110,8 @@ class InsSection(EstimatorSection):
         for key in ("course", "sage_husa", "fading"):
             if getattr(self, key) is not None and not receivers:
                 yield (key,), "needs a GNSS receiver among the aids: add one, or leave it out"
+        if self.zero_velocity_mps is not None and not any(one.kind == "gnss" for one in sensors.values()):
+            yield ("zero_velocity_mps",), "needs a GNSS receiver, which says that it stands: add one, or leave it out"
         yield from slip_mistakes(self.nonholonomic_mps, self.aids, sensors)
         yield from second_of_a_kind("ins", self.aids, sensors)
 

@@ -611,6 +611,10 @@ def test_keys_of_an_ins() -> None:
     assert "estimator[0].course: needs a GNSS receiver among the aids" in blind
     wheels = complaint(U_TURN, "estimator.ins.nonholonomic_mps=0.1")
     assert "estimator[0].nonholonomic_mps: is used with a body velocity: add such an aid, or leave it out" in wheels
+    standing = [f"estimator=[{{name='ins', aids=['barometer'], zero_velocity_mps={sigma}}}]" for sigma in (0.1, 0)]
+    only = "sensors={imu={}, barometer={}, magnetometer={}}", "expect={}"
+    assert "estimator[0].zero_velocity_mps: needs a GNSS receiver" in complaint(U_TURN, *only, standing[0])
+    assert "estimator[0].zero_velocity_mps" in complaint(U_TURN, *only, standing[1])
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.engine="unscented"')
     assert "estimator[2].engine: is a key of kind 'ins', not of 'ahrs'" in ahrs
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.states="full"')
