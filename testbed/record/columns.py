@@ -206,7 +206,7 @@ AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "sideslip": ("m/s", ("component",)),
     "body_velocity": ("m/s", ("component",)),
     "nonholonomic": ("m/s", ("component",)),
-    "zero_velocity": ("m/s", ("component",)),
+    "zero_velocity": ("m/s", ("ned",)),
     "star_attitude": ("rad", ("body",)),
     "position_fix": ("m", ("component",)),
     "range": ("m", ("component",)),
