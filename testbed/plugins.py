@@ -57,8 +57,8 @@ def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:
         raise UserError(f"kind {shown(kind)}: {wrong}")
     try:
         module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
-    except UserError:
-        raise
+    except UserError as error:
+        raise UserError(f"kind {shown(kind)}: {error}") from None
     except ModuleNotFoundError as error:
         if error.name is not None and where.split(".")[0] != error.name.split(".")[0]:
             todo = _beside(folder / where, error.name) if where.endswith(".py") else ""
@@ -116,7 +116,9 @@ def _file(path: Path) -> ModuleType:
 
 def raised(error: BaseException) -> str:
     """What was raised and where, on one line: in the user's code if it can be told, not in what that calls."""
-    found = traceback.extract_tb(error.__traceback__)
+    found = [
+        frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith("<frozen ")
+    ]  # Python's own import
     frames = [frame for frame in found if not _lies(Path(frame.filename), _HERE)]
     theirs = [frame for frame in frames if not _is_installed(Path(frame.filename))]
     last = (theirs or frames)[-1:]

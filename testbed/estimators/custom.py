@@ -74,7 +74,10 @@ def build(section: CustomSection, rig: Rig) -> Lane:
 
     Raises UserError when its class can't be had, does not have the three methods, or refuses its options.
     """
-    made = plugins.load(section.kind, rig.folder, GROUP)
+    try:
+        made = plugins.load(section.kind, rig.folder, GROUP)
+    except UserError as error:
+        raise UserError(f"estimator {section.name}: {error}") from None
     options = _options(section, made)
     try:
         inner = made(rig, **options)

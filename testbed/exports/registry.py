@@ -124,6 +124,8 @@ def _content(module: object, one: Format, tree: xarray.DataTree) -> bytes:
 
 def write_one(path: Path, content: bytes, force: bool) -> None:
     """Write one file whole, or not at all. Raises UserError when it can't be, or is somebody else's."""
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder: give the name of a file")
     with held(path.parent):
         require_own(path.parent, [path.name], force)
         if (path.parent / MANIFEST).exists():  # beside the record, or a folder of results

@@ -61,10 +61,18 @@ def rows(topic: str, version: str, stamps: npt.NDArray[np.int64], **values: Any)
     for name, value in {"timestamp": stamps, **values}.items():
         if name in (row.names or ()):
             kind = row[name].base
-            made[name] = np.rint(value).astype(kind) if kind.kind in "iu" else value
+            with np.errstate(over="ignore", invalid="ignore"):  # beyond what the field can hold it is infinite, or 0
+                made[name] = _whole(value, kind) if kind.kind in "iu" else value
         elif not any(name in (layout(topic, other)[1].names or ()) for other in VERSIONS):
             raise KeyError(name)
     return made
+
+
+def _whole(value: Any, kind: np.dtype[Any]) -> npt.NDArray[Any]:
+    """Numbers as integers of a ``kind``, 0 of what that can't hold."""
+    number, limits = np.rint(value), np.iinfo(kind)
+    held = (number >= limits.min) & (number <= limits.max)
+    return np.where(held, number, 0).astype(kind)
 
 
 def encode(

@@ -28,7 +28,7 @@ from testbed.report.campaign_page import contents
 from testbed.report.expected import COLUMNS, Kept, kept
 from testbed.report.page import Shown, png, render, script_of
 from testbed.results import REPORT, write_result
-from testbed.score.accuracy import AXES
+from testbed.score.accuracy import AXES, SETTLING_S
 from testbed.score.claims import HARDLY_ANY, MEDIAN, NEARLY_ALL, student
 from testbed.score.metrics import OUTAGE_MARKS_S
 
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
     from testbed.many.campaign import CampaignResult, Combination, Outcome
 
+UNSCORED = f"Errors over the runs: none is scored, which begins {SETTLING_S:.0f} s after an alignment"
 INTERACTIVE = ("errors", "nees")  # figures that the page has as plots to look around in
 TABLE, SUMMARY = "campaign.csv", "campaign.json"
 
@@ -347,12 +348,14 @@ def texts(result: CampaignResult) -> list[Text]:
     estimators = [e.name for e in result.combinations[0].scenario.estimator]
     for c in sorted(result.statistics.consistency, key=lambda c: estimators.index(c.estimator)):
         bounds = f"{c.lower:.2f} – {c.upper:.2f}"
-        numbers = [f"{c.nees:.2f}", bounds, f"{100 * c.inside:.0f} %", _number(c.false_alarms_per_h), str(c.runs)]
+        scored = math.isfinite(c.nees)
+        shown = [f"{c.nees:.2f}", bounds, f"{100 * c.inside:.0f} %"] if scored else ["–", bounds, "–"]
+        numbers = [*shown, _number(c.false_alarms_per_h), str(c.runs)]
         consistency.append([c.estimator, *values(c.combination), *numbers])
     enough = any(math.isfinite(s.median_low) for s in spreads)
     sure = Text("95 % confidence intervals of median and 95th percentile", intervals, 2 + len(keys))
     return [
-        Text("Errors over the runs", errors, 2 + len(keys)),
+        Text("Errors over the runs" if spreads else UNSCORED, errors, 2 + len(keys)),
         *([sure] if enough else []),
         Text("Consistency over the runs", consistency, 1 + len(keys)),
         *_efficiency(result, keys),

@@ -132,6 +132,8 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         lying = np.where(np.isfinite(true("q_nb")), true("q_nb"), estimated("q_nb"))  # as near as anybody knows
         position -= rotated(lying, np.broadcast_to(arm_b, position.shape))
         velocity -= rotated(lying, np.cross(true("omega_b"), arm_b))
+    for off in (position, velocity):
+        off[~(np.abs(off) < LARGEST)] = np.nan
     attitude = attitude_error(estimated("q_nb"), true("q_nb"))
     covariance = estimated("covariance")
     status = column(dataset, f"{own}/status")[rows]
@@ -142,9 +144,8 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
     # An attitude may be known before a position is; what is left out throughout was never claimed.
     begun = np.logical_or.accumulate(whole)
     for said in (np.column_stack([estimated(name) for name in ("lat", "lon", "h")]), estimated("v_n")):
-        known = np.asarray((np.abs(said) < LARGEST).all(axis=1))  # false for NaN
-        if known[aligned].any():
-            finite &= known | ~begun
+        if not np.isnan(said[aligned]).all():
+            finite &= np.asarray((np.abs(said) < LARGEST).all(axis=1)) | ~begun  # false for NaN
     since = np.zeros(len(t), bool) if aligned_s is None else t >= aligned_s
     settled = since if aligned_s is None else t >= aligned_s + settling_s
     own_n = np.array(json.loads(dataset.attrs.get("reference_sigma_n", "[0, 0, 0, 0, 0, 0]"))) ** 2

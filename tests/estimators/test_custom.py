@@ -254,6 +254,14 @@ def test_a_file_that_does_not_run_says_where(tmp_path: Path) -> None:
         UserError, match=r"can't be imported: ZeroDivisionError: division by zero \(broken.py, line 2\)"
     ):
         plugins.load("./broken.py:Mine", tmp_path, "none")
+    (tmp_path / "half.py").write_text("class A(:\n")
+    with pytest.raises(UserError, match=r"SyntaxError: invalid syntax \(half.py, line 1\)$"):
+        plugins.load("./half.py:A", tmp_path, "none")
+
+
+def test_a_kind_that_cannot_be_had_is_told_with_the_estimator_it_is_of(folder: Path) -> None:
+    with pytest.raises(UserError, match=r'^estimator mine: kind "./none.py:Mine": '):
+        flown(folder, kind="./none.py:Mine")
 
 
 def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pyulog import ULog
 
-from testbed.exports import export
+from testbed.exports import export, ulog
 from testbed.exports.px4 import NEVER, local
 from testbed.exports.px4_messages import MESSAGES, VERSIONS
 from testbed.exports.stream import START_US
@@ -174,6 +174,13 @@ def test_our_own_reader_finds_the_samples_again(flown: Path, record: Any, tmp_pa
     np.testing.assert_allclose(found.imus["imu"].dtheta[1:], imu["dtheta"].values[1:], rtol=1e-6, atol=1e-12)
     assert {"gnss", "gnss2", "barometer", "magnetometer", "airspeed"} <= found.samples.keys()
     assert len(found.samples["barometer"]) == len(record["sensors/barometer/time"])
+
+
+def test_what_a_field_cannot_hold_is_infinite_or_nothing() -> None:
+    stamps = np.arange(2, dtype=np.int64)
+    made = ulog.rows("sensor_gps", next(iter(VERSIONS)), stamps, satellites_used=[1e300, np.nan], eph=[1e300, 2.0])
+    assert made["satellites_used"].tolist() == [0, 0]
+    assert made["eph"].tolist() == [np.inf, 2.0]
 
 
 def test_formats_are_as_px4_writes_them() -> None:

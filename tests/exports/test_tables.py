@@ -91,6 +91,12 @@ def test_mat_has_a_struct_per_group_with_units(run_file: Path, tmp_path: Path) -
     assert found["attributes"]["seed"] == 3
 
 
+def test_a_folder_in_the_place_of_a_file_is_told(run_file: Path, tmp_path: Path) -> None:
+    for force in (False, True):
+        with pytest.raises(UserError, match="is a folder: give the name of a file"):
+            export(run_file, "mat", tmp_path, force)
+
+
 def test_unwritable_target_is_told(run_file: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for kind in ("csv", "mat"):

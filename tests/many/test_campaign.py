@@ -881,6 +881,16 @@ def test_few_runs_have_no_interval(tmp_path: Path) -> None:
     assert intervals.rows[1][2:] == ["0 – 5.00", "≥ 3.00"]
 
 
+def test_runs_too_short_to_be_scored_say_so(at_rest: Path, tmp_path: Path, threads: str) -> None:
+    short = ["duration_s=20", "sensors.gnss.denied=[]"]
+    errors, *_, consistency = campaign_report.texts(
+        campaign(at_rest, 2, overrides=short, out=tmp_path / "out", workers=threads)
+    )
+    assert errors.title.endswith("none is scored, which begins 60 s after an alignment")
+    _, nees, _, inside, *_ = consistency.rows[1]
+    assert (nees, inside) == ("–", "–")
+
+
 def test_history_is_the_error_once_a_second() -> None:
     dataset = synthetic_run.dataset(100.0, denied=((40.0, 50.0),))
     history = campaigns._history(dataset)

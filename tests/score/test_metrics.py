@@ -434,6 +434,18 @@ def test_an_attitude_before_a_position_does_not_make_it_one_of_attitude_only() -
     assert metrics.compute(run)["ins.nonfinite_samples"] == last.sum()
 
 
+@pytest.mark.parametrize(("name", "wrong"), [("v_n", np.inf), ("lat", np.nan), ("h", 1e300)])
+def test_what_never_was_a_number_is_not_taken_for_what_is_never_told(name: str, wrong: float) -> None:
+    run = synthetic_run.dataset(100.0)
+    own = run["estimators/ins"]
+    own[name].values.reshape(len(own["time"]), -1)[:, 0] = wrong
+    aligned = own["time"].values >= 5.0
+    assert metrics.compute(run)["ins.nonfinite_samples"] == aligned.sum()
+    for part in ("lat", "lon", "h") if name != "v_n" else ("v_n",):
+        own[part].values[:] = np.nan
+    assert "ins.nonfinite_samples" not in metrics.compute(run)
+
+
 def test_errors_are_judged_without_a_covariance() -> None:
     """A covariance that ends took the errors with it, and the estimates were called not finite."""
     run = synthetic_run.dataset(130.0)
