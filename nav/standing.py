@@ -16,7 +16,7 @@ from nav.aids.gnss import has_velocity
 from nav.increments import COINCIDENT, joined
 from nav.samples import Array, BodyVelocitySample, GnssSample, ImuSamples, Sample
 
-ZERO_VELOCITY = "zero velocity"  # in place of a sensor
+ZERO_VELOCITY = "zero_velocity"  # in place of a sensor
 WINDOW_S = 1.0  # over which it is judged, and as often a velocity is told
 LEAST_ROWS, LEAST_SHARE = 5, 0.9  # of increments in a window, and of its time that they must cover
 # The rms of what changes within a window, all axes together. Of eight recorded aircraft six stood with engines off, at

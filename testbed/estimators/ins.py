@@ -112,6 +112,8 @@ class InsSection(EstimatorSection):
                 yield (key,), "needs a GNSS receiver among the aids: add one, or leave it out"
         if self.zero_velocity_mps is not None and not any(one.kind == "gnss" for one in sensors.values()):
             yield ("zero_velocity_mps",), "needs a GNSS receiver, which says that it stands: add one, or leave it out"
+        if self.zero_velocity_mps is not None and ZERO_VELOCITY in sensors:
+            yield ("zero_velocity_mps",), f"takes the name {ZERO_VELOCITY!r}: give the sensor of that name another"
         yield from slip_mistakes(self.nonholonomic_mps, self.aids, sensors)
         yield from second_of_a_kind("ins", self.aids, sensors)
 

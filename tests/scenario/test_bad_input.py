@@ -615,6 +615,10 @@ def test_keys_of_an_ins() -> None:
     only = "sensors={imu={}, barometer={}, magnetometer={}}", "expect={}"
     assert "estimator[0].zero_velocity_mps: needs a GNSS receiver" in complaint(U_TURN, *only, standing[0])
     assert "estimator[0].zero_velocity_mps" in complaint(U_TURN, *only, standing[1])
+    named = "sensors={imu={}, gnss={}, zero_velocity={kind='barometer'}, magnetometer={}}", "expect={}"
+    assert "zero_velocity_mps: takes the name 'zero_velocity'" in complaint(
+        U_TURN, *named, "estimator=[{name='ins', aids=['gnss'], zero_velocity_mps=0.1}]"
+    )
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.engine="unscented"')
     assert "estimator[2].engine: is a key of kind 'ins', not of 'ahrs'" in ahrs
     ahrs = complaint(TEXTS["loiter_ahrs_continuous"], 'estimator.gyros.states="full"')
