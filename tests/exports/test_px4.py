@@ -177,10 +177,12 @@ def test_our_own_reader_finds_the_samples_again(flown: Path, record: Any, tmp_pa
 
 
 def test_what_a_field_cannot_hold_is_infinite_or_nothing() -> None:
-    stamps = np.arange(2, dtype=np.int64)
-    made = ulog.rows("sensor_gps", next(iter(VERSIONS)), stamps, satellites_used=[1e300, np.nan], eph=[1e300, 2.0])
-    assert made["satellites_used"].tolist() == [0, 0]
-    assert made["eph"].tolist() == [np.inf, 2.0]
+    stamps = np.arange(3, dtype=np.int64)
+    made = ulog.rows(
+        "sensor_gps", next(iter(VERSIONS)), stamps, satellites_used=[1e300, np.nan, 300.0], eph=[1e300, 2.0, 3.0]
+    )
+    assert made["satellites_used"].tolist() == [0, 0, 0]
+    assert made["eph"].tolist() == [np.inf, 2.0, 3.0]
 
 
 def test_formats_are_as_px4_writes_them() -> None:

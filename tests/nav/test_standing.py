@@ -101,6 +101,9 @@ def test_a_running_engine_a_missing_and_a_broken_increment_are_no_rest() -> None
     here = (imu.t < 20.01) | (imu.t > 23)
     gap = ImuSamples(imu.t[here], imu.dt[here], imu.dtheta[here], imu.dv[here])
     assert times(Standing((0.0, 0.0)).heard(gap, [fix(2.0)])) == list(range(3, 21))
+    short = (imu.t < 20.01) | (imu.t > 20.3)  # of one window a third is missing
+    cut = ImuSamples(imu.t[short], imu.dt[short], imu.dtheta[short], imu.dv[short])
+    assert times(Standing((0.0, 0.0)).heard(cut, [fix(2.0)])) == list(range(3, 21))
     again = times(Standing((0.0, 0.0)).heard(gap, [fix(2.0), fix(25.1)]))
     assert again == [*range(3, 21), *range(26, 31)]
 
