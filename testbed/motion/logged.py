@@ -167,7 +167,9 @@ class LogTruth(Section):
         ".npz, .mat, .parquet, or text such as .csv"
     )
     aircraft: str | None = Field(
-        default=None, description="an aircraft that flies as this one did, for what estimators expect; none: any body"
+        default=None,
+        min_length=1,
+        description="an aircraft that flies as this one did, for what estimators expect; none: any body",
     )
     rate_hz: TickRate = 200.0
     start_s: float = Field(default=0.0, ge=0, description="seconds of the log that are left out before the run begins")

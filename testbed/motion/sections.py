@@ -143,6 +143,8 @@ class Wind(Section):
 
     @model_validator(mode="after")
     def _one_wind(self) -> Self:
+        if "profile" in self.model_fields_set and not self.profile:
+            raise ValueError("profile has no rows: give one, or leave it out")
         one = [key for key in ("from_deg", "speed_mps", "front", "boundary_layer") if key in self.model_fields_set]
         given = [key for key in ("profile", "file") if getattr(self, key)]
         if len(given) == 2:
@@ -205,7 +207,9 @@ class FlightTruth(Section):
 
     source: Literal["flight"]
     aircraft: str = Field(
-        default="loiter", description="a shipped aircraft by name, or the path of a folder, seen from this file"
+        default="loiter",
+        min_length=1,
+        description="a shipped aircraft by name, or the path of a folder, seen from this file",
     )
     rate_hz: TickRate = 200.0
     start: Start = Field(description="where the flight begins")

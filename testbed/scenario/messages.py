@@ -147,6 +147,8 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[BaseModel]]
             return f"must be a number, not {shown(given)}"
         case "int_type" | "int_from_float":
             return f"must be a whole number, not {shown(given)}"
+        case "string_too_short":
+            return "must not be empty"
         case "string_type":
             return f'must be text in quotes, such as "text", not {shown(given)}'
         case "bool_type":

@@ -76,12 +76,15 @@ def _estimator(table: object, info: ValidationInfo) -> EstimatorSection:
         raise PydanticCustomError("estimator_kind", "{text}", {"text": str(error)}) from None
     found = section.model_validate({**table, "kind": kind}, strict=True)
     if isinstance(found, custom.CustomSection) and (folder := (info.context or {}).get("options")) is not None:
-        options = custom.options_of(found.kind, folder)
         try:
+            plugins.load(found.kind, folder, custom.GROUP)
+            options = custom.options_of(found.kind, folder)
             if options is not None:
                 options.model_validate(found.options)
         except ValidationError:
             raise
+        except UserError as error:
+            raise PydanticCustomError("estimator_kind", "{text}", {"text": str(error)}) from None
         except Exception as error:  # a validator of the user's
             raise PydanticCustomError("estimator_kind", "{text}", {"text": plugins.raised(error)}) from None
     return found
@@ -387,7 +390,7 @@ def _toml(text: str, place: str) -> dict[str, Any]:
 def _see_files(truth: dict[str, Any], path: Path | None) -> None:
     """Put what ``[truth]`` names as seen from the scenario file in place of what is written there."""
     folder = path.parent if path else Path()
-    if isinstance(named := truth.get("aircraft"), str):
+    if isinstance(named := truth.get("aircraft"), str) and named:
         truth["aircraft"] = _aircraft(named, path)
     streams = _tables(truth.get("columns"))
     columns = [one for stream in streams for one in _tables(stream)]

@@ -219,6 +219,8 @@ class Guard:
         for what, value in (("t", t), ("t_arrival", arrival)):
             if not (isinstance(value, Real) and math.isfinite(value)):
                 return f"a sample whose {what} is {shown(value)}: it must be a time in seconds"
+        if t < 0:
+            return f"a sample of {t:g} s, before the run begins: leave it out"
         if arrival < t:
             return f"a sample that arrives at {arrival:g} s, before it is true at {t:g} s"
         if name != self._name:

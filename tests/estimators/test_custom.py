@@ -259,9 +259,17 @@ def test_a_file_that_does_not_run_says_where(tmp_path: Path) -> None:
         plugins.load("./half.py:A", tmp_path, "none")
 
 
-def test_a_kind_that_cannot_be_had_is_told_with_the_estimator_it_is_of(folder: Path) -> None:
-    with pytest.raises(UserError, match=r'^estimator mine: kind "./none.py:Mine": '):
-        flown(folder, kind="./none.py:Mine")
+def test_every_kind_that_cannot_be_had_is_told_with_its_line(folder: Path) -> None:
+    text = (folder / "own.toml").read_text("utf-8").replace("filters.py:Mine", "none.py:Mine")
+    text += '[[estimator]]\nname = "two"\nkind = "./filters.py:Nope"\n'
+    (folder / "wrong.toml").write_text(text, "utf-8")
+    first, second = (n for n, line in enumerate(text.splitlines(), 1) if line.startswith('kind = "./'))
+    with pytest.raises(UserError) as told:
+        Scenario.load(folder / "wrong.toml")
+    one, two = str(told.value).splitlines()
+    assert one.startswith(f'{folder}/wrong.toml:{first}: estimator[1].kind: kind "./none.py:Mine": ')
+    assert two.startswith(f'{folder}/wrong.toml:{second}: estimator[2].kind: kind "./filters.py:Nope": there is no')
+    Scenario.parse(text, [], folder / "wrong.toml")  # as of a record, which needs no class
 
 
 def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:

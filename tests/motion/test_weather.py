@@ -275,6 +275,7 @@ aids = ["gnss", "airspeed"]
         ("{boundary_layer={roughness_m=20}}", "truth.wind.boundary_layer.roughness_m"),
         ("{boundary_layer={roughness_m=1, reference_m=0.5}}", "roughness_m must be below reference_m"),
         ("{updrafts={w_star_mps=2.0, depth_m=10}}", "truth.wind.updrafts.depth_m"),
+        ("{profile=[]}", "truth.wind: profile has no rows: give one, or leave it out"),
         ('{file="a.csv", profile=[[0, 0, 1]]}', "a file replaces a profile"),
         ('{file="a.csv", speed_mps=3}', "a file replaces speed_mps"),
         (

@@ -413,6 +413,11 @@ def test_a_kind_that_is_no_text(part: str, key: str, kind: str) -> None:
     assert f"{key}.kind: must be text in quotes" in complaint(U_TURN, f"{part}.kind={kind}")
 
 
+@pytest.mark.parametrize("key", ["title", "truth.aircraft"])
+def test_a_text_that_must_not_be_empty(key: str) -> None:
+    assert f"{key}: must not be empty" in complaint(U_TURN, f'{key}=""')
+
+
 def test_two_aids_of_a_kind() -> None:
     message = complaint(U_TURN, 'sensors.second={kind = "gnss"}', 'estimator.ins.aids=["gnss", "second"]')
     assert "estimator[0].aids[1]: 'second' is a second 'gnss': 'ins' takes one of each kind" in message
