@@ -27,7 +27,7 @@ from nav.aids.base import (
     aid_blocks,
     report_on,
 )
-from nav.aids.gnss import Contradiction, GnssAid
+from nav.aids.gnss import Contradiction, GnssAid, Wake
 from nav.claims import Claim, FollowingAid
 from nav.detection import ChiSquareGate, Mask, WindMemory, whiten
 from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_errors
@@ -84,6 +84,7 @@ class LocalFilter:
         self._contradictions = {
             aid.sensor: Contradiction(aid.largest_jump) for aid in aids if isinstance(aid, GnssAid) and aid.largest_jump
         }
+        self._wakes = {aid.sensor: Wake() for aid in aids if isinstance(aid, GnssAid) and aid.latency_sigma}
         self.silence = Silence(air.sensor) if air is not None and air.sideslip_sigma is not None else None
 
     def monitor(self, monitored: MonitoredAid, patience: Patience) -> None:
@@ -254,6 +255,10 @@ class LocalFilter:
         if measurement is not None and isinstance(sample, BarometerSample) and aid.sensor in self._scatters:
             scatter = self._scatters[aid.sensor].heard(sample)
             measurement = measurement._replace(R=np.maximum(measurement.R, scatter))
+        if measurement is not None and part == "gnss_velocity" and aid.sensor in self._wakes:
+            assert isinstance(aid, GnssAid)
+            now = aid.manoeuvre(state)
+            measurement = measurement._replace(R=measurement.R + self._wakes[aid.sensor].heard(sample.t, now) - now)
         claim = self.claims.get((aid.sensor, part))
         if measurement is not None and claim is not None and not claim.following.state:
             measurement = measurement._replace(R=claim.at(sample.t) * measurement.R)
@@ -276,11 +281,18 @@ class LocalFilter:
         return statistic, threshold, threshold * nis / statistic if statistic > 0.0 else threshold
 
     def as_judged(self, part: str, sample: Sample, S: Array) -> Array:
-        """S (m, m) as a detector or a gate is given it: of positions wider by what velocities contradict them."""
-        if part != "gnss_position" or sample.sensor not in self._contradictions:
+        """S (m, m) as a detector or a gate is given it.
+
+        That of positions is wider by what velocities contradict them, of velocities by what a manoeuvre does at once.
+        """
+        if part == "gnss_position" and sample.sensor in self._contradictions:
+            assert isinstance(sample, GnssSample)
+            more = self._contradictions[sample.sensor].heard(sample)
+        elif part == "gnss_velocity" and sample.sensor in self._wakes:
+            more = self._wakes[sample.sensor].onset
+        else:
             return S
-        assert isinstance(sample, GnssSample)
-        wide: Array = S + np.diag(self._contradictions[sample.sensor].heard(sample))
+        wide: Array = S + np.diag(more)
         return wide
 
     def innovate(self, state: State, measurement: Measurement) -> tuple[Array, Array, float]:

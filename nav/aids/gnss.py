@@ -30,11 +30,13 @@ from nav.rotation import cross, dcm_from_quat, quat_rotate
 from nav.samples import Array, GnssSample, Sample
 
 if TYPE_CHECKING:
+    from nav.state import State
     from nav.unscented import Points
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
 AT_REST = 1e-12  # square of a speed below which there is no direction [m^2/s^2]
 CONTRADICTION_S, REMEMBERED_S = 2.0, 6.0  # over which positions are held against velocities, faults remembered
+WAKE_S = 0.5  # in which what manoeuvres do to velocities comes, and goes, but for 1/e
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,10 @@ class GnssAid:
     and by the accelerometers' biases is left out: 0.03 m/s for a degree and 0.2 s. Where it is known to
     ``latency_sigma`` only when a sample was valid, two states say by how much earlier the position was, and by how
     much more the velocity lags. The receiver's own filters make both change with each manoeuvre by as much: velocity
-    times that is noise of the position beside its sigma, and acceleration times that of the velocity. Positions of a
-    sound receiver that jump against its velocities by no more than ``largest_jump`` are no fault: see
-    `Contradiction`. All this is what manoeuvres may do: with ``follow_s`` positions are claimed to be better as long
-    as they are, and velocities to be worse (`nav.claims`).
+    times that is noise of the position beside its sigma, and acceleration times that of the velocity, where it outlasts
+    the manoeuvre (`Wake`). Positions of a sound receiver that jump against its velocities by no more than
+    ``largest_jump`` are no fault: see `Contradiction`. All this is what manoeuvres may do: with ``follow_s`` positions
+    are claimed to be better as long as they are, and velocities to be worse (`nav.claims`).
     """
 
     sensor: str = "gnss"
@@ -155,9 +157,7 @@ class GnssAid:
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         R = white(sample.sigma_velocity_n, self._correlated[1])
         if latency >= 0 or self.velocity_lag:
-            acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
-            if state.rates[1].any():
-                acceleration[2] += gravity(float(state.lla[0]), float(state.lla[2]))
+            acceleration = _acceleration(state)
             lag = self.velocity_lag
             if latency >= 0:
                 lag += float(at.x[latency] + at.x[latency + 1])
@@ -165,6 +165,10 @@ class GnssAid:
                 R = R + (self.latency_sigma * acceleration) ** 2
             nu += lag * acceleration
         return Measurement(nu, H, R, unknown)
+
+    def manoeuvre(self, state: State) -> Array:
+        """The variance (3,) [m^2/s^2] that accelerating now adds to a velocity that is late by an uncertain time."""
+        return (self.latency_sigma * _acceleration(state)) ** 2
 
     def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
         """See `AidAtPoints`."""
@@ -198,6 +202,36 @@ def white(sigma: Array, correlated_variance: Array) -> Array:
         reported = sigma[i] * sigma[i]
         R[i] = max(reported - correlated_variance[i], WHITE_SHARE * reported)
     return R
+
+
+def _acceleration(state: State) -> Array:
+    """What the vehicle is accelerated by, NED (3,) [m/s^2]; where no increment was felt yet, none."""
+    acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
+    if state.rates[1].any():
+        acceleration[2] += gravity(float(state.lla[0]), float(state.lla[2]))
+    return acceleration
+
+
+@dataclass
+class Wake:
+    """What a manoeuvre does to a receiver's velocities, and leaves in them: the error of a pull-up outlasts it.
+
+    w_k = e w_(k-1) + (1 - e) m_k per axis, e = exp(-dt / `WAKE_S`), where m_k is `GnssAid.manoeuvre`. A manoeuvre that
+    is more than that by its `onset` max(0, m_k - w_k) may do that too, at once.
+    """
+
+    variance: Array = field(default_factory=lambda: np.zeros(3))  # w [m^2/s^2]
+    onset: Array = field(default_factory=lambda: np.zeros(3))  # [m^2/s^2]
+    _heard: float = -math.inf  # [s]
+
+    def heard(self, t: float, manoeuvre: Array) -> Array:
+        """The variance (3,) [m^2/s^2] at ``t`` [s]; at a time that it was told of before it is what it was."""
+        if t > self._heard:
+            kept = math.exp((self._heard - t) / WAKE_S)
+            self.variance = kept * self.variance + (1.0 - kept) * manoeuvre
+            self.onset = np.maximum(0.0, manoeuvre - self.variance)
+            self._heard = t
+        return self.variance
 
 
 @dataclass

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 from worlds.ins import CONSUMER, FIELD_N, flight, gnss, imu, magnetometer
 
 from nav.aids import AirspeedAid, GnssAid, MagnetometerAid
 from nav.aids.airspeed import SLOW
 from nav.aids.base import OperatingPoint
+from nav.aids.gnss import WAKE_S, Wake
 from nav.alignment import InitialState
+from nav.detection import ChiSquareGate
 from nav.earth import gravity
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
+from nav.local_filter import LocalFilter
 from nav.reference import Reference
 from nav.samples import AirspeedSample, FixType, GnssSample, ImuSamples, MagnetometerSample, Outcome
 
+RECEIVER, STEP = GnssAid(latency_sigma=0.1), 0.2
 SPEED, TURN = 20.0, 0.5  # of a level circle [m/s, rad/s]
 LAT, H = math.radians(47.0), 300.0
 
@@ -60,6 +66,61 @@ def test_an_uncertain_latency_counts_with_velocity_and_acceleration():
     np.testing.assert_allclose(speed.R, 0.01 + (0.1 * SPEED * TURN * across) ** 2, atol=1e-9)
     np.testing.assert_allclose(speed.H[:, [late, lag]], np.outer(-SPEED * TURN * across, [1, 1]), atol=1e-9)
     np.testing.assert_allclose(at.P[late : lag + 1, late : lag + 1], 0.01 * np.eye(2))
+
+
+def test_a_wake_is_the_mean_of_the_last_half_second_and_what_goes_beyond_that_is_its_onset():
+    manoeuvre = np.zeros((60, 3))
+    manoeuvre[10:30] = [4.0, 1.0, 0.0]  # two pulls, of four seconds and of one sample
+    manoeuvre[45] = 9.0
+    kept = np.exp(-STEP / WAKE_S)
+    mean = lfilter([1.0 - kept], [1.0, -kept], manoeuvre, axis=0)
+    wake = Wake()
+    for k, now in enumerate(manoeuvre):
+        np.testing.assert_allclose(wake.heard(STEP * k, now), mean[k], atol=1e-12)
+        np.testing.assert_allclose(wake.onset, np.maximum(now - mean[k], 0.0), atol=1e-12)
+
+
+def test_a_wake_begins_with_what_it_hears_first_and_hears_each_sample_once():
+    wake = Wake()
+    np.testing.assert_array_equal(wake.heard(5.0, np.ones(3)), np.ones(3))
+    np.testing.assert_array_equal(wake.heard(5.0, np.full(3, 7.0)), np.ones(3))
+    np.testing.assert_array_equal(wake.heard(4.0, np.full(3, 7.0)), np.ones(3))  # taken back and flown again
+    np.testing.assert_array_equal(wake.onset, np.zeros(3))
+
+
+def test_velocities_are_taken_for_as_bad_and_judged_by_what_begins():
+    """10 m/s^2 of a turn is 1 m/s of 0.1 s; half a second after it has ended 1/e of that variance is left."""
+    filter_, at = LocalFilter(CONSUMER, [RECEIVER], ChiSquareGate(1e-3)), circling(RECEIVER)
+    level = np.array([0.0, 0.0, -gravity(LAT, H)])
+    straight = Rotation.from_quat(at.state.q_nb, scalar_first=True).inv().apply(level)
+    turning = at.state.rates[1].copy()
+
+    def told(t, force_b):
+        at.state.rates[1] = force_b
+        sample = replace(fix(velocity(0.7)), t=t, t_arrival=t)
+        R = filter_.measure(at.reference, at.state, RECEIVER, "gnss_velocity", sample).R
+        return R - sample.sigma_velocity_n**2, filter_.as_judged("gnss_velocity", sample, np.eye(3)) - np.eye(3)
+
+    pull, onset = told(0.7, turning)
+    assert np.linalg.norm(np.sqrt(pull)) == pytest.approx(0.1 * SPEED * TURN)
+    assert not onset.any()
+    left, onset = told(0.7 + WAKE_S, straight)
+    np.testing.assert_allclose(left, pull / np.e, atol=1e-12)
+    assert not onset.any()
+    nothing, _ = told(0.7 + 80 * WAKE_S, straight)
+    np.testing.assert_allclose(nothing, 0.0, atol=1e-12)
+    again, onset = told(0.7 + 81 * WAKE_S, turning)
+    np.testing.assert_allclose(again + np.diag(onset), pull)
+    np.testing.assert_allclose(again, (1 - 1 / np.e) * pull)
+
+
+def test_a_receiver_whose_latency_is_known_leaves_no_wake():
+    aid = GnssAid()
+    filter_, at = LocalFilter(CONSUMER, [aid], ChiSquareGate(1e-3)), circling(aid)
+    S = np.eye(3)
+    found = filter_.measure(at.reference, at.state, aid, "gnss_velocity", fix(velocity(0.7)))
+    np.testing.assert_array_equal(found.R, fix(velocity(0.7)).sigma_velocity_n ** 2)
+    assert filter_.as_judged("gnss_velocity", fix(velocity(0.7)), S) is S
 
 
 @pytest.mark.parametrize("lag", [0.1, -0.1, 0.2])
