@@ -16,6 +16,7 @@ from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
+from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency
@@ -145,7 +146,7 @@ class Recorded:
         doubt = log.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
-        told = [doubt, *_losses(log, [*scenario.sensors, *_references(truth)])]
+        told = [doubt, *mistaken(log), *_losses(log, [*scenario.sensors, *_references(truth)])]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:

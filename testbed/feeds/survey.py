@@ -105,9 +105,9 @@ class Survey:
 
 def survey(log: Log) -> Survey:
     """Measure what is in a log."""
-    phases = _phases(log)
-    resting = max((p for p in phases if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
-    moving = [p for p in phases if p.name in MOVING]
+    found = phases(log)
+    resting = max((p for p in found if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
+    moving = [p for p in found if p.name in MOVING]
     noise = {name: still for name, imu in log.imus.items() if (still := _noise(log, imu, resting)) is not None}
     vibration = {name: felt for name, imu in log.imus.items() if (felt := _vibration(log, imu, moving)) is not None}
     times = {name: imu.t for name, imu in log.imus.items()}
@@ -124,7 +124,7 @@ def survey(log: Log) -> Survey:
         elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
-    return Survey(log, rates, phases, noise, vibration, late, spheres, scales)
+    return Survey(log, rates, found, noise, vibration, late, spheres, scales)
 
 
 def _rate(t: Array) -> Rate:
@@ -145,7 +145,7 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
     return t, v_n, np.array([(one.lat, one.lon, one.h) for one in found]).reshape(-1, 3)
 
 
-def _phases(log: Log) -> list[Phase]:
+def phases(log: Log) -> list[Phase]:
     """Rest by the inertial unit, flight by GNSS speed or height."""
     imu = next(iter(log.imus.values()))
     count = max(int((imu.t[-1] - log.t0) / WINDOW_S), 1)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from testbed.feeds.draft import sections
+from testbed.feeds.mistaken import mistaken
 from testbed.feeds.survey import Survey
 from testbed.feeds.unsound import barometers, magnetometers
 from testbed.score.likeness import ALIKE, Row
@@ -33,7 +34,7 @@ def tables(found: Survey) -> Iterator[Table]:
     more = " …" if len(listed) > MESSAGES_SHOWN else ""
     _add(head, "holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)
     unsound = {**magnetometers(found), **barometers(found)}
-    for note in [*log.notes, *([log.remark] if log.remark else []), *unsound.values()]:
+    for note in [*log.notes, *([log.remark] if log.remark else []), *mistaken(log), *unsound.values()]:
         _add(head, "note", note)
     yield head
     reports = _table("sensors", "sensor", "samples", "rate [Hz]", "jitter [ms]", "gaps", "longest step [s]", "proposed")

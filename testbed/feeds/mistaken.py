@@ -1,0 +1,112 @@
+"""What of a log can't be in the units and axes that it is taken for, by what its sensors say of each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from nav.earth import STANDARD_GRAVITY, displacement_n
+from nav.samples import Array, GnssSample, ImuSamples
+from testbed.feeds.log import Log
+from testbed.feeds.survey import between, fixes, phases
+
+STRETCH_S = 5.0  # over which a way, and a turn, are added up: fixes may be told to a metre only
+LEAST_STRETCHES = 10
+LEAST_WAY, LEAST_CLIMB = 15.0, 5.0  # in a stretch [m]
+LEAST_TURN = math.radians(360)  # of the course
+# What 56 logs have, of which one receiver was jammed and two IMUs were not right: positions are 1 to 4 % of their way
+# off what velocities say (0.29 and 0.54 of bad ones), heights 6 to 31 % (0.44 and 0.65); km/h make 72 %, exchanged axes
+# more, and a sign 200 %. Gyros feel 1.1 to 5 times what the course turns, 0.2 to 1.4 rad/s; deg/s for rad/s are 57
+# times as much. Accelerometers feel 0.81 to 1.08 of gravity.
+MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
+LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
+LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, as the median
+ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
+
+
+def mistaken(log: Log) -> list[str]:
+    """What contradicts what, a sentence for each sensor; nothing where all may be as it is taken for."""
+    told = []
+    for name, own in log.samples.items():
+        if any(isinstance(one, GnssSample) and one.has_fix for one in own):
+            told += [f"{name}: {what}: are units, columns and axes right?" for what in _receiver(own)]
+    for name, imu in log.imus.items():
+        if len(imu) > 1:
+            told += [f"{name}: {what}" for what in _inertial(log, imu)]
+    return told
+
+
+def _receiver(own: Sequence[Any]) -> Iterator[str]:
+    """Where its positions go otherwise than its velocities say."""
+    t, v_n, place = fixes(own)
+    usable = np.isfinite(v_n).all(axis=1) & np.isfinite(place).all(axis=1)
+    t, v_n, place = t[usable], v_n[usable], place[usable]
+    ways = list(_stretches(t, v_n, place))
+    if not ways:
+        return
+    said, gone = (np.array(one) for one in zip(*ways, strict=True))
+    ways_of = (("go", [0, 1], LEAST_WAY, MOST_OFF), ("climb", [2], LEAST_CLIMB, MOST_HEIGHT_OFF))
+    for what, axes, least, most in ways_of:
+        far = np.maximum(*(np.linalg.norm(one[:, axes], axis=1) for one in (said, gone))) >= least
+        if far.sum() < LEAST_STRETCHES:
+            continue
+        off = np.linalg.norm((said - gone)[far][:, axes], axis=1)
+        way = np.linalg.norm(gone[far][:, axes], axis=1)
+        told = np.linalg.norm(said[far][:, axes], axis=1)
+        if np.median(off) > most * np.median(np.maximum(way, told)):
+            figures = f"{np.median(way):.3g} m in {STRETCH_S:g} s where these say {np.median(told):.3g} m"
+            yield f"its positions {what} otherwise than its velocities say ({figures}, {np.median(off):.3g} m apart)"
+
+
+def _stretches(t: Array, v_n: Array, place: Array) -> Iterator[tuple[Array, Array]]:
+    """What velocities add up to (3,) and how far positions move (3,) [m] in each stretch without a gap."""
+    first = 0
+    for k in range(1, len(t)):
+        if t[k] - t[k - 1] > 0.5 * STRETCH_S:
+            first = k
+        elif t[k] - t[first] >= STRETCH_S:
+            rows = slice(first, k + 1)
+            said = np.atleast_1d(np.trapezoid(v_n[rows], t[rows], axis=0))
+            yield said, displacement_n(*place[k].tolist(), *place[first].tolist())
+            first = k
+
+
+def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
+    """Where gravity, or the turns of a receiver's course, are not what it feels."""
+    size = np.linalg.norm(imu.dv, axis=1) / imu.dt
+    usual = float(np.median(size[np.isfinite(size)])) if np.isfinite(size).any() else STANDARD_GRAVITY
+    if not LEAST_FORCE < usual / STANDARD_GRAVITY < MOST_FORCE:
+        yield f"it feels {usual:.3g} m/s² mostly, where gravity is 9.8: is the unit of its accelerometers right?"
+    elif _lies_on_its_back(log, imu):
+        yield "at rest it lies on its back: are its axes forward, right and down?"
+    if log.receiver is None:
+        return
+    t, v_n, _ = fixes(log.samples[log.receiver])
+    at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
+    felt = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1))])
+    fast = np.hypot(v_n[:, 0], v_n[:, 1]) > LEAST_WAY / STRETCH_S
+    step = np.diff(t)
+    both = fast[1:] & fast[:-1] & (step < 0.5 * STRETCH_S) & (t[:-1] > at[0]) & (t[1:] < at[-1])
+    seconds = float(step[both].sum())
+    if seconds < LEAST_STRETCHES * STRETCH_S:
+        return
+    heading = np.exp(1j * np.arctan2(v_n[:, 1], v_n[:, 0]))
+    course = float(np.abs(np.angle(heading[1:] / heading[:-1]))[both].sum())
+    own = float(np.diff(np.interp(t, at, felt))[both].sum())
+    rates = f"{math.degrees(own / seconds):.3g} deg/s on the way"
+    if own > FASTEST_TURN * seconds:
+        yield f"its gyros feel {rates}: is their unit right?"
+    elif course > LEAST_TURN and own < LEAST_FELT * course:
+        turns = f"{math.degrees(course / seconds):.3g} deg/s"
+        yield f"its gyros feel {rates}, where the course of {log.receiver} turns by {turns}: is their unit right?"
+
+
+def _lies_on_its_back(log: Log, imu: ImuSamples) -> bool:
+    """Whether gravity pulls it upwards for most of its rest."""
+    rests = [between(log, imu, one) for one in phases(log) if one.name == "rest"]
+    forces = [np.nansum(imu.dv[rows], axis=0) for rows in rests]
+    total = np.sum(forces, axis=0) if forces else np.zeros(3)
+    return bool(-total[2] < math.cos(ON_ITS_BACK) * np.linalg.norm(total))

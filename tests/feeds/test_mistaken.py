@@ -1,0 +1,137 @@
+"""Units and axes of a log that can't be right, by what its sensors say of each other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pymap3d
+import pytest
+from rich.console import Console
+
+from nav.samples import FixType, GnssSample, ImuSamples
+from testbed import Scenario
+from testbed.feeds import formats
+from testbed.feeds.log import Log
+from testbed.feeds.mistaken import mistaken
+from testbed.feeds.recorded import Recorded
+from testbed.feeds.survey import survey
+from testbed.report.log import tables
+
+RADIUS, SPEED, CLIMB, STANDS, LASTS = 200.0, 20.0, 2.0, 20.0, 200.0
+RIGHT = "are units, columns and axes right?"
+
+
+def flown():
+    """Twenty seconds at rest, then a climbing circle to the right; the body level, its nose along the way."""
+    rng = np.random.default_rng(7)
+    t = np.arange(0.01, LASTS, 0.01)
+    aloft = (t > STANDS)[:, None]
+    rate = np.where(aloft, [0.0, 0.0, SPEED / RADIUS], 0.0) + rng.normal(0.0, 2e-3, (len(t), 3))
+    force = np.where(aloft, [0.0, SPEED**2 / RADIUS, -9.8], [0.0, 0.0, -9.8]) + rng.normal(0.0, 0.05, (len(t), 3))
+    imu = ImuSamples(t, np.full(len(t), 0.01), 0.01 * rate, 0.01 * force)
+    fixes = []
+    for now in np.arange(0.2, LASTS - 0.2, 0.2).tolist():
+        flying = max(now - STANDS, 0.0)
+        angle, moves = SPEED * flying / RADIUS, float(flying > 0)
+        east, north, up = RADIUS * (1 - math.cos(angle)), RADIUS * math.sin(angle), CLIMB * flying
+        lat, lon, h = pymap3d.enu2geodetic(*(rng.normal([east, north, up], 1.0)), 47.0, 8.0, 400.0)
+        v_n = moves * np.array([SPEED * math.cos(angle), SPEED * math.sin(angle), -CLIMB]) + rng.normal(0.0, 0.1, 3)
+        sigma = np.ones(3)
+        fixes.append(
+            GnssSample(
+                now, now, math.radians(lat), math.radians(lon), h, v_n, sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.5
+            )
+        )
+    return imu, fixes
+
+
+IMU, FIXES = flown()
+
+
+def log(imu=IMU, fixes=FIXES):
+    return Log(Path("a.npz"), "table", {"imu": imu}, {"gnss": fixes}, None, 0.0, {})
+
+
+def with_velocities(change):
+    return [replace(one, v_n=change(one.v_n)) for one in FIXES]
+
+
+def test_nothing_is_said_of_what_is_right():
+    assert mistaken(log()) == []
+
+
+def test_a_short_log_says_nothing():
+    few = ImuSamples(*(column[:400] for column in (IMU.t, IMU.dt, IMU.dtheta, IMU.dv)))
+    assert mistaken(log(few, with_velocities(lambda v: 9 * v)[:15])) == []
+    assert mistaken(log(fixes=[replace(one, v_n=np.full(3, np.nan)) for one in FIXES])) == []
+
+
+@pytest.mark.parametrize(
+    "change", [lambda v: v / 3.6, lambda v: 3.6 * v, lambda v: v[[1, 0, 2]], lambda v: v * [1, -1, 1]]
+)
+def test_velocities_that_do_not_lead_where_positions_are(change):
+    (said,) = [one for one in mistaken(log(fixes=with_velocities(change))) if "positions go" in one]
+    assert said.startswith("gnss: its positions go otherwise than its velocities say (")
+    assert said.endswith(RIGHT)
+
+
+def test_heights_that_velocities_contradict():
+    (said,) = mistaken(log(fixes=with_velocities(lambda v: v * [1, 1, -1])))
+    assert said.startswith("gnss: its positions climb otherwise than its velocities say (10")
+    assert said.endswith(RIGHT)
+
+
+@pytest.mark.parametrize("wrong", [math.pi / 180, 180 / math.pi])
+def test_gyros_in_another_unit(wrong):
+    (said,) = mistaken(log(replace(IMU, dtheta=wrong * IMU.dtheta)))
+    assert said.startswith("imu: its gyros feel ")
+    assert said.endswith("is their unit right?")
+    assert ("where the course of gnss turns by 5.7" in said) == (wrong < 1)
+
+
+@pytest.mark.parametrize("wrong", [9.8, 1 / 9.8, 0.5])
+def test_accelerometers_in_another_unit(wrong):
+    (said,) = mistaken(log(replace(IMU, dv=wrong * IMU.dv)))
+    assert said.startswith("imu: it feels ")
+    assert float(said.split()[3]) == pytest.approx(wrong * math.hypot(9.8, SPEED**2 / RADIUS), rel=0.02)
+    assert said.endswith("is the unit of its accelerometers right?")
+
+
+@pytest.mark.parametrize(
+    ("turned", "said"),
+    [
+        ([1, -1, -1], ["imu: at rest it lies on its back: are its axes forward, right and down?"]),
+        ([-1, -1, 1], []),
+    ],
+)
+def test_a_unit_on_its_back(turned, said):
+    assert mistaken(log(replace(IMU, dv=IMU.dv * turned))) == said
+
+
+def test_what_stands_on_its_tail_is_sound():
+    on_its_tail = np.stack([-IMU.dv[:, 2], IMU.dv[:, 1], IMU.dv[:, 0]], axis=1)
+    assert mistaken(log(replace(IMU, dv=on_its_tail))) == []
+
+
+def test_a_log_and_a_run_say_it(tmp_path):
+    flat = {"imu_t": IMU.t, "gyro": IMU.dtheta / 0.01, "accel": IMU.dv / 0.01, "gnss_t": [one.t for one in FIXES]}
+    flat |= {name: [getattr(one, name) for one in FIXES] for name in ("lat", "lon", "h")}
+    flat["v"] = [3.6 * one.v_n for one in FIXES]
+    np.savez(tmp_path / "a.npz", **flat)
+    (tmp_path / "a.toml").write_text(
+        'title = "a"\nduration_s = 190\n[truth]\nsource = "log"\nfile = "a.npz"\n'
+        '[truth.columns.imu]\ntime = "imu_t"\ngyro = "gyro"\naccel = "accel"\n'
+        '[truth.columns.gnss]\ntime = "gnss_t"\nlat = "lat"\nlon = "lon"\nheight = "h"\nvelocity = "v"\n'
+        '[sensors.imu]\ngrade = "mems-hobby"\n[sensors.gnss]\ngrade = "u-blox-m8"\n'
+        '[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
+    )
+    scenario = Scenario.load(tmp_path / "a.toml")
+    said = "gnss: its positions go otherwise than its velocities say"
+    assert said in Recorded(scenario, 1).remark()
+    console = Console(width=400)
+    with console.capture() as shown:
+        console.print(next(tables(survey(formats.open_log(scenario.truth)))))
+    assert said in shown.get()
