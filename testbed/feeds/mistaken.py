@@ -28,7 +28,7 @@ ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
 
 
 def mistaken(log: Log) -> list[str]:
-    """What contradicts what, a sentence for each sensor; nothing where all may be as it is taken for."""
+    """What contradicts what, a sentence each, sensor by sensor; nothing where all may be as it is taken for."""
     told = []
     for name, own in log.samples.items():
         if any(isinstance(one, GnssSample) and one.has_fix for one in own):
@@ -48,8 +48,8 @@ def _receiver(own: Sequence[Any]) -> Iterator[str]:
     if not ways:
         return
     said, gone = (np.array(one) for one in zip(*ways, strict=True))
-    ways_of = (("go", [0, 1], LEAST_WAY, MOST_OFF), ("climb", [2], LEAST_CLIMB, MOST_HEIGHT_OFF))
-    for what, axes, least, most in ways_of:
+    level, upright = ("go", [0, 1], LEAST_WAY, MOST_OFF), ("climb", [2], LEAST_CLIMB, MOST_HEIGHT_OFF)
+    for what, axes, least, most in (level, upright):
         far = np.maximum(*(np.linalg.norm(one[:, axes], axis=1) for one in (said, gone))) >= least
         if far.sum() < LEAST_STRETCHES:
             continue

@@ -146,7 +146,7 @@ class Recorded:
         doubt = log.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
-        told = [doubt, *mistaken(log), *_losses(log, [*scenario.sensors, *_references(truth)])]
+        told = [doubt, *mistaken(_as_used(log, sections)), *_losses(log, [*scenario.sensors, *_references(truth)])]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
@@ -246,6 +246,16 @@ def _references(truth: LogTruth) -> list[str]:
     """The streams of a table that are known of the motion, where the run makes use of them."""
     used = [name for name, stream in truth.columns.items() if (stream.kind or name) == "reference"]
     return used if truth.reference == "solution" else []
+
+
+def _as_used(log: Log, sections: Mapping[str, SensorConfig]) -> Log:
+    """The log of the sensors that a run makes use of, its units' forces in body axes."""
+    imus = {
+        name: replace(log.imus[name], dv=log.imus[name].dv @ section.errors().C_sb)
+        for name, section in sections.items()
+        if isinstance(section, ImuConfig)
+    }
+    return replace(log, imus=imus, samples={name: own for name, own in log.samples.items() if name in sections})
 
 
 def _losses(log: Log, streams: Collection[str]) -> list[str]:

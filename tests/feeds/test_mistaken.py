@@ -116,22 +116,40 @@ def test_what_stands_on_its_tail_is_sound():
     assert mistaken(log(replace(IMU, dv=on_its_tail))) == []
 
 
-def test_a_log_and_a_run_say_it(tmp_path):
-    flat = {"imu_t": IMU.t, "gyro": IMU.dtheta / 0.01, "accel": IMU.dv / 0.01, "gnss_t": [one.t for one in FIXES]}
-    flat |= {name: [getattr(one, name) for one in FIXES] for name in ("lat", "lon", "h")}
-    flat["v"] = [3.6 * one.v_n for one in FIXES]
-    np.savez(tmp_path / "a.npz", **flat)
-    (tmp_path / "a.toml").write_text(
+def table(folder, lies=(1, 1, 1), says=1.0, sensors=""):
+    """The scenario of a table with both, and a receiver that nobody uses unless ``sensors`` has it."""
+    flat = {"imu_t": IMU.t, "gyro": IMU.dtheta / 0.01 * lies, "accel": IMU.dv / 0.01 * lies}
+    flat |= {name: [getattr(one, name) for one in FIXES] for name in ("lat", "lon", "h", "t", "v_n")}
+    np.savez(folder / "a.npz", **flat, v=says * np.array(flat["v_n"]))
+    place = 'time = "t"\nlat = "lat"\nlon = "lon"\nheight = "h"\n'
+    (folder / "a.toml").write_text(
         'title = "a"\nduration_s = 190\n[truth]\nsource = "log"\nfile = "a.npz"\n'
         '[truth.columns.imu]\ntime = "imu_t"\ngyro = "gyro"\naccel = "accel"\n'
-        '[truth.columns.gnss]\ntime = "gnss_t"\nlat = "lat"\nlon = "lon"\nheight = "h"\nvelocity = "v"\n'
-        '[sensors.imu]\ngrade = "mems-hobby"\n[sensors.gnss]\ngrade = "u-blox-m8"\n'
+        f'[truth.columns.gnss]\n{place}velocity = "v_n"\n[truth.columns.second]\nkind = "gnss"\n{place}velocity = "v"\n'
+        f'[sensors.imu]\ngrade = "mems-hobby"\n{sensors}[sensors.gnss]\ngrade = "u-blox-m8"\n'
         '[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
     )
-    scenario = Scenario.load(tmp_path / "a.toml")
-    said = "gnss: its positions go otherwise than its velocities say"
-    assert said in Recorded(scenario, 1).remark()
+    return Scenario.load(folder / "a.toml")
+
+
+def shown(scenario):
     console = Console(width=400)
-    with console.capture() as shown:
+    with console.capture() as kept:
         console.print(next(tables(survey(formats.open_log(scenario.truth)))))
-    assert said in shown.get()
+    return kept.get()
+
+
+def test_a_log_says_it_of_all_and_a_run_of_what_it_uses(tmp_path):
+    said = "second: its positions go otherwise than its velocities say"
+    unused = table(tmp_path, says=3.6)
+    assert said in shown(unused)
+    assert Recorded(unused, 1).remark() == ""
+    used = table(tmp_path, says=3.6, sensors='[sensors.second]\nkind = "gnss"\n')
+    assert said in Recorded(used, 1).remark()
+
+
+def test_a_unit_that_is_told_to_be_mounted_on_its_back_is_sound(tmp_path):
+    on_its_back = table(tmp_path, lies=(1, -1, -1))
+    assert "at rest it lies on its back" in shown(on_its_back)
+    assert "at rest it lies on its back" in Recorded(on_its_back, 1).remark()
+    assert Recorded(table(tmp_path, (1, -1, -1), sensors="mounting_deg = [180, 0, 0]\n"), 1).remark() == ""
