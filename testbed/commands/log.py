@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -57,7 +58,8 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
             )
         print("Say in [truth.columns.<sensor>] of a scenario what they are, and give that in place of the table.")
         return
-    found = survey(formats.read(place, {}) if truth is None else formats.open_log(truth))
+    read = formats.read(place, {}) if truth is None else formats.open_log(truth)
+    found = survey(read if date is None else replace(read, date=date))
     if compare is not None:
         from testbed.score import likeness
 

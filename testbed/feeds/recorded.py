@@ -19,7 +19,7 @@ from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
-from testbed.feeds.survey import latency
+from testbed.feeds.survey import latency, usual_step
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario
@@ -56,8 +56,7 @@ def located(scenario: Scenario) -> Scenario:
 def rate(log: Log, name: str) -> float:
     """How often a sensor of a log reports [Hz], to `DIGITS` digits."""
     t = log.imus[name].t if name in log.imus else np.array([one.t for one in log.samples[name]])
-    steps = np.diff(t)
-    usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    usual = usual_step(t) if len(t) > 1 and t[-1] > t[0] else 1.0
     return float(f"{1 / usual:.{DIGITS}g}")
 
 

@@ -18,6 +18,7 @@ from nav._jit import njit
 from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
+from testbed.errors import UserError
 from testbed.feeds.log import Log
 from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
@@ -29,6 +30,8 @@ LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
+TOGETHER = 10  # steps
+SLOWEST_IMU_S = 2.0  # between its samples: more is another unit of time
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
@@ -127,11 +130,20 @@ def survey(log: Log) -> Survey:
     return Survey(log, rates, found, noise, vibration, late, spheres, scales)
 
 
+def usual_step(t: Array) -> float:
+    """The usual time from one of ascending times (N,) to the next, N > 1: the median of the mean of `TOGETHER` steps.
+
+    One step alone says nothing of that where stamps are rounded, or come in pairs.
+    """
+    n = min(TOGETHER, len(t) - 1)
+    return float(np.median(t[n:] - t[:-n])) / n
+
+
 def _rate(t: Array) -> Rate:
     steps = np.diff(t)
     if not len(steps):
         return Rate(len(t), math.nan, math.nan, 0, 0.0)
-    usual = float(np.median(steps))
+    usual = usual_step(t)
     ordinary = steps[steps <= max(GAP_PERIODS * usual, GAP_S)]
     jitter = float(np.std(ordinary)) if len(ordinary) else math.nan
     return Rate(len(t), 1 / usual, jitter, len(steps) - len(ordinary), float(steps.max()))
@@ -146,8 +158,11 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 
 def phases(log: Log) -> list[Phase]:
-    """Rest by the inertial unit, flight by GNSS speed or height."""
+    """Rest by the inertial unit, flight by GNSS speed or height. Raises UserError where its times can't be seconds."""
     imu = next(iter(log.imus.values()))
+    if len(imu) > 1 and (step := usual_step(imu.t)) > SLOWEST_IMU_S:
+        told = f"its IMU reports every {step:.3g} s, for {imu.t[-1] - imu.t[0]:.3g} s"
+        raise UserError(f'{log.path}: {told}: give truth.columns.<sensor>.time a unit, such as "ms" or "us"')
     count = max(int((imu.t[-1] - log.t0) / WINDOW_S), 1)
     edges = log.t0 + WINDOW_S * np.arange(count + 1)
     rows = np.searchsorted(imu.t, edges)
@@ -193,7 +208,7 @@ def _noise(log: Log, imu: ImuSamples, resting: Phase | None) -> Noise | None:
     if resting is None or resting.end - resting.start < LEAST_REST_S:
         return None
     part = between(log, imu, resting)
-    dt = float(np.median(imu.dt[part]))
+    dt = usual_step(imu.t[part])
     gyro, force = imu.dtheta[part] / imu.dt[part, None], imu.dv[part] / imu.dt[part, None]
     found: list[tuple[float, float, float]] = []
     for values in (gyro, force):
@@ -218,7 +233,7 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     force = force[np.isfinite(force).all(axis=1)]  # of increments that a table lacks nothing is known
     if len(force) < 2:
         return None
-    rate_hz = 1 / float(np.median(imu.dt[part]))
+    rate_hz = 1 / usual_step(imu.t[part])
     frequency, density = signal.welch(force, rate_hz, nperseg=min(1024, len(force)), axis=0)
     total = density.sum(axis=1)
     fast = frequency >= 5.0

@@ -29,7 +29,8 @@ def tables(found: Survey) -> Iterator[Table]:
     lasts = max(float(own.t[-1]) for own in log.imus.values()) - log.t0
     head.add_row("lasts", f"{lasts:.1f} s")
     head.add_row("date", str(log.date or "not said"))
-    _add(head, "reference", log.solution.name if log.solution is not None else "its GNSS alone")
+    reference = "its GNSS alone" if log.receiver is not None else "none"
+    _add(head, "reference", log.solution.name if log.solution is not None else reference)
     listed = [f"{name} {count}" for name, count in sorted(log.messages.items())]
     more = " …" if len(listed) > MESSAGES_SHOWN else ""
     _add(head, "holds", ", ".join(listed[:MESSAGES_SHOWN]) + more)

@@ -12,7 +12,7 @@ from scipy import signal
 
 from nav.samples import Array, ImuSamples
 from testbed.errors import UserError
-from testbed.feeds.survey import LEAST_REST_S, MOVING, Survey, between
+from testbed.feeds.survey import LEAST_REST_S, MOVING, Survey, between, usual_step
 from testbed.record.reader import load
 from testbed.score import accuracy, detection
 from testbed.sensors.units import DEG, DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS_PER_ROOT_H
@@ -127,7 +127,7 @@ def _moving_spectrum(found: Survey, imu: ImuSamples) -> tuple[Array, tuple[Array
     if moving is None or moving.end - moving.start < LEAST_REST_S:
         return np.empty(0), (np.empty(0), np.empty(0))
     part = between(found.log, imu, moving)
-    rate_hz = 1 / float(np.median(imu.dt[part]))
+    rate_hz = 1 / usual_step(imu.t[part])
     densities = []
     for increments in (imu.dtheta[part], imu.dv[part]):
         measured = increments / imu.dt[part, None]

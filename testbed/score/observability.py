@@ -60,6 +60,7 @@ from nav.samples import (
 )
 from testbed.errors import UserError
 from testbed.estimators import registry
+from testbed.estimators.lane import Lane
 from testbed.estimators.outside import OutsideSection
 from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
@@ -98,7 +99,7 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     found = {}
     own = [one for one in scenario.estimator if one.kind in registry.BUILT_IN and not isinstance(one, OutsideSection)]
     for name, running in registry.build(own, scenario.rig(scenario.seed)).items():
-        way = _way(dataset, name) if name in accuracy.names(dataset) else None
+        way = _way(dataset, name, running) if name in accuracy.names(dataset) else None
         if way is None:
             continue
         match running.horizon.estimator:
@@ -112,11 +113,12 @@ def of_run(dataset: xarray.DataTree) -> dict[str, Visibility]:
     return found
 
 
-def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
+def _way(dataset: xarray.DataTree, name: str, running: Lane) -> _Way | None:
     """The way from where the estimator was aligned, None when it never was, or only at the end.
 
     Where nobody knows the motion it is that of the next time at which somebody does, or the last; None where
-    nobody ever does.
+    nobody ever does. A recorded flight has no truth of what is felt: it is what the estimator's IMU felt, None where
+    the record lacks that too; and its air moves with the ground.
     """
     own, t = f"estimators/{name}", column(dataset, "truth/time")
     aligned = np.flatnonzero(column(dataset, f"{own}/status") & Status.ALIGNED)
@@ -133,11 +135,33 @@ def _way(dataset: xarray.DataTree, name: str) -> _Way | None:
     lla = np.column_stack([motion[key][row] for key in ("lat", "lon", "h")])
     q_nb, v_n, dv, dtheta = (motion[key][row] for key in ("q_nb", "v_n", "dv", "dtheta"))
     airspeed = column(dataset, "truth/airspeed")[row]
+    airspeed = np.where(np.isfinite(airspeed), airspeed, np.linalg.norm(v_n, axis=1))
+    if not motion["dv"][known].any():
+        unit, C_sb = next(iter(running.imus.items()))
+        felt = _felt(dataset, unit, t[row - 1], t[row])
+        if felt is None:
+            return None
+        dtheta, dv = (increments @ C_sb for increments in felt)
     interval = (t[row] - t[row - 1])[:, None]
     sigma = np.concatenate(
         [column(dataset, f"{own}/sigma_{what}_n")[aligned[0]] for what in ("attitude", "velocity", "position")]
     )
     return _Way(edges, t[row], q_nb, v_n, lla, airspeed, dv / interval, dtheta / interval, sigma)
+
+
+def _felt(dataset: xarray.DataTree, unit: str, begins: Array, ends: Array) -> tuple[Array, Array] | None:
+    """The increments (N, 3) [rad], [m/s] that an IMU has recorded between times, None where it has not."""
+    if f"/sensors/{unit}" not in dataset.groups:
+        return None
+    t = column(dataset, f"sensors/{unit}/time")
+    first, stop = (np.searchsorted(t, edges + KNOWN, side="right") for edges in (begins, ends))
+
+    def between(name: str) -> Array:
+        total = np.cumsum(np.nan_to_num(column(dataset, f"sensors/{unit}/{name}")), axis=0)
+        total = np.vstack([np.zeros(3), total])
+        return np.asarray(total[stop] - total[first])
+
+    return between("dtheta"), between("dv")
 
 
 def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, int], sensor: str = "") -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import testbed.__main__ as cli
-from nav.samples import GnssSample
+from nav.samples import GnssSample, ImuSamples
 from testbed import Scenario, run
 from testbed.data import data_dir
 from testbed.errors import UserError
@@ -281,3 +282,29 @@ def test_log_shows_a_table_and_writes_a_scenario_that_runs(
     assert [getattr(one, "profile", "") for one in scenario.estimator] == ["", "any_motion"]
     assert "without a log" in command("log", str(data_dir("scenarios") / "u_turn.toml"))
     assert "No such file" in command("log", "nowhere.bin")
+
+
+@pytest.mark.parametrize("stamps", ["exact", "milliseconds", "pairs"])
+def test_the_rate_is_that_of_samples_however_they_are_stamped(stamps: str) -> None:
+    """400 a second, rounded down to whole milliseconds, or two by two; a line of 80 Hz stays where it is."""
+    rng, exact = np.random.default_rng(3), np.arange(1, 24001) / 400
+    t = {"exact": exact, "milliseconds": np.floor(1e3 * exact) / 1e3, "pairs": np.floor(200 * exact) / 200}[stamps]
+    t = t + (1e-4 * (np.arange(24000) % 2) if stamps == "pairs" else 0.0)
+    dt = np.diff(t, prepend=t[0] - 0.0025)
+    force = rng.normal(0.0, 0.05, (24000, 3)) - [0.0, 0.0, 9.8]
+    force[12000:, 2] += 3 * np.sin(2 * np.pi * 80 * exact[12000:])
+    rate = rng.normal(0.0, 1e-3, (24000, 3)) + np.where(exact > 30, 0.3 * np.sin(exact), 0.0)[:, None]
+    imu = ImuSamples(t, dt, dt[:, None] * rate, dt[:, None] * force)
+    found = survey(Log(Path("a.npz"), "table", {"imu": imu}, {}, None, float(t[0]), {}))
+    assert found.rates["imu"].rate_hz == pytest.approx(400, rel=1e-3)
+    assert found.noise["imu"].gyro_walk == pytest.approx(1e-3 / math.sqrt(400), rel=0.2)
+    (frequency, _), *_ = found.vibration["imu"].lines
+    assert frequency == pytest.approx(80.0, abs=0.5)
+
+
+@pytest.mark.parametrize("per_second", [1e3, 1e6, 1e9])
+def test_times_in_another_unit_are_told(per_second: float) -> None:
+    t = np.arange(4000.0) / 100 * per_second
+    imu = ImuSamples(t, np.full(4000, per_second / 100), np.zeros((4000, 3)), np.zeros((4000, 3)))
+    with pytest.raises(UserError, match=r'^a.npz: its IMU reports every 1.*e?.* s, for .* s: give .* such as "ms"'):
+        survey(Log(Path("a.npz"), "table", {"imu": imu}, {}, None, 0.0, {}))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import io
 import math
@@ -13,6 +14,7 @@ import pytest
 from rich.console import Console
 from worlds.log_writers import dataflash, us
 
+import testbed.__main__ as cli
 from nav.earth import isa_pressure
 from testbed.feeds import draft, formats
 from testbed.feeds.survey import Survey, survey
@@ -103,3 +105,27 @@ def test_a_barometer_that_is_elsewhere_than_its_receiver_is_told(air: float, whe
     console.print(next(tables(found)))
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     assert ("its pressure altitude is" in shown) == bool(where)
+
+
+@pytest.mark.parametrize("date", ["", "date = 2024-06-01\n"])
+def test_a_table_has_the_date_of_its_scenario(
+    date: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    t, mag_t = np.arange(0, 20, 0.02), np.arange(0, 20, 0.1)
+    flat = {"t": t, "g": np.zeros((len(t), 3)), "a": np.tile([0, 0, -9.8], (len(t), 1)), "mag_t": mag_t}
+    flat |= {"m": np.tile([480.0, 0.0, 0.0], (len(mag_t), 1)), "lat": np.full(len(mag_t), 47.0)}
+    np.savez(tmp_path / "a.npz", **flat)
+    (tmp_path / "a.toml").write_text(
+        f'title = "a"\nduration_s = 15\n{date}[truth]\nsource = "log"\nfile = "a.npz"\n'
+        '[truth.columns.imu]\ntime = "t"\ngyro = "g"\naccel = "a"\n'
+        '[truth.columns.gnss]\ntime = "mag_t"\nlat = { column = "lat", unit = "deg" }\n'
+        'lon = { column = "lat", unit = "deg" }\nheight = "lat"\n'
+        '[truth.columns.magnetometer]\ntime = "mag_t"\nfield = { column = "m", unit = "mG" }\n'
+        '[sensors.imu]\n[sensors.gnss]\n[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
+    )
+    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setattr("sys.argv", ["testbed", "log", str(tmp_path / "a.toml")])
+    with contextlib.suppress(SystemExit):
+        cli.main()
+    told = "magnetometer: at rest its field is inclined by 0 deg, by the World Magnetic Model by 6"
+    assert (told in capsys.readouterr().out) == bool(date)

@@ -16,6 +16,7 @@ from testbed.papers import scenario
 from testbed.report import page as report
 from testbed.report import tables
 from testbed.report.figures import observability as figures
+from testbed.report.figures.imu import imu_error
 from testbed.report.run import Run
 from testbed.score import accuracy, metrics
 from testbed.score import observability as visibility
@@ -204,6 +205,18 @@ def test_a_receiver_may_have_any_name() -> None:
     assert list(found) == ["ins", "federated", "ahrs"]
     for name in ("ins", "federated"):
         assert np.isfinite(found[name].seen_from()[found[name].names.index("dv down")])
+
+
+def test_of_a_recorded_flight_it_is_by_what_its_imu_felt() -> None:
+    """Nobody knows the force of a recorded flight: without any, neither tilt nor wind would ever be seen."""
+    flown = run(Scenario.load("recorded_flight", {"expect": {}})).dataset
+    assert not np.nan_to_num(flown["truth/dv"].values).any()
+    found = visibility.of_run(flown)
+    assert (share(found["ins"], "phi north", "phi east", "wind 1", "airspeed_scale") > 0.9).all()
+    assert (share(found["ahrs"], "phi north", "phi east") > 0.9).all()
+    unheard = run(Scenario.load("recorded_flight", {"expect": {}, "record.imu": False})).dataset
+    assert visibility.of_run(unheard) == {}
+    assert imu_error(Run(flown), "ins") is None
 
 
 def test_the_figure_is_pale_where_only_the_past_helps() -> None:

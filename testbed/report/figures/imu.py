@@ -71,9 +71,12 @@ def _focus_bias(ax: Axes, value: Array, real: Array) -> None:
 
 
 def imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
-    """Times ``t`` (N,) and mean error ``gyro`` (N, 3) [rad/s], ``accel`` (N, 3) [m/s^2] of an estimator's IMU."""
+    """Times ``t`` (N,) and mean error ``gyro`` (N, 3) [rad/s], ``accel`` (N, 3) [m/s^2] of an estimator's IMU.
+
+    None where nobody knows it: truth of a recorded flight does not tell what is felt.
+    """
     imu = run.imu_of(estimator)
-    if imu is None or len(run.t) < 3:
+    if imu is None or len(run.t) < 3 or not np.nan_to_num(run.truth("dv")).any():
         return None
     t = column(run.dataset, f"sensors/{imu}/time")
     edges = np.arange(run.t[0], run.t[-1], BIAS_STEP_S)
