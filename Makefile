@@ -80,3 +80,4 @@ lock:
 
 clean:
 	rm -rf $(VENV) $(CLIENTS) $(LOWEST) runs site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks
+	find . -name __pycache__ -prune -exec rm -rf {} +

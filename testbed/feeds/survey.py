@@ -208,7 +208,10 @@ def _noise(log: Log, imu: ImuSamples, resting: Phase | None) -> Noise | None:
     if resting is None or resting.end - resting.start < LEAST_REST_S:
         return None
     part = between(log, imu, resting)
-    dt = usual_step(imu.t[part])
+    t = imu.t[part]
+    if not len(t) or t[-1] - t[0] < LEAST_REST_S:  # another unit was heard then
+        return None
+    dt = usual_step(t)
     gyro, force = imu.dtheta[part] / imu.dt[part, None], imu.dv[part] / imu.dt[part, None]
     found: list[tuple[float, float, float]] = []
     for values in (gyro, force):

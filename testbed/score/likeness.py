@@ -127,6 +127,8 @@ def _moving_spectrum(found: Survey, imu: ImuSamples) -> tuple[Array, tuple[Array
     if moving is None or moving.end - moving.start < LEAST_REST_S:
         return np.empty(0), (np.empty(0), np.empty(0))
     part = between(found.log, imu, moving)
+    if part.stop - part.start < 2:  # another unit was heard then
+        return np.empty(0), (np.empty(0), np.empty(0))
     rate_hz = 1 / usual_step(imu.t[part])
     densities = []
     for increments in (imu.dtheta[part], imu.dv[part]):

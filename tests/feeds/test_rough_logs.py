@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import testbed.__main__ as cli
-from nav.samples import GnssSample, ImuSamples
+from nav.samples import Array, GnssSample, ImuSamples
 from testbed import Scenario, run
 from testbed.data import data_dir
 from testbed.errors import UserError
@@ -308,3 +308,15 @@ def test_times_in_another_unit_are_told(per_second: float) -> None:
     imu = ImuSamples(t, np.full(4000, per_second / 100), np.zeros((4000, 3)), np.zeros((4000, 3)))
     with pytest.raises(UserError, match=r'^a.npz: its IMU reports every 1.*e?.* s, for .* s: give .* such as "ms"'):
         survey(Log(Path("a.npz"), "table", {"imu": imu}, {}, None, 0.0, {}))
+
+
+@pytest.mark.parametrize("heard", [0, 1, 2])
+def test_a_unit_that_was_hardly_heard_at_rest_has_no_noise(heard: int) -> None:
+    def still(t: Array) -> ImuSamples:
+        turning = np.where(t > 30, 0.3 * np.sin(t), 0.0)[:, None]
+        return ImuSamples(t, np.full(len(t), 0.01), 0.01 * turning * np.ones(3), np.tile([0, 0, -0.098], (len(t), 1)))
+
+    late = still(np.concatenate([10 + 0.01 * np.arange(heard), np.arange(40, 60, 0.01)]))
+    both = {"imu": still(np.arange(0.01, 60, 0.01)), "imu2": late}
+    found = survey(Log(Path("a.npz"), "table", both, {}, None, 0.0, {}))
+    assert list(found.noise) == ["imu"]
