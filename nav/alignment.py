@@ -45,7 +45,8 @@ WITHOUT_VELOCITY_S = 10.0  # so long must it take then: as long as errors of suc
 NOISE_SHARE = 0.2  # gyrocompassing lasts until noise adds less than this share of the limit
 SWING_ROUNDS = 3  # of the correction of the antenna's swing: each leaves a few hundredths of the last
 UNCALIBRATED = 2.5  # times what a magnetometer is told to be wrong by: a sound one is so once in twenty
-FIELD_HEADING_LIMIT = 0.7  # hard iron over the level field, beyond which a magnetometer tells no heading to begin with
+# Hard iron over the level field, beyond which a magnetometer tells no heading to begin with: beside a course, or alone.
+FIELD_HEADING_LIMIT, ALONE_LIMIT = 0.7, 1.0
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
 FEW, CLEARLY = 5, 0.9  # pairs, and the share of pushes that is explained, where nothing else is asked for a heading
@@ -285,16 +286,15 @@ class Alignment:
     ) -> _Heading | None:
         speed = math.hypot(fix.v_n[0], fix.v_n[1])
         told = field_bias == self.aids.field_bias
-        if (
-            self._fields > 0
-            and field_n is not None
-            and (told or field_bias <= FIELD_HEADING_LIMIT * math.hypot(field_n[0], field_n[1]))
-        ):
+        on_course = speed >= COURSE_SPEED and self.aids.wind <= COURSE_SIGMA_LIMIT * speed
+        level = 0.0 if field_n is None else math.hypot(field_n[0], field_n[1])
+        most = level * (FIELD_HEADING_LIMIT if on_course else ALONE_LIMIT)
+        if self._fields > 0 and field_n is not None and (told or field_bias <= most):
             field_b = C_b0 @ self._field_0 / self._fields
             return _Heading(
                 field_b, field_n, self.aids.field**2 / self._fields, self._magnetometer(field_b, field_bias)
             )
-        if speed >= COURSE_SPEED and self.aids.wind <= COURSE_SIGMA_LIMIT * speed:
+        if on_course:
             course = np.array([fix.v_n[0], fix.v_n[1], 0.0])
             return _Heading(np.array([1.0, 0.0, 0.0]), course, 0.0, heading_sigma=self.aids.wind / speed)
         at_rest = max(speed, float(np.linalg.norm(first.v_n))) <= REST_SPEED
@@ -378,7 +378,9 @@ class Alignment:
 
     def _state(self, fix: GnssSample, T: float, dv_b: Array, dv_n: Array, heading: _Heading) -> InitialState:
         C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
-        J = [_attitude_jacobian(dv_b, heading.s_b, dv_n, heading.s_n, which) for which in range(4)]
+        # As filters reckon with what is measured: hard iron that makes a field longer turns it by no less for them.
+        expected_b = C_nb.T @ heading.s_n
+        J = [_attitude_jacobian(dv_b, expected_b, dv_n, heading.s_n, which) for which in range(4)]
 
         variance_v = np.diag(whole(fix.sigma_velocity_n, self.aids.gnss_velocity))
         up = dv_n / np.linalg.norm(dv_n)

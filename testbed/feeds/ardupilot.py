@@ -51,6 +51,7 @@ SOLUTIONS = ("XKF1", "NKF1", "EKF1", "ATT")  # the last is what it flew by, whoe
 PLACES = ("POS", "AHR2")
 TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in the vehicle [rad]
 RESOLUTION_DEG = 0.02  # of logged angles, and of what is added to them
+LAST_PAGE = 528  # of a log that is written by pages, which may be empty [bytes]
 LEAST_RUNNING = 0.5  # of the log
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
@@ -58,9 +59,9 @@ Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one u
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a DataFlash log. Raises UserError when it is damaged, or has no inertial data."""
-    messages = _messages(path)
-    units = _units(messages)
     notes: list[str] = []
+    messages = _messages(path, notes)
+    units = _units(messages)
     imus: dict[str, ImuSamples] = {}
     for name, rows in units.get("imu", {}).items():
         t, kept = _times(name, rows, notes)
@@ -68,7 +69,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     if not imus:
         imus = _raw_units(units, notes)
     found = {name: len(rows) for name, rows in messages.items()}
-    require_imu(path, imus, found, NEEDED)
+    require_imu(path, imus, found, NEEDED, notes)
     samples = _aiding(units, notes)
     solution = None
     for solution in _solutions(messages, _first_fix(samples)):
@@ -83,18 +84,20 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     return at_pace(log, _pace(units))
 
 
-def _messages(path: Path) -> dict[str, list[dict[str, Any]]]:
-    """All messages by their names. Raises UserError when there are none."""
+def _messages(path: Path, notes: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """All messages by their names, and what of the file is none. Raises UserError when there are no messages."""
     with path.open("rb") as file:
         text = file.read(2) != BINARY
     with warnings.catch_warnings(), _silence():
         warnings.simplefilter("ignore", ResourceWarning)  # of a file that the reader gives up on
-        found, problem = _parsed(path, text)
+        found, size, problem = _parsed(path, text)
         if problem:
             gc.collect()
     if not found:
         cut = "it was cut off, or never written"
         raise UserError(f"{path}: a DataFlash log without a single message: {problem or cut}")
+    if not text and (lost := path.stat().st_size - size) > LAST_PAGE:
+        notes.append(f"{lost} of its {size + lost} bytes can't be read, and are left out: it is damaged")
     return found
 
 
@@ -112,21 +115,25 @@ def _silence() -> Iterator[None]:
         os.close(kept)
 
 
-def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], str]:
-    """The messages up to where the file is damaged beyond reading, and how it is, empty when it is not."""
+def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], int, str]:
+    """The messages up to where the file is damaged beyond reading, the bytes that they are, of a binary one, and how it
+    is damaged, empty when it is not.
+    """
     from pymavlink import DFReader  # type: ignore[import-untyped]
 
     found: dict[str, list[dict[str, Any]]] = {}
+    size = 0
     wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES, "PARM"}
     try:
         reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
         with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
             while (message := reader.recv_msg()) is not None:
                 name = message.get_type()
+                size += getattr(message.fmt, "len", 0)
                 found.setdefault(name, []).append(_fields(message) if name in wanted else {})
     except Exception as error:  # whatever a damaged file makes the reader raise
-        return found, f"{type(error).__name__} {error}"
-    return found, ""
+        return found, size, f"{type(error).__name__} {error}"
+    return found, size, ""
 
 
 def _fields(message: Any) -> dict[str, Any]:
@@ -146,6 +153,8 @@ def _units(messages: Mapping[str, list[dict[str, Any]]]) -> dict[str, dict[str, 
             numbers = {one.get("I") for one in own}
             for number in sorted(numbers, key=lambda n: -1 if n is None else n):
                 of_unit = [one for one in own if one.get("I") == number]
+                if number is not None and len(of_unit) == 1 < len(own):
+                    continue  # what damaged bytes look like
                 count = (k if number is None else int(number)) + 1
                 if kind in ("gyr", "acc") and number is None:
                     count = max(k, 1)

@@ -18,7 +18,7 @@ from testbed.errors import UserError
 from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.reference import doubt
-from testbed.feeds.survey import Noise, Survey
+from testbed.feeds.survey import Noise, Sphere, Survey
 from testbed.feeds.unsound import magnetometers
 from testbed.motion.logged import LogTruth
 from testbed.motion.terrain import JACKSBORO
@@ -58,9 +58,9 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
                     keys["latency_s"] = found.latency_s[name]
             case MagnetometerSample():
                 keys = {"kind": "magnetometer", "grade": grade, **keys}
-                residual = found.field_residual.get(name, (0.0, 0.0))[0] / MICROTESLA
-                if residual > MAGNETOMETERS[grade]["hard_iron_ut"]:
-                    keys["hard_iron_ut"] = _rounded(residual)
+                iron = _iron(found.spheres.get(name)) / MICROTESLA
+                if iron > MAGNETOMETERS[grade]["hard_iron_ut"]:
+                    keys["hard_iron_ut"] = _rounded(iron)
             case BarometerSample():
                 keys = {"kind": "barometer", "grade": grade, **keys}
             case AirspeedSample():
@@ -72,6 +72,14 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
                 continue
         made[name] = keys
     return made
+
+
+def _iron(sphere: Sphere | None) -> float:
+    """What a magnetometer's field is off by per axis [T], by the sphere that fits it; 0 where none is known."""
+    if sphere is None:
+        return 0.0
+    sure = sphere.off > BIAS_SIGMAS * sphere.off_sigma
+    return max(sphere.residual, sphere.off / math.sqrt(3) if sure else 0.0)
 
 
 def imu_keys(noise: Noise | None) -> dict[str, Any]:
@@ -116,7 +124,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     date = log.date if date is None else date
     own = sections(found)
     unsound = magnetometers(found)
-    aids = [name for name, keys in own.items() if keys["kind"] != "imu"]
+    aids = [name for name in own if len(log.samples.get(name, ())) > 1]
     aids.sort(key=unsound.__contains__)  # those that are come last
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
     if log.receiver is not None:

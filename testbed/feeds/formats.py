@@ -40,6 +40,11 @@ FORMATS = (
     Format("Parquet", (b"PAR1",), "table"),
 )
 CSV = Format("CSV", (), "table")  # text, whatever it begins with
+# What else files begin with, and what to do about it.
+OTHERS = (
+    ((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf"), "is compressed: unpack it first"),
+    ((b"\xff\xfe", b"\xfe\xff"), "is text in UTF-16: save it as UTF-8"),
+)
 
 
 def open_log(truth: LogTruth) -> Log:
@@ -97,5 +102,8 @@ def known(path: Path) -> Format:
     if head[8:9] in (b"\xfd", b"\xfe"):
         what = "a telemetry log, which has no inertial data at their rate"
         raise UserError(f"{path}: is {what}: give the log that the autopilot kept on board")
+    for begins, told in OTHERS:
+        if head.startswith(begins):
+            raise UserError(f"{path}: {told}")
     names = ", ".join(one.name for one in (*FORMATS, CSV))
     raise UserError(f"{path}: is no log of a known format: these are {names}")

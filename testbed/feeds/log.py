@@ -95,11 +95,12 @@ class Log:
 
     @property
     def receiver(self) -> str | None:
-        """The first GNSS receiver with a fix, None when there is none."""
-        for name, own in self.samples.items():
-            if any(isinstance(one, GnssSample) and one.has_fix for one in own):
-                return name
-        return None
+        """The first GNSS receiver with at least half as many fixes as the one with the most, None without a fix."""
+        fixes = {
+            name: sum(isinstance(one, GnssSample) and one.has_fix for one in own) for name, own in self.samples.items()
+        }
+        most = max(fixes.values(), default=0)
+        return next((name for name, count in fixes.items() if most and 2 * count >= most), None)
 
 
 def beginning(
@@ -145,11 +146,14 @@ def at_pace(log: Log, pace: float) -> Log:
     return replace(log, imus=imus, samples=samples, solution=solution, t0=log.t0 / pace, notes=[*log.notes, slow])
 
 
-def require_imu(path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, int], needed: str) -> None:
-    """Raise UserError when a log has no inertial data, with what it has and what would be needed."""
+def require_imu(
+    path: Path, imus: Mapping[str, ImuSamples], found: Mapping[str, int], needed: str, notes: Sequence[str] = ()
+) -> None:
+    """Raise UserError when a log has no inertial data, with what it has, what would be needed and what was odd."""
     if not any(len(imu) > 1 for imu in imus.values()):
         there = ", ".join(f"{name} ({count})" for name, count in sorted(found.items())) or "nothing at all"
-        raise UserError(f"{path}: has no inertial data: needed are {needed}; it has {there}")
+        odd = "".join(f"; {note}" for note in notes)
+        raise UserError(f"{path}: has no inertial data: needed are {needed}; it has {there}{odd}")
 
 
 def require_one_clock(path: Path, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> None:

@@ -50,12 +50,12 @@ Making: TypeAlias = Callable[[str, Rows, list[str]], Samples]
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a ULog. Raises UserError when it is damaged, or has no inertial data."""
-    logged = _topics(path)
+    notes: list[str] = []
+    logged = _topics(path, notes)
     found = {name: sum(len(rows["timestamp"]) for rows in own.values()) for name, own in logged.items()}
     topics = _one_height(logged)
-    notes: list[str] = []
     imus = _imus(topics, notes)
-    require_imu(path, imus, found, NEEDED)
+    require_imu(path, imus, found, NEEDED, notes)
     samples: dict[str, Samples] = {}
     for kind, sources in SOURCES.items():
         counts = [_most(topics, source[0], source[1]) for source in sources]
@@ -77,8 +77,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     )  # fmt: skip
 
 
-def _topics(path: Path) -> dict[str, dict[int, Rows]]:
-    """All topics with their fields. Raises UserError when the file can't be read, or holds none."""
+def _topics(path: Path, notes: list[str]) -> dict[str, dict[int, Rows]]:
+    """All topics with their fields, and what is missing. Raises UserError where none can be read."""
     from pyulog import ULog
 
     try:
@@ -92,6 +92,11 @@ def _topics(path: Path) -> dict[str, dict[int, Rows]]:
             topics.setdefault(data.name, {})[data.multi_id] = data.data
     if not topics:
         raise UserError(f"{path}: a ULog without a single message: it was cut off, or never written")
+    if log.file_corruption:
+        notes.append("parts of it can't be read, and are left out: it is damaged")
+    if log.dropouts:
+        lost = sum(one.duration for one in log.dropouts) / 1e3
+        notes.append(f"its logger was too slow {len(log.dropouts)} times: all messages of {lost:.2f} s are missing")
     return topics
 
 

@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,10 +31,12 @@ LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
 TOGETHER = 10  # steps
+ROUNDING_S = 1e-9  # of times that are numbers
 SLOWEST_IMU_S = 2.0  # between its samples: more is another unit of time
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
+ERRORS = 20  # of a magnetometer in a flight that are independent: each lasts
 LEAST_SPREAD = 0.05  # of a field about its mean, over its median size, in the direction of the least
 ACROSS = 0.1  # share of the flight across its main direction, to tell wind from scale
 SCALE_SIGMA, WORST_CONDITION = 0.05, 1e6  # of an airspeed scale that is worth saying
@@ -92,6 +94,18 @@ class Vibration:
     lines: Sequence[tuple[float, float]]
 
 
+class Sphere(NamedTuple):
+    """The sphere that fits magnetic fields in body axes best [T]: their rms distance from it, and its radius.
+
+    Its centre is ``off`` the origin, by hard iron, known to ``off_sigma``.
+    """
+
+    residual: float
+    radius: float
+    off: float
+    off_sigma: float
+
+
 @dataclass(frozen=True, slots=True)
 class Survey:
     """All that was found; what could not be is None or missing."""
@@ -102,7 +116,7 @@ class Survey:
     noise: Mapping[str, Noise]
     vibration: Mapping[str, Vibration]
     latency_s: Mapping[str, float]
-    field_residual: Mapping[str, tuple[float, float]]  # rms about the sphere that fits, and its radius [T]
+    spheres: Mapping[str, Sphere]
     airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
 
 
@@ -146,6 +160,7 @@ def _rate(t: Array) -> Rate:
     usual = usual_step(t)
     ordinary = steps[steps <= max(GAP_PERIODS * usual, GAP_S)]
     jitter = float(np.std(ordinary)) if len(ordinary) else math.nan
+    jitter = 0.0 if jitter < ROUNDING_S else jitter
     return Rate(len(t), 1 / usual, jitter, len(steps) - len(ordinary), float(steps.max()))
 
 
@@ -301,22 +316,26 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     return 0.0 if best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
 
 
-def _sphere(field: Array) -> tuple[float, float] | None:
-    """The rms distance of magnetic fields (N, 3) from the sphere that fits them best, and its radius [T].
-
-    None where the vehicle did not turn enough to tell.
-    """
+def _sphere(field: Array) -> Sphere | None:
+    """The sphere that fits magnetic fields (N, 3) [T]; None where the vehicle did not turn enough to tell."""
     known = field[np.isfinite(field).all(axis=1)]
     if len(known) < LEAST_FIXES:
         return None
     scale = float(np.abs(known).max()) or 1.0
     x = known / scale
-    solved, *_ = np.linalg.lstsq(np.column_stack([2 * x, np.ones(len(x))]), np.sum(x * x, axis=1), rcond=None)
+    A = np.column_stack([2 * x, np.ones(len(x))])
+    solved, *_ = np.linalg.lstsq(A, np.sum(x * x, axis=1), rcond=None)
     radius = math.sqrt(max(float(solved[3] + solved[:3] @ solved[:3]), 0.0))
     apart = np.linalg.norm(x - solved[:3], axis=1) - radius
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)[-1] / math.sqrt(len(x))
     size = float(np.median(np.linalg.norm(x, axis=1)))  # not the radius: to noise alone a tiny sphere fits
-    return (scale * float(np.sqrt(np.mean(apart**2))), scale * radius) if spread > LEAST_SPREAD * size else None
+    if spread <= LEAST_SPREAD * size:
+        return None
+    residual = float(np.sqrt(np.mean(apart**2)))
+    # Of |x - c|^2 = r^2 an error of x makes 2 r times as much.
+    doubt = 2 * radius * residual * math.sqrt(np.trace(np.linalg.inv(A.T @ A)[:3, :3]) * len(x) / ERRORS)
+    off = float(np.linalg.norm(solved[:3]))
+    return Sphere(scale * residual, scale * radius, scale * off, scale * doubt)
 
 
 def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:

@@ -128,7 +128,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             reference = _reference(t, values, notes)
         else:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
-    require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"')
+    require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"', notes)
     require_one_clock(path, imus, samples)
     start = beginning(imus, samples, reference, notes)
     remark = _contradicted(reference, imus, samples)
@@ -254,6 +254,8 @@ def _instead(array: Any) -> str:
         return f"holds {array.dtype}: give seconds as numbers"
     if array.ndim > 1 or array.dtype.kind not in "OUST":
         return f"holds {array.dtype} of shape {array.shape}"
+    if not len(array):
+        return "has no rows"
     for k, one in enumerate(array):
         if not _is_number(one):
             return f"holds text, first {shown(str(one)[:LONGEST_SHOWN])} in row {k + 1}"

@@ -265,5 +265,5 @@ REQUEST = {
 
 EVENT = {
     "severity": Variable("", "info, warning or error", dtype="S8"),
-    "text": Variable("", "what happened", dtype="S160"),
+    "text": Variable("", "what happened", dtype="S320"),
 }

@@ -50,6 +50,8 @@ def tables(found: Survey) -> Iterator[Table]:
     longest = sorted(found.phases, key=lambda p: p.start - p.end)[:PHASES_SHOWN]
     for phase in sorted(longest, key=lambda p: p.start):
         flight.add_row(phase.name, f"{phase.start:.0f}", f"{phase.end:.0f}")
+    if shorter := len(found.phases) - len(longest):
+        flight.caption = f"and {shorter} shorter ones"
     yield flight
     quality = _table("measured", "sensor", "what", "value")
     for row in _measured(found):
@@ -74,9 +76,10 @@ def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
             yield name, "line of the spectrum", f"{frequency:.1f} Hz, {amplitude:.3g} m/s²"
     for name, lag in found.latency_s.items():
         yield name, "velocity is told of later than the motion by", f"{lag:.2f} s"
-    for name, (residual, radius) in found.field_residual.items():
-        value = f"{residual / MICROTESLA:.3g} µT about {radius / MICROTESLA:.3g} µT"
-        yield name, "rms from the sphere that fits", value
+    for name, sphere in found.spheres.items():
+        residual, radius, off, sigma = (f"{value / MICROTESLA:.3g}" for value in sphere)
+        yield name, "rms from the sphere that fits", f"{residual} µT about {radius} µT"
+        yield name, "its centre, hard iron, is off by", f"{off} µT, to {sigma}"
     for name, scale in found.airspeed_scale.items():
         yield name, "true airspeed over the sensor's", f"{scale:.3f}"
 

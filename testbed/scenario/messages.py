@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -73,6 +73,7 @@ def _locate(details: ErrorDetails, root: type[BaseModel], written: Written) -> t
     here: Any = written.data
     path: KeyPath = ()
     models: list[type[BaseModel]] = [root]
+    named = False  # whether the step is a name that the user gave, of one of several such sections
     for step in loc[:-1]:
         if isinstance(here, dict) and len(models) > 1 and step in (here.get(key) for key in TAG_KEYS):
             models = [m for m in models if any(step in _tags(m, key) for key in TAG_KEYS)]
@@ -86,9 +87,12 @@ def _locate(details: ErrorDetails, root: type[BaseModel], written: Written) -> t
                 models = [registry.find(kind).section]
                 options = custom.options_of(kind, written.folder) if models == [custom.CustomSection] else None
                 models += [options] if options else []
+            elif isinstance(step, str) and named:
+                named = False
             elif isinstance(step, str):
                 fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
                 models = [model for annotation in fields for model in _sections(annotation)]
+                named = any(get_origin(annotation) is dict for annotation in fields)
     if loc and (_holds(here, loc[-1]) or details["type"] in ("missing", "union_tag_not_found", "scenario")):
         path = (*path, loc[-1])
     if details["type"] == "sensor_kind" and details["input"]["kind"] != path[-1]:

@@ -96,7 +96,7 @@ def _sensor(name: str, *both: Survey) -> Iterator[Row]:
         ("true airspeed over the sensor's", "", [one.airspeed_scale for one in both], 1.0, 0.0),
         (
             "rms from the sphere that fits", "µT",
-            [{key: fit[0] for key, fit in one.field_residual.items()} for one in both], MICROTESLA,
+            [{key: sphere.residual for key, sphere in one.spheres.items()} for one in both], MICROTESLA,
             0.0,
         ),
     ):  # fmt: skip
@@ -115,10 +115,11 @@ def _inertial(name: str, *both: Survey) -> Iterator[Row]:
     biases = [float(np.abs(one.noise[name].gyro_bias).max()) if name in one.noise else math.nan for one in both]
     yield Row(name, "largest gyro bias at rest", "deg/h", biases[0] / DEG_PER_H, biases[1] / DEG_PER_H)
     spectra = [_moving_spectrum(one, one.log.imus[name]) for one in both]
-    for low, high in itertools.pairwise(BANDS_HZ):
+    for low, wide in itertools.pairwise(BANDS_HZ):
+        high = min(wide, *(one.rates[name].rate_hz / 2 for one in both))  # of what neither unit feels nothing is said
         for k, (what, unit, scale) in enumerate((("rate", "deg/s", DEG), ("specific force", "m/s²", 1.0))):
             first, second = (_band(spectrum[0], spectrum[1][k], low, high) / scale for spectrum in spectra)
-            yield Row(name, f"{what} in motion, {low:g} to {high:g} Hz, rms", unit, first, second)
+            yield Row(name, f"{what} in motion, {low:g} to {high:.3g} Hz, rms", unit, first, second)
 
 
 def _moving_spectrum(found: Survey, imu: ImuSamples) -> tuple[Array, tuple[Array, Array]]:

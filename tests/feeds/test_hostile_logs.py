@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -115,6 +116,32 @@ def attempted(path: Path, name: str) -> tuple[Log | None, str]:
         return None, str(error)
 
 
+@pytest.mark.parametrize("name", ["bin", "ulg"])
+def test_what_can_not_be_read_of_a_log_is_told(files: dict[str, Path], name: str, tmp_path: Path) -> None:
+    whole = files[name].read_bytes()
+    path = tmp_path / "broken"
+    half = len(whole) // 2
+    for bad in (b"", bytes(1000)):
+        path.write_bytes(whole[:half] + bad + whole[half:])
+        told = [note for note in read(path, name).notes if "can't be read, and are left out: it is damaged" in note]
+        assert len(told) == bool(bad)
+        if bad and name == "bin":  # with the message that they are in
+            lost, size = (int(word) for word in told[0].split() if word.isdecimal())
+            assert len(bad) <= lost <= len(bad) + 200
+            assert size == len(whole) + len(bad)
+
+
+def test_a_number_that_one_damaged_message_has_is_no_unit(files: dict[str, Path], tmp_path: Path) -> None:
+    whole = bytearray(files["bin"].read_bytes())
+    at = whole.index(b"\xa3\x95\x83", 2000)  # a GPS message: its number is after its time
+    whole[at + 11] = 77
+    path = tmp_path / "broken"
+    path.write_bytes(whole)
+    log = read(path, "bin")
+    assert [one for one in log.names if one.startswith("gnss")] == ["gnss"]
+    assert len(log.samples["gnss"]) == len(read(files["bin"], "bin").samples["gnss"]) - 1
+
+
 def nothing(path: Path) -> None:
     path.write_bytes(b"")
 
@@ -141,10 +168,20 @@ def telemetry(path: Path) -> None:
     path.write_bytes(packet * 50)
 
 
+def compressed(path: Path) -> None:
+    path.write_bytes(gzip.compress(b"t,a\n0.1,2\n"))
+
+
+def wide_text(path: Path) -> None:
+    path.write_text("t,a\n0.1,2\n", encoding="utf-16")
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
         (nothing, "is empty"),
+        (compressed, "is compressed: unpack it first"),
+        (wide_text, "is text in UTF-16: save it as UTF-8"),
         (words, "is no log of a known format"),
         (picture, "is no log of a known format"),
         (huge, "2.0 GiB"),

@@ -115,7 +115,7 @@ def test_no_sphere_is_fitted_to_a_magnetometer_that_does_not_turn(turns: bool, t
             field = 300.0 * np.array([np.cos(angle), np.sin(angle), np.sin(3 * angle)]) + rng.normal(0.0, 1.0, 3)
             values = (*values[:2], *field)
         messages.append((name, values))
-    assert bool(survey(read(messages, tmp_path)).field_residual) == turns
+    assert bool(survey(read(messages, tmp_path)).spheres) == turns
 
 
 @pytest.mark.parametrize(
@@ -301,13 +301,23 @@ def test_nothing_is_interpolated_from_nowhere(receiver: bool, tmp_path: Path) ->
     assert np.nanmax(np.abs(lat - 47)) < 0.1
 
 
-def test_a_draft_takes_the_receiver_that_has_a_fix(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("until", "taken"), [(100.0, "gnss2"), (0.95 * SECONDS, "gnss2"), (0.3 * SECONDS, "gnss")])
+def test_a_draft_takes_the_receiver_that_has_fixes(until: float, taken: str, tmp_path: Path) -> None:
     second = [
         (name, (values[0], 1, *values[2:])) for name, values in circling() if name == "GPS"
     ]  # of the same kind, the second unit
-    messages = sorted([*unfixed(circling(), 100.0), *second], key=lambda one: one[1][0])
+    messages = sorted([*unfixed(circling(), until), *second], key=lambda one: one[1][0])
     text = draft.scenario(survey(read(messages, tmp_path)), tmp_path / "x", None)
-    assert 'aids = ["gnss2"' in text
+    assert f'aids = ["{taken}"' in text
+
+
+@pytest.mark.parametrize("heard", [1, 2])
+def test_what_was_heard_once_is_no_aid(heard: int, tmp_path: Path) -> None:
+    fields = [one for one in circling() if one[0] == "MAG"]
+    log = read([one for one in circling() if one[0] != "MAG" or one in fields[:heard]], tmp_path)
+    text = draft.scenario(survey(log), tmp_path / "x", None)
+    assert "[sensors.magnetometer]" in text
+    assert ('"magnetometer"]' in text) == (heard > 1)
 
 
 def test_places_where_no_aircraft_is_are_not_believed_without_a_receiver_either(tmp_path: Path) -> None:

@@ -316,3 +316,42 @@ def test_the_heights_of_a_px4_solution_are_above_the_ellipsoid(old: bool) -> Non
     )
     assert px4._geoid({"vehicle_gps_position": {0: rows}}) == pytest.approx(-34.0, abs=1e-6)
     assert px4._geoid({}) == 0.0
+
+
+def test_columns_without_rows_are_told(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(",".join(NAMES) + "\n")
+    assert set(load(tmp_path / "a.csv").others.values()) == {"has no rows"}
+    np.savez(tmp_path / "a.npz", **{name: np.empty(0) for name in NAMES})
+    columns = {"time": "t", "gyro": ["gx", "gy", "gz"], "accel": ["fx", "fy", "fz"]}
+    for file in ("a.csv", "a.npz"):
+        truth = LogTruth.model_validate({"source": "log", "file": file, "columns": {"imu": columns}})
+        with pytest.raises(UserError, match=r"rows|has no inertial data"):
+            formats.read(tmp_path / file, truth.columns)
+
+
+@pytest.mark.parametrize(("wrong", "right"), [("gyroo", "gyro"), ("tme", "time")])
+def test_a_key_of_a_column_that_is_misspelt_is_told(wrong: str, right: str, tmp_path: Path) -> None:
+    text = f"""
+duration_s = 10
+[truth]
+source = "log"
+file = "a.npz"
+columns.time = {{ kind = "imu", {wrong} = "g", time = "t", accel = {{ column = "a", axs = ["x", "y", "z"] }} }}
+[sensors.time]
+kind = "imu"
+"""
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(UserError) as caught:
+        Scenario.load(tmp_path / "a.toml")
+    assert f"truth.columns.time.{wrong}: unknown key: did you mean {right}? Choose from" in str(caught.value)
+    assert "truth.columns.time.accel.axs: unknown key: did you mean axes? Choose from" in str(caught.value)
+
+
+@pytest.mark.parametrize("column", ["t", "gx"])
+def test_of_a_unit_that_can_not_be_read_it_is_said_why(column: str, tmp_path: Path) -> None:
+    table = dict(zip(NAMES, IMU.T, strict=True))
+    np.savez(tmp_path / "a.npz", **{**table, column: np.full(len(T), 7.0 if column == "t" else np.nan)})
+    columns = {"time": "t", "gyro": ["gx", "gy", "gz"], "accel": ["fx", "fy", "fz"]}
+    truth = LogTruth.model_validate({"source": "log", "file": "a.npz", "columns": {"imu": columns}})
+    with pytest.raises(UserError, match=r"has no inertial data: .*; imu: .*(come again|of 1500)"):
+        formats.read(tmp_path / "a.npz", truth.columns)

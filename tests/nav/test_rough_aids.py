@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
-from worlds.ins import CONSUMER, FIELD_N, flight, gnss, imu, magnetometer
+from worlds.ins import CONSUMER, FIELD_N, at_rest, error, feed, flight, gnss, imu, magnetometer
 
 from nav.aids import AirspeedAid, GnssAid, MagnetometerAid
 from nav.aids.airspeed import SLOW
@@ -204,3 +204,27 @@ def test_a_magnetometer_that_nobody_calibrated_tells_no_heading_but_is_learned(h
     _, calibrated, _ = aligned(30, 1e-6 * np.ones(3))
     assert math.sqrt(calibrated.covariance[8, 8]) < math.radians(4)
     assert (calibrated.extra["magnetometer_bias"][1] < MagnetometerAid().bias_sigma).all()
+
+
+@pytest.mark.parametrize("scale", [0.6, 1.0, 1.6])
+def test_iron_that_makes_a_field_longer_or_shorter_tells_no_heading(scale: float):
+    """The field that it was aligned by, heard again, tells nothing new: the heading stays as good as iron lets it."""
+    truth, rng = at_rest(4), np.random.default_rng(46)
+    along = truth.C_nb[0].T @ np.array([*FIELD_N[:2], 0.0])
+    samples = gnss(truth, rng, 4.0) + magnetometer(truth, rng, (scale - 1) * along)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(), MagnetometerAid(bias_sigma=10e-6))), lambda *_: FIELD_N)
+    estimates, _ = feed(FusionHorizon(ins), imu(truth, CONSUMER, rng)[0], samples, 0.25)
+    first = next(one for one in estimates if math.isfinite(one.lat))
+    assert math.sqrt(first.covariance[8, 8]) > 0.9 * 10e-6 / math.hypot(*FIELD_N[:2])
+
+
+def test_what_is_at_rest_begins_on_a_compass_whose_iron_is_nearly_as_large_as_the_field():
+    """There is no course that could tell more; it claims hardly anything, and its heading is that of the field."""
+    truth, rng = at_rest(4), np.random.default_rng(47)
+    along = truth.C_nb[0].T @ np.array([*FIELD_N[:2], 0.0])
+    samples = gnss(truth, rng, 4.0) + magnetometer(truth, rng, 0.9 * along)
+    ins = Ins(InsConfig(CONSUMER, (GnssAid(), MagnetometerAid(bias_sigma=6e-6))), lambda *_: FIELD_N)
+    estimates, _ = feed(FusionHorizon(ins), imu(truth, CONSUMER, rng)[0], samples, 0.25)
+    first = next(one for one in estimates if math.isfinite(one.lat))
+    assert math.sqrt(first.covariance[8, 8]) > math.radians(40)
+    assert abs(error(first, truth)[8]) < math.radians(5)

@@ -68,6 +68,15 @@ def test_bands_have_the_power_of_what_shakes_in_them() -> None:
     assert rate.alike
 
 
+def test_of_what_a_unit_can_not_feel_nothing_is_said() -> None:
+    log = toy(2.0, frequency=3.0)
+    imu = log.imus["imu"]
+    slower = ImuSamples(*(one[3::4] for one in (imu.t, 4 * imu.dt, imu.dtheta, imu.dv)))  # at 50 Hz
+    rows = likeness.compare(survey(replace(log, imus={"imu": slower})), survey(log))
+    bands = [row.what for row in rows if row.what.startswith("rate in motion")]
+    assert bands == [f"rate in motion, {band} Hz, rms" for band in ("0.5 to 2", "2 to 8", "8 to 25")]
+
+
 def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None:
     flight = survey(toy(2.0))
     late = replace(flight, latency_s={"gnss": 0.2})

@@ -86,14 +86,14 @@ def _shares_inside(run: Run, ax: Axes, values: dict[str, Array], bounds: tuple[f
 
 def ellipses(run: Run) -> Figure | None:
     """Horizontal error of every estimator at some moments, each with the ellipse that it claims."""
-    moments = _moments(run)
+    claimed = {name: (run.estimate(name, "time"), run.estimate(name, "covariance")) for name in run.positioned}
+    moments = [(title, shown) for t, title in _moments(run) if (shown := _known_at(run, t, claimed))]
     if not moments:
         return None
     drawn = sheet(-(-len(moments) // ABREAST), ABREAST, height=2.75, gap=0.75, shared=False)
     drawn.figure.subplots_adjust(wspace=0.28)
-    claimed = {name: (run.estimate(name, "time"), run.estimate(name, "covariance")) for name in run.positioned}
-    for ax, (t, title) in zip(drawn.axes.flat, moments, strict=False):
-        _ellipses_at(run, ax, t, claimed)
+    for ax, (title, shown) in zip(drawn.axes.flat, moments, strict=False):
+        _ellipses_at(run, ax, shown)
         ax.set_title(title, y=1.0, fontsize=9, loc="left")
         ax.set_xlabel("east [m]", fontsize=9)
     for ax in drawn.axes[:, 0]:
@@ -126,8 +126,8 @@ def _moments(run: Run) -> list[tuple[float, str]]:
     return moments
 
 
-def _ellipses_at(run: Run, ax: Axes, t: float, claimed: Mapping[str, tuple[Array, Array]]) -> None:
-    """Ellipse and error of all that have one at a time; what is far larger than the smallest is cut off, and named.
+def _known_at(run: Run, t: float, claimed: Mapping[str, tuple[Array, Array]]) -> dict[str, tuple[Array, Array]]:
+    """Ellipse (N, 2) and error (2,) [m] at a time of all estimators that have both; none where nobody knew the truth.
 
     ``claimed``: times (N,) and covariances (N, 9, 9) of each estimator.
     """
@@ -138,9 +138,13 @@ def _ellipses_at(run: Run, ax: Axes, t: float, claimed: Mapping[str, tuple[Array
             times, covariance = claimed[name]
             at = int(np.argmin(np.abs(times - e.t[row])))
             shown[name] = (ellipse(covariance[at, :2, :2], SIGMAS), e.position[row, :2])
+    return {name: (corners, error) for name, (corners, error) in shown.items() if np.isfinite([*corners, error]).all()}
+
+
+def _ellipses_at(run: Run, ax: Axes, shown: Mapping[str, tuple[Array, Array]]) -> None:
+    """Ellipses and errors at a moment; what is far larger than the smallest is cut off, and named."""
     sizes = {name: float(np.abs([*corners, error]).max()) for name, (corners, error) in shown.items()}
-    sizes = {name: size for name, size in sizes.items() if np.isfinite(size)}
-    limit = 1.25 * max([s for s in sizes.values() if s <= FAR * FAR * min(sizes.values())], default=1.0)
+    limit = 1.25 * max(size for size in sizes.values() if size <= FAR * FAR * min(sizes.values()))
     for rank, name in enumerate(sizes):
         corners, error = shown[name]
         on_top = layer(rank, len(sizes), 1.1)
