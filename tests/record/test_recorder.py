@@ -310,8 +310,8 @@ def test_rows_are_written_on_the_way_unless_the_end_is_near(
 
 def test_long_text_is_cut_at_a_whole_character() -> None:
     recorder = Recorder(None, scenario(), 3)
-    recorder.event(0.0, "warning", "é" * 100 + "!")
-    assert recorder.dataset()["events"]["text"].item() == "é" * 80
+    recorder.event(0.0, "warning", "é" * 200 + "!")
+    assert recorder.dataset()["events"]["text"].item() == "é" * 160
 
 
 def test_imu_can_be_left_out() -> None:
