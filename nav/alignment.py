@@ -49,6 +49,7 @@ UNCALIBRATED = 2.5  # times what a magnetometer is told to be wrong by: a sound 
 FIELD_HEADING_LIMIT, ALONE_LIMIT = 0.7, 1.0
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
+PULL = 3.0  # of a receiver that is led away steadily, where nothing else is asked for a heading [m/s^2]
 FEW, CLEARLY = 5, 0.9  # pairs, and the share of pushes that is explained, where nothing else is asked for a heading
 LONGEST_S = 6.0  # beyond which gyros drift too far within a pair of vectors for matching
 NORTH = np.array([1.0, 0.0, 0.0])
@@ -160,7 +161,7 @@ class Alignment:
         """One for the same sensors that finds the heading by accelerations alone, soon, where they tell it clearly."""
         other = Alignment(self.imu, self.aids, self.arm_b, DIFFERENCE_S)
         other.names, other.receiver = self.names, self.receiver
-        other._matching, other._by_accelerations = VelocityMatching(*self._biases, FEW, CLEARLY), True
+        other._matching, other._by_accelerations = VelocityMatching(*self._biases, PULL, FEW, CLEARLY), True
         return other
 
     def _restart(self, fix: GnssSample | None) -> None:
@@ -317,7 +318,7 @@ class Alignment:
         sigma_v = math.sqrt(float(np.max(first.sigma_velocity_n**2 + fix.sigma_velocity_n**2)))
         sigma = math.hypot(sigma_v, ACCELERATION_ERROR * T) if T <= LONGEST_S else math.inf
         push_0 = self._dv_0 + C_b0.T @ swing_b
-        self._matching.add(C_b0.T, push_0, self._turned_0, self._specific_force_n(first, fix, T), sigma)
+        self._matching.add(C_b0.T, push_0, self._turned_0, T, self._specific_force_n(first, fix, T), sigma)
         self.matched = self._matching.attitude()
         if self.matched is None and self._by_accelerations:  # by what has happened since something that did not fit
             self.matched = self._matching.attitude(FEW + 1)

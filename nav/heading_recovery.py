@@ -23,7 +23,6 @@ FALSE_ALARM = 1e-4  # probability that two attitudes as good as they claim contr
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 LIMIT = chi_square_threshold(FALSE_ALARM, 3)
 LEAST = 1e-6  # of a filter's own [rad]
-PULLED = 0.14  # of the tilt that accelerations tell: a receiver that is pulled away by 1.4 m/s^2 [rad]
 ELSEWHERE = 5.0  # sigmas
 GRAVITY = 9.8  # [m/s^2]
 TURN, PLACE = slice(PHI, PHI + 3), range(POS, POS + 2)
@@ -34,8 +33,8 @@ class HeadingRecovery:
 
     Where a heading is off by a radian, what is felt along one axis is taken for another: velocity and tilt go wrong,
     fixes and fields leave their gates, and what corrections remain go along wrong axes. `nav.velocity_matching` asks
-    nothing of the filter. A receiver that is pulled away steadily tells of a tilt that is not there, and of no other
-    heading: so tilt is known by it to `PULLED` only. One that is farther away than a wrong attitude could have led in
+    nothing of the filter. A receiver that is pulled away steadily would tell of a tilt that is not there: so a pull is
+    estimated beside (`nav.alignment.PULL`). One that is farther away than a wrong attitude could have led in
     the time is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what
     is refused is wrong. It is the receiver that the ``alignment`` was made for.
     """
@@ -118,5 +117,4 @@ def _contradicts(found: Matched, state: State, filters: int) -> bool:
     turn = rotvec_from_quat(quat_multiply(quat_from_dcm(found.C_nb), quat_conjugate(state.q_nb)))
     each = state.P[:filters, TURN, TURN] + LEAST**2 * np.eye(3)
     known = np.linalg.inv(np.linalg.inv(each).sum(axis=0))
-    told = found.covariance + np.diag([PULLED**2, PULLED**2, 0.0])
-    return bool(turn @ np.linalg.solve(known + told, turn) > LIMIT)
+    return bool(turn @ np.linalg.solve(known + found.covariance, turn) > LIMIT)

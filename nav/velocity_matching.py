@@ -5,12 +5,14 @@ gravity: a vector known in body axes and in n (Wu and Pan, Velocity/Position Int
 In-Flight Coarse Alignment, IEEE Trans. Aerospace and Electronic Systems 49 (2), 2013). One pair is hardly more than
 gravity, which tells no heading. Of several in a row, k = 1 ... K, what is not gravity does,
 
-    y_k = C_n0 (exp(-[B_k b x]) s_k - A_k a),
+    y_k = C_n0 (exp(-[B_k b x]) s_k - A_k a) + T_k p,
 
 with 0 the body axes at the beginning as the gyros carry them, s_k (3,) the push in these and y_k (3,) in n, A_k (3, 3)
 the integral of C_0b over the pair and B_k from now back to its middle (negative), b and a the biases of gyros and
-accelerometers: of small units they tilt 0 by degrees meanwhile. C_n0, b and a follow by least squares (Gauss-Newton),
-b and a with what is known of them; the derivative by b is of first order in the turn.
+accelerometers: of small units they tilt 0 by degrees meanwhile; p (3,) is by what a receiver may be pulled away in n,
+steadily, over T_k seconds. C_n0, b, a and p follow by least squares (Gauss-Newton), all but C_n0 with what is known of
+them; the derivative by b is of first order in the turn. Where hardly more than gravity
+is felt, p can't be told from a tilt.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ class _Pair(NamedTuple):
     push_0: Array  # (3,) integral of specific force [m/s]
     over: Array  # (3, 3) integral of C_0b over the pair [s]
     before: Array  # (3, 3) the same from the beginning of the chain up to the middle of the pair
+    lasts: float  # [s]
     push_n: Array  # (3,)
     sigma: float  # of any axis [m/s]
 
@@ -50,7 +53,7 @@ class Matched(NamedTuple):
 
 class _Fit(NamedTuple):
     cost: float
-    level_cost: float  # of horizontal residuals, and of what was known of biases
+    level_cost: float  # of horizontal residuals, and of what was known of slow errors
     C_n0: Array
     covariance: Array  # (3, 3) of C_n0's turn [rad^2], if residuals are as told
 
@@ -58,16 +61,18 @@ class _Fit(NamedTuple):
 class VelocityMatching:
     """Collects pairs of pushes, one after the other without a gap, until they tell a heading.
 
-    ``gyro_sigma`` [rad/s] and ``accel_sigma`` [m/s^2] are those of the biases, each axis alike. It takes at least so
-    many pairs, and a heading must explain the share ``explained`` of the squares of horizontal pushes, or they are the
-    receiver's.
+    ``gyro_sigma`` [rad/s] and ``accel_sigma`` [m/s^2] are those of the biases, ``pull_sigma`` [m/s^2] that of what a
+    receiver may be pulled away by, each axis alike. It takes at least so many pairs, and a heading must explain the
+    share ``explained`` of the squares of horizontal pushes, or they are the receiver's.
     """
 
-    def __init__(self, gyro_sigma: float, accel_sigma: float, least: int = LEAST, explained: float = EXPLAINED) -> None:
+    def __init__(
+        self, gyro_sigma: float, accel_sigma: float, pull_sigma: float = 0.0, least: int = LEAST,
+        explained: float = EXPLAINED,
+    ) -> None:  # fmt: skip
         self._least, self._explained = least, explained
-        self._weights = np.repeat([DAMPING, 1.0, 1.0], 3)
-        self._weights[3:6] /= max(gyro_sigma, 1e-9) ** 2
-        self._weights[6:] /= max(accel_sigma, 1e-9) ** 2
+        known = np.maximum([gyro_sigma, accel_sigma, pull_sigma], 1e-9)
+        self._weights = np.repeat([DAMPING, *known**-2], 3)
         self.forget()
 
     def forget(self) -> None:
@@ -80,14 +85,15 @@ class VelocityMatching:
         """Whether there are pairs."""
         return bool(self._pairs)
 
-    def add(self, C_1b: Array, push_1: Array, turned_1: Array, push_n: Array, sigma: float) -> None:
-        """Add what was felt since the last pair: in the axes 1 at its beginning, to which ``C_1b`` turns those of now,
-        the push (3,) [m/s] and the integral (3, 3) of C_1b [s]; in n, the change of velocity less gravity (3,) [m/s],
-        of which ``sigma`` [m/s] is what any axis is wrong by. A pair of infinite sigma only carries the axes on.
+    def add(self, C_1b: Array, push_1: Array, turned_1: Array, lasts: float, push_n: Array, sigma: float) -> None:
+        """Add what was felt since the last pair, which ``lasts`` so long [s]: in the axes 1 at its beginning, to which
+        ``C_1b`` turns those of now, the push (3,) [m/s] and the integral (3, 3) of C_1b [s]; in n, the change of
+        velocity less gravity (3,) [m/s], of which ``sigma`` [m/s] is what any axis is wrong by. A pair of infinite
+        sigma only carries the axes on.
         """
         over = self._C_0b @ turned_1
         if math.isfinite(sigma):
-            self._pairs.append(_Pair(self._C_0b @ push_1, over, self._turned + 0.5 * over, push_n, sigma))
+            self._pairs.append(_Pair(self._C_0b @ push_1, over, self._turned + 0.5 * over, lasts, push_n, sigma))
             del self._pairs[:-PAIRS]
         self._C_0b, self._turned = self._C_0b @ C_1b, self._turned + over
 
@@ -115,24 +121,25 @@ class VelocityMatching:
 
     def _fit(self, pairs: Sequence[_Pair], heading: float) -> _Fit:
         """Least squares from this turn [rad] of what is level on."""
-        f, over, before, y, sigmas = (np.array(column) for column in zip(*pairs, strict=True))
-        before = before - self._turned
-        sigma = sigmas[:, None]
+        f, over, before, lasts, y, sigma = (np.array(column) for column in zip(*pairs, strict=True))
+        before, lasts, sigma = before - self._turned, lasts[:, None], sigma[:, None]
+        pulled = lasts[:, None] * np.eye(3)
         C_n0 = _turn(np.array([0.0, 0.0, heading])) @ _between(f.sum(axis=0), y.sum(axis=0))
-        biases = np.zeros(6)
+        slow = np.zeros(9)  # b, a and p
         for step in range(STEPS + 1):
-            turned = _turned(f, -(before @ biases[:3]))
-            found = (turned - over @ biases[3:]) @ C_n0.T
-            left = (y - found) / sigma
+            turned = _turned(f, -(before @ slow[:3]))
+            found = (turned - over @ slow[3:6]) @ C_n0.T
+            left = (y - found - lasts * slow[6:]) / sigma
             if step == STEPS:
                 break
-            J = np.concatenate([-_skew(found), C_n0 @ _skew(turned) @ before, -(C_n0 @ over)], axis=2) / sigma[:, None]
+            by_biases = [C_n0 @ _skew(turned) @ before, -(C_n0 @ over)]
+            J = np.concatenate([-_skew(found), *by_biases, pulled], axis=2) / sigma[:, None]
             N = np.einsum("kij,kil->jl", J, J) + np.diag(self._weights)
-            known = self._weights * np.concatenate([np.zeros(3), biases])
+            known = self._weights * np.concatenate([np.zeros(3), slow])
             change = np.linalg.solve(N, np.einsum("kij,ki->j", J, left) - known)
             C_n0 = _turn(change[:3]) @ C_n0
-            biases = biases + change[3:]
-        prior = float(self._weights[3:] @ biases**2)
+            slow = slow + change[3:]
+        prior = float(self._weights[3:] @ slow**2)
         return _Fit(
             float(np.sum(left**2)) + prior, float(np.sum(left[:, :2] ** 2)) + prior, C_n0, np.linalg.inv(N)[:3, :3]
         )

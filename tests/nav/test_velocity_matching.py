@@ -51,7 +51,7 @@ def pairs(rng, count, seconds=2.0, strength=1.0, noise=0.1, gyro=0.0, accel=0.0,
             push_1, turned_1 = push_1 + middle @ f_b[i] * dt, turned_1 + middle * dt
             C_1b = C_1b @ whole[i]
         push_n = f_n[k * steps : (k + 1) * steps].sum(axis=0) * dt + noise * rng.normal(size=3)
-        made.append((C_1b, push_1, turned_1, push_n, max(noise, 1e-3)))
+        made.append((C_1b, push_1, turned_1, seconds, push_n, max(noise, 1e-3)))
     return made, attitude(np.array([count * seconds]))[0]
 
 
@@ -96,6 +96,39 @@ def test_it_is_as_good_as_it_says():
     assert np.abs(np.divide(wrong, np.hypot(claimed, AT_BEST))).max() < 3.0
 
 
+def pulled(seed, noise, strength=2.0):
+    """Fifteen pairs of a receiver that is led away steadily: by 2 m/s^2 an axis, or not at all."""
+    rng = np.random.default_rng(seed)
+    made, true = pairs(rng, 15, strength=strength, noise=noise, gyro=0.1 * DEG, accel=0.05)
+    away = rng.normal(size=3) * 2.0
+    return [(*one[:4], one[4] + away * one[3], one[5]) for one in made], true
+
+
+def turn_off(made, true, pull_sigma):
+    """The turn (3,) [rad] by which the attitude found is off, and its covariance less what is not drawn here."""
+    found = VelocityMatching(0.1 * DEG, 0.05, pull_sigma)
+    for pair in made:
+        found.add(*pair)
+    attitude = found.attitude()
+    if attitude is None:
+        return None
+    off_n = (Rotation.from_matrix(attitude.C_nb) * true.inv()).as_rotvec()
+    return off_n, attitude.covariance - np.diag([0.0, 0.0, AT_BEST**2])
+
+
+def test_a_steady_pull_is_told_from_a_tilt():
+    """Where more than gravity is felt: without noise to a degree, and as well as it says with it."""
+    exact = [turn_off(*pulled(400 + seed, 0.0), 2.0) for seed in range(12)]
+    assert max(np.abs(one[0]).max() for one in exact) < 0.03
+    tilted = [turn_off(*pulled(400 + seed, 0.0), 0.0) for seed in range(12)]
+    assert all(one is None or np.abs(one[0][:2]).max() > 0.03 for one in tilted)
+    told = [one for seed in range(60) if (one := turn_off(*pulled(500 + seed, 0.2), 2.0)) is not None]
+    assert len(told) > 40
+    nees = [turn @ np.linalg.solve(covariance, turn) / 3 for turn, covariance in told]
+    print(f"{len(told)} of 60, NEES {np.mean(nees):.2f}")
+    assert 0.4 < np.mean(nees) < 2.5
+
+
 @pytest.mark.parametrize("strength", [0.0, 0.05])
 def test_noise_tells_nothing(strength):
     """A hovering body, and a receiver that is wrong by more than it moves."""
@@ -111,9 +144,9 @@ def test_without_any_error_or_in_free_fall_there_is_nothing_to_tell_either(weigh
     rng = np.random.default_rng(0)
     still = np.array([0.0, 0.0, -2 * weight])
     with np.errstate(all="ignore"):
-        made = [(np.eye(3), still, 2 * np.eye(3), still + 0.3 * rng.normal(size=3), 0.3) for _ in range(15)]
+        made = [(np.eye(3), still, 2 * np.eye(3), 2.0, still + 0.3 * rng.normal(size=3), 0.3) for _ in range(15)]
         assert matched(made, 1e-6, 1e-6) is None
-        assert matched([(*one[:3], one[1], 0.3) for one in made], 1e-6, 1e-6) is None
+        assert matched([(*one[:4], one[1], 0.3) for one in made], 1e-6, 1e-6) is None
 
 
 def test_velocities_that_are_worse_than_told_are_not_believed():
@@ -121,7 +154,7 @@ def test_velocities_that_are_worse_than_told_are_not_believed():
     for seed in range(40):
         rng = np.random.default_rng(300 + seed)
         one, true = pairs(rng, 15, strength=0.4, noise=0.0)
-        found = matched([(*pair[:3], pair[3] + 0.6 * rng.normal(size=3), 0.1) for pair in one])
+        found = matched([(*pair[:4], pair[4] + 0.6 * rng.normal(size=3), 0.1) for pair in one])
         made.append(found is not None and abs(off(found, true)) > 3 * found[1])
     assert sum(made) <= 1
 
