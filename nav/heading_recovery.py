@@ -34,9 +34,9 @@ class HeadingRecovery:
     Where a heading is off by a radian, what is felt along one axis is taken for another: velocity and tilt go wrong,
     fixes and fields leave their gates, and what corrections remain go along wrong axes. `nav.velocity_matching` asks
     nothing of the filter. A receiver that is pulled away steadily would tell of a tilt that is not there: so a pull is
-    estimated beside (`nav.alignment.PULL`). One that is farther away than a wrong attitude could have led in
-    the time is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what
-    is refused is wrong. It is the receiver that the ``alignment`` was made for.
+    estimated beside (`nav.alignment.PULL`). One that is farther away than a wrong attitude could have led in the time
+    is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what is refused
+    is wrong. It is the receiver that the ``alignment`` was made for.
     """
 
     def __init__(self, alignment: Alignment) -> None:

@@ -11,8 +11,8 @@ with 0 the body axes at the beginning as the gyros carry them, s_k (3,) the push
 the integral of C_0b over the pair and B_k from now back to its middle (negative), b and a the biases of gyros and
 accelerometers: of small units they tilt 0 by degrees meanwhile; p (3,) is by what a receiver may be pulled away in n,
 steadily, over T_k seconds. C_n0, b, a and p follow by least squares (Gauss-Newton), all but C_n0 with what is known of
-them; the derivative by b is of first order in the turn. Where hardly more than gravity
-is felt, p can't be told from a tilt.
+them; the derivative by b is of first order in the turn. Where hardly more than gravity is felt, p can't be told from a
+tilt.
 """
 
 from __future__ import annotations

@@ -96,10 +96,10 @@ def test_it_is_as_good_as_it_says():
     assert np.abs(np.divide(wrong, np.hypot(claimed, AT_BEST))).max() < 3.0
 
 
-def pulled(seed, noise, strength=2.0):
-    """Fifteen pairs of a receiver that is led away steadily: by 2 m/s^2 an axis, or not at all."""
+def pulled(seed, noise):
+    """Fifteen pairs of a receiver that is led away steadily, by 2 m/s^2 an axis (rms)."""
     rng = np.random.default_rng(seed)
-    made, true = pairs(rng, 15, strength=strength, noise=noise, gyro=0.1 * DEG, accel=0.05)
+    made, true = pairs(rng, 15, strength=2.0, noise=noise, gyro=0.1 * DEG, accel=0.05)
     away = rng.normal(size=3) * 2.0
     return [(*one[:4], one[4] + away * one[3], one[5]) for one in made], true
 
@@ -117,7 +117,7 @@ def turn_off(made, true, pull_sigma):
 
 
 def test_a_steady_pull_is_told_from_a_tilt():
-    """Where more than gravity is felt: without noise to a degree, and as well as it says with it."""
+    """Where more than gravity is felt: without noise to two degrees, and as well as it says with it."""
     exact = [turn_off(*pulled(400 + seed, 0.0), 2.0) for seed in range(12)]
     assert max(np.abs(one[0]).max() for one in exact) < 0.03
     tilted = [turn_off(*pulled(400 + seed, 0.0), 0.0) for seed in range(12)]
