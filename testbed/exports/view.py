@@ -73,10 +73,13 @@ class View:
 
     @cached_property
     def sensors(self) -> dict[str, dict[str, Columns]]:
-        """Samples of each kind of sensor by the sensor's name."""
+        """Samples of each kind of sensor by the sensor's name; increments that are missing are left out."""
         found: dict[str, dict[str, Columns]] = {kind: {} for kind in KINDS.values()}
         for name in self._tree["sensors"].children if "sensors" in self._tree.children else ():
             own = self.group(f"sensors/{name}")
+            if "dtheta" in own:
+                known = np.isfinite(own["dtheta"]).all(axis=1) & np.isfinite(own["dv"]).all(axis=1)
+                own = {key: values[known] for key, values in own.items()}
             for column, kind in KINDS.items():
                 if column in own and len(own["time"]):
                     found[kind][str(name)] = own

@@ -81,7 +81,7 @@ def is_table(head: bytes) -> bool:
 def columns(path: Path) -> Iterator[tuple[str, Any]]:
     """Name and values of each column of a text; those without names are numbered from 0.
 
-    Raises UserError where rows have more fields than there are names.
+    Raises UserError where rows have more fields than there are names, or the text is not in UTF-8.
     """
     import pandas
 
@@ -95,19 +95,22 @@ def columns(path: Path) -> Iterator[tuple[str, Any]]:
             raise UserError(f"{path}: line {found.above + 1} {told}: names with spaces need quotes, or other marks")
     elif found.names:
         index = 0 if _has_row_names(path, found) else False
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
-        frame = pandas.read_csv(
-            path,
-            sep=r"\s+" if found.mark == SPACES else found.mark,
-            decimal=found.decimal,
-            skiprows=found.above + found.hidden,
-            header=0 if found.names and not found.hidden else None,
-            names=found.names if found.hidden else None,
-            skipinitialspace=True,
-            index_col=index,
-            low_memory=False,
-        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pandas.errors.ParserWarning)  # of the empty fields at the ends of rows
+            frame = pandas.read_csv(
+                path,
+                sep=r"\s+" if found.mark == SPACES else found.mark,
+                decimal=found.decimal,
+                skiprows=found.above + found.hidden,
+                header=0 if found.names and not found.hidden else None,
+                names=found.names if found.hidden else None,
+                skipinitialspace=True,
+                index_col=index,
+                low_memory=False,
+            )
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: is text, but not in UTF-8: save it as that") from None
     return ((str(name), frame[name].to_numpy()) for name in frame.columns)
 
 

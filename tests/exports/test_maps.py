@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import h5py
 import numpy as np
 import pymap3d
 import pytest
@@ -137,6 +139,25 @@ def test_psins_has_its_axes(exported: Any, record: Any) -> None:
     assert (swap * turned * swap * truth.inv()).magnitude().max() < 1e-7
     np.testing.assert_array_equal(avp[:, 6], record["truth/lat"].values)
     np.testing.assert_array_equal(avp[:, 5], -record["truth/v_n"].values[:, 2])
+
+
+@pytest.mark.parametrize("form", ["navego", "psins", "ulg", "bin"])
+def test_increments_that_are_missing_are_left_out(form: str, flown: Path, tmp_path: Path) -> None:
+    """A NaN would end a toolbox's solution: time shows the gap."""
+    whole, gap = tmp_path / "whole.nc", tmp_path / "gap.nc"
+    for path in (whole, gap):
+        shutil.copy(flown, path)
+    with h5py.File(gap, "r+") as file:
+        file["sensors/imu/dtheta"][200:300] = np.nan
+        file["sensors/imu/dv"][200:300] = np.nan
+    paths = [export(path, form) for path in (whole, gap)]
+    if form in ("navego", "psins"):
+        rows = [loadmat(path, simplify_cells=True) for path in paths]
+        rows = [one["imu"]["fb"] if form == "navego" else one["trj"]["imu"] for one in rows]
+        assert len(rows[0]) - len(rows[1]) == 100
+        assert np.isfinite(rows[1]).all()
+    else:
+        assert paths[1].stat().st_size < paths[0].stat().st_size
 
 
 def test_mcap_is_read_by_its_own_library(exported: Any, record: Any) -> None:

@@ -355,3 +355,12 @@ def test_of_a_unit_that_can_not_be_read_it_is_said_why(column: str, tmp_path: Pa
     truth = LogTruth.model_validate({"source": "log", "file": "a.npz", "columns": {"imu": columns}})
     with pytest.raises(UserError, match=r"has no inertial data: .*; imu: .*(come again|of 1500)"):
         formats.read(tmp_path / "a.npz", truth.columns)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "mac-roman"])
+def test_a_text_that_is_not_utf_8_is_told(encoding: str, tmp_path: Path) -> None:
+    """A name of a column, as a spreadsheet of another time writes it."""
+    lines = [",".join([*NAMES, "Höhe"]), *(f"{row},300" for row in rows(IMU, ","))]
+    (tmp_path / "a.csv").write_text("\n".join(lines), encoding=encoding)
+    with pytest.raises(UserError, match="is text, but not in UTF-8: save it as that"):
+        load(tmp_path / "a.csv")
