@@ -17,6 +17,7 @@ import queue
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import traceback
 import uuid
@@ -37,6 +38,7 @@ WORKER_WAIT_S = 10.0  # how long its first worker may take to appear
 POLL_S = 0.5  # how often the workers are looked at when nothing comes from them
 GONE = "the scheduler has gone: give the same command again for what is left"
 PRELOAD = "testbed.many.worker"
+PARENT = "TESTBED_POOL"  # the variable that tells a worker whose it is, by the number of the process
 SHARE_S = 0.3  # how often a task tells how far it is
 AHEAD = 2  # tasks given to a cluster for each of its threads, so that none waits for the next
 
@@ -323,6 +325,8 @@ class _Crew:
     _began: set[str] = field(default_factory=set)  # of those processes, whom the scheduler has seen
     _names: Iterator[int] = field(default_factory=itertools.count)
     _ending: ExitStack = field(default_factory=ExitStack)
+    _hiring: threading.Lock = field(default_factory=threading.Lock)
+    _over: bool = False  # an interrupt that is not heard kills them from another thread: then nobody else comes
     _folder: Path = field(init=False)
 
     def __enter__(self) -> _Crew:
@@ -359,10 +363,12 @@ class _Crew:
         worker += ["--no-nanny", "--no-dashboard", "--memory-limit", "0", "--death-timeout", "10"]
         worker += ["--local-directory", str(self._folder), "--preload", PRELOAD]
         path = os.pathsep.join(folder or os.getcwd() for folder in sys.path)
-        with (self._folder / f"{name}.err").open("wb") as said, interrupts.held():
+        with (self._folder / f"{name}.err").open("wb") as said, self._hiring, interrupts.held():
+            if self._over:
+                return
             self._processes[name] = subprocess.Popen(
                 [sys.executable, "-P", "-m", *worker],
-                env=os.environ | _ENVIRONMENT | {"PYTHONPATH": path},
+                env=os.environ | _ENVIRONMENT | {"PYTHONPATH": path, PARENT: str(os.getpid())},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=said,
@@ -374,8 +380,10 @@ class _Crew:
         return lines[-1] if lines else "it said nothing"
 
     def _kill(self) -> None:
-        for process in self._processes.values():
-            process.kill()
+        with self._hiring:
+            self._over = True
+            for process in self._processes.values():
+                process.kill()
         for process in self._processes.values():
             process.wait()
 

@@ -7,6 +7,8 @@ import os
 import threading
 import time
 
+from testbed.many.pool import PARENT
+
 LOOK_S = 0.5
 
 
@@ -19,4 +21,4 @@ def _end_with(parent: int) -> None:
 
 # Tasks are done in a thread, beside which no process may be forked; all cores are busy anyway.
 multiprocessing.current_process().daemon = True
-threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+threading.Thread(target=_end_with, args=(int(os.environ[PARENT]),), daemon=True).start()

@@ -117,3 +117,24 @@ def test_a_worker_that_cannot_begin_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(pool, "PRELOAD", "no_such_module")
     with pool.opened(2, 2) as crew, pytest.raises(pool.UserError, match=r"ended before it had begun: .*no_such_module"):
         list(crew.work(square, [1, 2]))
+
+
+@pytest.mark.ci
+def test_who_is_killed_from_beside_hires_nobody() -> None:
+    """An interrupt that the main thread doesn't hear kills its workers while it looks after them."""
+    with pool._scheduler() as cluster, pool._Crew(cluster, 1) as crew:
+        while not crew.room():
+            time.sleep(0.05)
+        crew._kill()
+        crew.room()
+        assert all(process.poll() is not None for process in crew._processes.values())
+
+
+@pytest.mark.ci
+def test_a_worker_that_begins_after_its_pool_has_ended_ends_too() -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    script = "import testbed.many.worker, time; time.sleep(600)"
+    path = os.pathsep.join(filter(None, sys.path))
+    environment = os.environ | {"PYTHONPATH": path, pool.PARENT: str(ended.pid)}
+    assert subprocess.run([sys.executable, "-c", script], env=environment, timeout=60, check=False).returncode == 1
