@@ -18,7 +18,7 @@ COMMANDS = {
     "campaign": (["campaign", "static_bench", "--runs", "1000000"], r"what is finished is in .*; the same .*"),
     "check": (["check", "one.toml", "two.toml"], "nothing was concluded"),
     "papers": (["papers"], "nothing was written"),
-    "watch": (["watch", f"udpin:127.0.0.1:{free_port()}"], ""),
+    "watch": (["watch", "udpin:127.0.0.1:{port}"], ""),
 }
 
 
@@ -49,6 +49,7 @@ def group(mark: str) -> list[str]:
 )
 def test_an_interrupt_ends_a_command(tmp_path: Path, name: str, number: int, after_s: float) -> None:
     arguments, left = COMMANDS[name]
+    arguments = [one.format(port=free_port()) for one in arguments]  # which others may take soon
     bench = Path(__file__).parents[1] / "scenarios" / "static_bench.toml"
     for scenario in ("one", "two"):
         (tmp_path / f"{scenario}.toml").write_text(bench.read_text().replace("duration_s = 300", "duration_s = 36000"))
