@@ -15,6 +15,7 @@ import numpy as np
 from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.errors import UserError
+from testbed.feeds.axes import unlike
 from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
 from testbed.feeds.reference import doubt
@@ -123,7 +124,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     lasts = max(end - (0.0 if truth is None else truth.start_s), SHORTEST_S)
     date = log.date if date is None else date
     own = sections(found)
-    unsound = magnetometers(found)
+    unsound = {**magnetometers(found), **unlike(log)}
     aids = [name for name in own if len(log.samples.get(name, ())) > 1]
     aids.sort(key=unsound.__contains__)  # those that are come last
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind

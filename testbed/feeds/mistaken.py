@@ -10,6 +10,7 @@ import numpy as np
 
 from nav.earth import STANDARD_GRAVITY, displacement_n
 from nav.samples import Array, GnssSample, ImuSamples
+from testbed.feeds.axes import unlike
 from testbed.feeds.log import Log
 from testbed.feeds.survey import between, fixes, phases
 
@@ -36,7 +37,7 @@ def mistaken(log: Log) -> list[str]:
     for name, imu in log.imus.items():
         if len(imu) > 1:
             told += [f"{name}: {what}" for what in _inertial(log, imu)]
-    return told
+    return [*told, *unlike(log).values()]
 
 
 def _receiver(own: Sequence[Any]) -> Iterator[str]:

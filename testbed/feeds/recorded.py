@@ -248,12 +248,12 @@ def _references(truth: LogTruth) -> list[str]:
 
 
 def _as_used(log: Log, sections: Mapping[str, SensorConfig]) -> Log:
-    """The log of the sensors that a run makes use of, its units' forces in body axes."""
-    imus = {
-        name: replace(log.imus[name], dv=log.imus[name].dv @ section.errors().C_sb)
-        for name, section in sections.items()
-        if isinstance(section, ImuConfig)
-    }
+    """The log of the sensors that a run makes use of, its units in body axes."""
+    imus = {}
+    for name, section in sections.items():
+        if isinstance(section, ImuConfig):
+            own, C_sb = log.imus[name], section.errors().C_sb
+            imus[name] = replace(own, dtheta=own.dtheta @ C_sb, dv=own.dv @ C_sb)
     return replace(log, imus=imus, samples={name: own for name, own in log.samples.items() if name in sections})
 
 
