@@ -6,7 +6,7 @@ import datetime as dt
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,13 @@ from testbed.errors import UserError
 from testbed.feeds.axes import unlike
 from testbed.feeds.log import Log
 from testbed.feeds.recorded import first_place, rate
-from testbed.feeds.reference import doubt
+from testbed.feeds.reference import doubt, elsewhere_in_height
 from testbed.feeds.survey import Noise, Sphere, Survey
 from testbed.feeds.unsound import magnetometers
 from testbed.motion.logged import LogTruth
 from testbed.motion.terrain import JACKSBORO
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
+from testbed.sensors.gnss import GRADES as RECEIVERS
 from testbed.sensors.imu_grades import GRADES as IMUS
 from testbed.sensors.magnetometer import GRADES as MAGNETOMETERS
 from testbed.sensors.magnetometer import WMM_YEARS
@@ -32,6 +33,7 @@ from testbed.sensors.units import DEG_PER_H, DEG_PER_ROOT_H, MG, MICROTESLA, MPS
 WORST = "mems-hobby"
 NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its noise, and biases within so many sigmas
 DIGITS = 3
+MOST_RTK_CLAIM = 0.05  # level [m]
 AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
 ROWS_HZ, RECORD_HZ = 100.0, 10.0
 SHORTEST_S = 0.1  # of a run; one that begins after the log's end is refused when it is run
@@ -54,9 +56,9 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
         keys: dict[str, Any] = {"rate_hz": rate(log, name)}
         match own[0]:
             case GnssSample():
-                keys = {"kind": "gnss", "grade": receiver, **keys}
+                keys = {"kind": "gnss", **_receiver_keys(own, receiver), **keys}
                 if name in found.latency_s and not log.valid_times:
-                    keys["latency_s"] = found.latency_s[name]
+                    keys |= _lateness(found.latency_s[name], found.velocity_lag_s.get(name, 0.0))
             case MagnetometerSample():
                 keys = {"kind": "magnetometer", "grade": grade, **keys}
                 iron = _iron(found.spheres.get(name)) / MICROTESLA
@@ -73,6 +75,20 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
                 continue
         made[name] = keys
     return made
+
+
+def _receiver_keys(own: Sequence[Any], grade: str) -> dict[str, Any]:
+    """The grade of a receiver, and how well its latency is known: `rtk` of one that claims what only that can have."""
+    claims = [float(np.max(one.sigma_position_n[:2])) for one in own if one.has_fix]
+    if not claims or not np.median(claims) <= MOST_RTK_CLAIM:  # nor where it claims nothing
+        return {"grade": grade}
+    return {"grade": "rtk", "latency_sigma_s": RECEIVERS["u-blox-m8"]["latency_sigma_s"]}
+
+
+def _lateness(latency: float, lag: float) -> dict[str, float]:
+    """Of a receiver whose velocities are told of so late, and that are so much older than its positions [s]."""
+    lag = round(min(lag, latency), 2)  # no position is told of before it is there
+    return {"latency_s": round(latency - lag, 2)} | ({"velocity_lag_s": lag} if lag else {})
 
 
 def _iron(sphere: Sphere | None) -> float:
@@ -144,7 +160,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     lines += [f"{key} = {_inline(value)}" for key, value in ({"rate_hz": ROWS_HZ} | kept).items()]
     if truth is not None and "reference" in truth.model_fields_set:
         lines.append(f"reference = {_inline(truth.reference)}")
-    elif doubt(log.solution, log.samples):
+    elif doubt(log.solution, log.samples) or (log.solution and elsewhere_in_height(log.solution, log.samples)):
         lines.append('reference = "gnss"  # its own solution is elsewhere')
     if truth is not None and truth.start is not None:
         lines.append(f"start = {_inline(truth.start.model_dump())}")

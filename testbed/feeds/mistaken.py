@@ -25,6 +25,7 @@ LEAST_TURN = math.radians(360)  # of the course
 MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
 LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
 LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, as the median
+MOST_STEP, STEP_SHARE = math.radians(5), 0.95  # from one sample to the next; no more in this share of them
 ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
 
 
@@ -34,6 +35,8 @@ def mistaken(log: Log) -> list[str]:
     for name, own in log.samples.items():
         if any(isinstance(one, GnssSample) and one.has_fix for one in own):
             told += [f"{name}: {what}: are units, columns and axes right?" for what in _receiver(own)]
+        elif any(isinstance(one, GnssSample) for one in own):
+            told.append(f"{name}: it never has a fix")
     for name, imu in log.imus.items():
         if len(imu) > 1:
             told += [f"{name}: {what}" for what in _inertial(log, imu)]
@@ -83,6 +86,10 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
         yield f"it feels {usual:.3g} m/s² mostly, where gravity is 9.8: is the unit of its accelerometers right?"
     elif _lies_on_its_back(log, imu):
         yield "at rest it lies on its back: are its axes forward, right and down?"
+    often = float(np.quantile(np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1), STEP_SHARE))
+    if often > MOST_STEP:
+        how = f"it turns by {math.degrees(often):.0f} deg from one sample to the next ({1 - STEP_SHARE:.0%} turn more)"
+        yield f"{how}: told so seldom, rates lead no attitude on for long: log it faster, if you can"
     if log.receiver is None:
         return
     t, v_n, _ = fixes(log.samples[log.receiver])

@@ -19,7 +19,7 @@ from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
-from testbed.feeds.survey import latency, usual_step
+from testbed.feeds.survey import latency, usual_step, velocity_lag
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario
@@ -265,14 +265,27 @@ def _losses(log: Log, streams: Collection[str]) -> list[str]:
 def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:
     """A receiver's reference at the times when the IMU felt its velocities, of one whose latency is not known well.
 
-    No estimator has a part in it: one that finds a latency must not be judged by what it was told.
+    No estimator has a part in it: one that finds a latency must not be judged by what it was told. Velocities are older
+    than the positions beside them, by what both say of each other or by what is told.
     """
+    lag = section.velocity_lag_s
     if log.valid_times or not section.latency_sigma_s or not log.imus:
-        return found
+        return _lagging(found, lag)
     late = latency(next(iter(log.imus.values())), log.samples[receiver])
     if late is None:
+        return _lagging(found, lag)
+    shown = velocity_lag(log.samples[receiver])
+    lag = lag if shown is None else min(shown, late)
+    by = f"{late - lag:.2f} s late by the IMU" + (f", its velocities {lag:.2f} s more" if shown else "")
+    return replace(_lagging(found, lag), name=f"{found.name}, {by}", t=found.t + section.latency_s - (late - lag))
+
+
+def _lagging(found: Reference, lag: float) -> Reference:
+    """The same with its velocities where they were ``lag`` [s] before; beyond the last of them they are unknown."""
+    if not lag or "v_n" not in found.columns or len(found.t) < 2:
         return found
-    return replace(found, name=f"{found.name}, {late:.2f} s late by the IMU", t=found.t + section.latency_s - late)
+    v_n = [np.interp(found.t, found.t - lag, axis, np.nan, np.nan) for axis in found.columns["v_n"].T]
+    return replace(found, columns={**found.columns, "v_n": np.column_stack(v_n)})
 
 
 def _with_attitude(found: Reference, solution: Reference, start: float) -> Reference:

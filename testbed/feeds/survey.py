@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nav._jit import njit
-from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density
+from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, radii
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.errors import UserError
@@ -30,6 +30,7 @@ LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
+LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # [s], -, [m]
 TOGETHER = 10  # steps
 ROUNDING_S = 1e-9  # of times that are numbers
 SLOWEST_IMU_S = 2.0  # between its samples: more is another unit of time
@@ -115,7 +116,8 @@ class Survey:
     phases: Sequence[Phase]
     noise: Mapping[str, Noise]
     vibration: Mapping[str, Vibration]
-    latency_s: Mapping[str, float]
+    latency_s: Mapping[str, float]  # of velocities
+    velocity_lag_s: Mapping[str, float]  # by which these are older than the positions beside them
     spheres: Mapping[str, Sphere]
     airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
 
@@ -130,10 +132,13 @@ def survey(log: Log) -> Survey:
     times = {name: imu.t for name, imu in log.imus.items()}
     times |= {name: np.array([one.t for one in own]) for name, own in log.samples.items()}
     main = next(iter(log.imus.values()))
-    late, spheres, scales = {}, {}, {}
+    late, behind, spheres, scales = {}, {}, {}, {}
     for name, own in log.samples.items():
-        if isinstance(own[0], GnssSample) and (lag := latency(main, own)) is not None:
-            late[name] = lag
+        if isinstance(own[0], GnssSample):
+            if (lag := latency(main, own)) is not None:
+                late[name] = lag
+            if (lag := velocity_lag(own)) is not None:
+                behind[name] = lag
         elif isinstance(own[0], MagnetometerSample):
             field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
             if (sphere := _sphere(field)) is not None:
@@ -141,7 +146,7 @@ def survey(log: Log) -> Survey:
         elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
-    return Survey(log, rates, found, noise, vibration, late, spheres, scales)
+    return Survey(log, rates, found, noise, vibration, late, behind, spheres, scales)
 
 
 def usual_step(t: Array) -> float:
@@ -189,9 +194,9 @@ def phases(log: Log) -> list[Phase]:
     for k in range(count):
         still = bool(resting[k])
         near = slice(*np.searchsorted(t, edges[k : k + 2]))
-        fast = float(np.nanmax(speed[near], initial=0.0))
+        slowest, fast = _speeds(speed, near)
         high = float(np.max(place[near, 2] - np.median(place[:5, 2]), initial=0.0)) if len(place) else 0.0
-        if fast > FLYING_SPEED or (high > FLYING_HEIGHT and not still):
+        if slowest > FLYING_SPEED or (high > FLYING_HEIGHT and not still):
             names.append("flying")
         elif rows[k + 1] == rows[k]:
             names.append("silent")
@@ -199,6 +204,18 @@ def phases(log: Log) -> list[Phase]:
             names.append("rest" if still and fast < REST_SPEED else "moving")
     changes = [0, *[k for k in range(1, count) if names[k] != names[k - 1]], count]
     return [Phase(names[a], a * WINDOW_S, b * WINDOW_S) for a, b in itertools.pairwise(changes)]
+
+
+def _speeds(speed: Array, near: slice) -> tuple[float, float]:
+    """The least and the largest speed [m/s] in a window, of the fixes ``near``; without any, of those before and after.
+
+    A vehicle that has lost its receiver may fly on as steadily as one that is at rest.
+    """
+    if near.stop > near.start:
+        fast = float(np.nanmax(speed[near], initial=0.0))
+        return fast, fast
+    about = np.nan_to_num(speed[max(near.start - 1, 0) : near.start + 1])
+    return float(np.min(about, initial=math.inf)) if len(about) else 0.0, float(np.max(about, initial=0.0))
 
 
 def between(log: Log, imu: ImuSamples, phase: Phase) -> slice:
@@ -314,6 +331,39 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     if 0 < best < len(LAGS) - 1 and clearer(best, 0):
         return float(LAGS[best])
     return 0.0 if best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
+
+
+def velocity_lag(own: Sequence[Any]) -> float | None:
+    """How much older a receiver's velocities are than the positions beside them [s]; None where that is not shown.
+
+    Positions p move by what velocities of that age add up to: sum v dt - dp = -lag dv, level, over `LAG_S` each. Least
+    squares, what does not fit counting for less; it is believed from 5 sigma on, its residuals lasting so long, too.
+    """
+    t, v_n, place = fixes(own)
+    known = np.isfinite(v_n[:, :2]).all(axis=1) & np.isfinite(place).all(axis=1)
+    t, v, place = t[known], v_n[known, :2], place[known]
+    if len(t) < LEAST_FIXES:
+        return None
+    step = np.diff(t)
+    n = max(1, round(LAG_S / float(np.median(step))))
+    lat, lon, h = place.T
+    R_M, R_N = radii(lat)
+    east = (lon - lon[0] + math.pi) % (2 * math.pi) - math.pi
+    p = np.column_stack([(lat - lat[0]) * (R_M + h), east * (R_N + h) * np.cos(lat)])
+    way = np.vstack([np.zeros((1, 2)), np.cumsum(0.5 * (v[1:] + v[:-1]) * step[:, None], axis=0)])
+    gaps = np.concatenate([[0], np.cumsum(step > 2 * np.median(step))])
+    whole = gaps[n:] == gaps[:-n]
+    apart, gained = (((way - p)[n:] - (way - p)[:-n])[whole], (v[n:] - v[:-n])[whole])
+    if len(apart) < LEAST_FIXES or not gained.any():
+        return None
+    weights, lag, left = np.ones(len(apart)), 0.0, np.zeros(len(apart))
+    for _ in range(FIT_ROUNDS):
+        told = float(weights @ np.sum(gained**2, axis=1))
+        lag = -float(weights @ np.sum(apart * gained, axis=1)) / told
+        left = np.linalg.norm(apart + lag * gained, axis=1)
+        weights = np.minimum(1.0, OUTLYING * np.median(left) / np.maximum(left, TINY))
+    variance = float(weights @ left**2) / len(left) / 2 * n / told
+    return lag if lag**2 > CLEARER * variance else None
 
 
 def _sphere(field: Array) -> Sphere | None:

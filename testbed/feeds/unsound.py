@@ -21,6 +21,7 @@ LEAST_SAMPLES = 60  # in flight
 # flight; bad ones are off by 24 deg or a third of it, and motors' currents add as much.
 MOST_INCLINATION_OFF = math.radians(15)
 MOST_SIZE_OFF = 0.25
+FIELDS_UT = 15.0, 85.0  # that a magnetometer may say, a third beyond those of the Earth
 MOST_HEIGHT_OFF_M = 1000.0  # of a pressure altitude: no weather makes so much
 
 
@@ -87,6 +88,9 @@ def _against(found: Survey, fields: list[MagnetometerSample]) -> Iterator[str]:
 
     resting = [(phase, part) for phase, part in during("rest") if phase.end - phase.start >= LEAST_REST_S]
     if not resting:
+        usual = float(np.median(size)) / MICROTESLA
+        if not FIELDS_UT[0] <= usual <= FIELDS_UT[1]:
+            yield f"its field is of {usual:.3g} µT mostly, where the Earth's is of 22 to 67 µT"
         return
     at_rest = float(np.median(np.concatenate([size[part] for _, part in resting])))
     if (model_n := _model(found.log)) is not None:

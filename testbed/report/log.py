@@ -76,6 +76,8 @@ def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
             yield name, "line of the spectrum", f"{frequency:.1f} Hz, {amplitude:.3g} m/s²"
     for name, lag in found.latency_s.items():
         yield name, "velocity is told of later than the motion by", f"{lag:.2f} s"
+    for name, lag in found.velocity_lag_s.items():
+        yield name, "velocity is older than the position beside it by", f"{lag:.2f} s"
     for name, sphere in found.spheres.items():
         residual, radius, off, sigma = (f"{value / MICROTESLA:.3g}" for value in sphere)
         yield name, "rms from the sphere that fits", f"{residual} µT about {radius} µT"

@@ -17,7 +17,7 @@ from testbed.feeds import formats
 from testbed.feeds.log import Log
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.recorded import Recorded
-from testbed.feeds.survey import survey
+from testbed.feeds.survey import phases, survey
 from testbed.report.log import tables
 
 RADIUS, SPEED, CLIMB, STANDS, LASTS = 200.0, 20.0, 2.0, 20.0, 200.0
@@ -114,6 +114,29 @@ def test_a_unit_on_its_back(turned, said):
 def test_what_stands_on_its_tail_is_sound():
     on_its_tail = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     assert mistaken(log(replace(IMU, dtheta=IMU.dtheta @ on_its_tail.T, dv=IMU.dv @ on_its_tail.T))) == []
+
+
+def test_a_receiver_that_never_has_a_fix_is_told():
+    assert mistaken(log(fixes=[replace(one, fix_type=FixType.NO_FIX) for one in FIXES])) == ["gnss: it never has a fix"]
+
+
+@pytest.mark.parametrize(("rate", "step"), [(20.0, ""), (180.0, "9")])
+def test_a_unit_that_turns_far_between_two_samples(rate, step):
+    """At 20 Hz, to and fro, so that its course is as it was."""
+    t = np.arange(0.05, LASTS, 0.05)
+    rates = np.zeros((len(t), 3))
+    rates[:, 2] = np.radians(rate) * np.where(t % 2 < 1, 1.0, -1.0)
+    imu = ImuSamples(t, np.full(len(t), 0.05), 0.05 * rates, np.tile([0.0, 0.0, -0.49], (len(t), 1)))
+    told = mistaken(log(imu, fixes=FIXES[:5]))
+    assert [one.split(" from one")[0] for one in told] == ([f"imu: it turns by {step} deg"] if step else [])
+
+
+def test_a_steady_flight_without_its_receiver_is_no_rest():
+    """As it circles, rates and forces are as steady as at rest."""
+    lost = [one if not 100 < one.t < 140 else replace(one, fix_type=FixType.NO_FIX) for one in FIXES]
+    assert [phase.name for phase in phases(log(fixes=lost))] == ["rest", "flying"]
+    late = [one if one.t > 10 else replace(one, fix_type=FixType.NO_FIX) for one in FIXES]
+    assert [phase.name for phase in phases(log(fixes=late))] == ["rest", "flying"]
 
 
 def table(folder, lies=(1, 1, 1), says=1.0, sensors=""):

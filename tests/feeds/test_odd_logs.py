@@ -347,7 +347,9 @@ def test_a_solution_that_is_below_its_receiver_is_told(below_m: float, told: boo
     messages = with_solution(circling())
     low = [(name, (*v[:3], v[3] - below_m) if name == "POS" else v) for name, v in messages]
     said = '(XKF1) is 20 m below gnss (median): truth.reference = "gnss" judges by the receiver'
-    assert read(low, tmp_path).remark == (f"the autopilot's own solution {said}" if told else "")
+    log = read(low, tmp_path)
+    assert log.remark == (f"the autopilot's own solution {said}" if told else "")
+    assert ('reference = "gnss"' in draft.scenario(survey(log), tmp_path / "x", None)) == told
 
 
 @pytest.mark.parametrize("below_m", [0.0, 20.0])

@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import io
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,14 @@ def test_a_magnetometer_that_is_not_in_the_earths_field_is_told(
 ) -> None:
     told = magnetometers(flown(tmp_path, **wrong))
     assert told == ({"magnetometer": f"magnetometer: {said}: {ADVICE}"} if said else {})
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, ""), (0.3, "14.3"), (2.0, "95.4")])
+def test_a_field_that_is_not_the_earths_is_told_without_a_rest_too(factor: float, said: str, tmp_path: Path) -> None:
+    found = flown(tmp_path, factor=factor)
+    restless = replace(found, phases=[phase for phase in found.phases if phase.name != "rest"])
+    mostly = f"its field is of {said} µT mostly, where the Earth's is of 22 to 67 µT"
+    assert magnetometers(restless) == ({"magnetometer": f"magnetometer: {mostly}: {ADVICE}"} if said else {})
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.5])
