@@ -113,7 +113,7 @@ class AhrsSection(EstimatorSection):
                 if key in self.model_fields_set:
                     yield (key,), 'says how profile "jiang2021" levels: leave it out, or the profile "any_motion"'
         yield from super().mistakes(sensors)
-        yield from aid_mistakes("ahrs", self.aids, sensors, AIDS)
+        yield from aid_mistakes("ahrs", self.aids, sensors, AIDS, own=False)
         yield from second_of_a_kind("ahrs", self.aids, sensors)
 
 

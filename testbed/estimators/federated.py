@@ -190,7 +190,7 @@ class FederatedSection(EstimatorSection):
                 yield (*where, "name"), "is made of letters, digits and _, and does not begin with a digit"
             elif local.name in names[:index]:
                 yield (*where, "name"), f"{local.name!r} is taken by a local filter above: give each its own name"
-            for path, text in aid_mistakes(self.kind, local.aids, sensors, ONE_EACH | SEVERAL):
+            for path, text in aid_mistakes(self.kind, local.aids, sensors, ONE_EACH | SEVERAL, own=True):
                 yield (*where, *path), text
         yield from slip_mistakes(self.nonholonomic_mps, self.aiding(sensors), sensors)
         shares = [local.share for local in self.locals if local.share is not None]
@@ -220,17 +220,15 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
     errors = rig.imu(section.imu).errors()
     air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
-    def aid(name: str) -> Aid:
-        made = aid_of(name, rig, errors, air, section.nonholonomic_mps)
-        assert made is not None  # the scenario was checked
-        return made
+    def aid(name: str) -> Aid | None:
+        return aid_of(name, rig, errors, air, section.nonholonomic_mps)
 
     used = dict.fromkeys(name for local in section.locals for name in local.aids)
     # Without a receiver or magnetometer among the aids, the first in the file serves the alignment.
     for kind in ("gnss", "magnetometer"):
         if all(rig.sensors[name].kind != kind for name in used):
             used |= dict.fromkeys([name for name, s in rig.sensors.items() if s.kind == kind][:1])
-    aids = {name: aid(name) for name in used}
+    aids = {name: made for name in used if (made := aid(name)) is not None}  # one of the user's may aid none
     local_filters = tuple(
         Local(
             local.name,
@@ -242,6 +240,7 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
                     local.detector.kind in ("sprt", "glr") and local.detector.coloured,
                 )
                 for name in local.aids
+                if name in aids
             ),
             local.share,
             scaling(local.engine),

@@ -103,7 +103,7 @@ class InsSection(EstimatorSection):
     def mistakes(self, sensors: Mapping[str, SensorConfig]) -> Iterator[Mistake]:
         """What is wrong with it among these sensors."""
         yield from super().mistakes(sensors)
-        yield from aid_mistakes("ins", self.aids, sensors, ONE_EACH | SEVERAL)
+        yield from aid_mistakes("ins", self.aids, sensors, ONE_EACH | SEVERAL, own=True)
         if self.smooth and self.engine != "linear":
             yield ("smooth",), f"needs engine 'linear', not {self.engine!r}: leave one of the two out"
         receivers = [aid for aid in self.aids if aid in sensors and sensors[aid].kind == "gnss"]

@@ -104,10 +104,10 @@ class EstimatorSection(Section):
 
 
 def aid_mistakes(
-    kind: str, aids: Sequence[str], sensors: Mapping[str, SensorConfig], usable: frozenset[str]
+    kind: str, aids: Sequence[str], sensors: Mapping[str, SensorConfig], usable: frozenset[str], *, own: bool
 ) -> Iterator[Mistake]:
-    """What is wrong with a list of aids, of sensors that are of ``usable`` kinds."""
-    names = [name for name, one in sensors.items() if one.kind in usable or registry.of(one).aid is not None]
+    """What is wrong with a list of aids, of sensors of ``usable`` kinds, or ``own``: of the user's that have an aid."""
+    names = [n for n, one in sensors.items() if one.kind in usable or (own and registry.of(one).aid is not None)]
     for index, aid in enumerate(aids):
         if aid in sensors and aid not in names:
             yield ("aids", index), f"{aid!r} is of kind {sensors[aid].kind!r}, which does not aid {kind!r}"

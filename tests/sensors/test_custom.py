@@ -241,6 +241,23 @@ def test_what_is_wrong_is_said(scenario: Path, overrides: dict[str, object], say
     assert says in str(told.value)
 
 
+def test_one_that_aids_filters_does_not_aid_an_ahrs(scenario: Path) -> None:
+    """Which ended in a traceback: its aids are three kinds of ours. Those of the user's are handed any sample."""
+    rest, keys = (
+        scenario.with_name("rest.toml"),
+        {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].kind": "ahrs"},
+    )
+    with pytest.raises(UserError) as told:
+        Scenario.load(rest, {**keys, "estimator[0].aids": ["magnetometer", "radar"]})
+    assert "estimator[0].aids[1]: 'radar' is of kind './radar.py:Aided', which does not aid 'ahrs'" in str(told.value)
+    with pytest.raises(UserError) as told:
+        Scenario.load(rest, {**keys, "estimator[0].aids": ["magnetometer", "rada"]})
+    assert str(told.value).endswith('there is no sensor "rada": choose from magnetometer')
+    (scenario.parent / "filters.py").write_text("class Mine: ...")
+    mine = {"name": "mine", "kind": "./filters.py:Mine", "aids": ["magnetometer", "radar"]}
+    assert Scenario.load(rest, {"estimator": [mine]}).estimator[0].aids == ("magnetometer", "radar")
+
+
 def test_its_lists_may_be_lists_or_tuples(scenario: Path) -> None:
     keys = {"sensors.radar.beams": [[1, 0.1], [2.5]], "sensors.radar.arm_m": [0.1, 0.1, 0.2]}
     own = Scenario.load(scenario, keys).sensors["radar"]
@@ -410,10 +427,16 @@ def test_times_may_be_arrays_without_dimensions(scenario: Path) -> None:
     assert own.dataset["sensors/radar"].identical(plain.dataset["sensors/radar"])
 
 
-def test_one_that_says_it_aids_nothing_aids_nothing(scenario: Path) -> None:
-    keys = {"sensors.radar.kind": "./radar.py:Aiding", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
-    result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": "none aided"}))
-    assert not [one for one in result.dataset.groups if one.endswith("innovations/radar")]
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_one_that_says_it_aids_nothing_aids_nothing(scenario: Path, kind: str) -> None:
+    """In a federated filter it ended in a traceback."""
+    aids = ["gnss", "magnetometer", "radar"]
+    taken = {"aids": aids} if kind == "ins" else {"locals": [{"name": "one", "aids": aids}]}
+    keys = {"sensors.radar.kind": "./radar.py:Aiding", "sensors.radar.how": "none aided", "duration_s": 4}
+    estimator = {"name": "mine", "kind": kind, **taken}
+    result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "estimator": [estimator]}))
+    aiding = {one.rpartition("/")[2] for one in result.dataset.groups if "innovations/" in one}
+    assert aiding == {"gnss_position", "gnss_velocity", "magnetometer"}
 
 
 def test_one_with_the_keys_of_a_magnetometer_is_told_where_it_is(scenario: Path) -> None:
