@@ -18,12 +18,14 @@ else `Adapter` stands in for them.
 from __future__ import annotations
 
 import dataclasses
+import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, RootModel, ValidationError
 
 from nav import strapdown
 from nav.horizon import FusionHorizon
@@ -34,6 +36,7 @@ from testbed.estimators.given import Given, Unfit
 from testbed.estimators.lane import Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Mistake
+from testbed.schema import keys_of
 from testbed.sensors import SensorConfig
 
 GROUP = "navigation_testbed.estimators"
@@ -95,31 +98,51 @@ def build(section: CustomSection, rig: Rig) -> Lane:
     return Lane(FusionHorizon(adapter, rig.lag_s(used), coning=coning), imus, used, voter=voter)
 
 
+# --- its keys
+
+
 def options_of(kind: str, folder: Path) -> type[BaseModel] | None:
     """The model that checks the keys of a class; None where it has none, or can't be had, which `build` says."""
     try:
-        found = getattr(plugins.load(kind, folder, GROUP), "Options", None)
+        return _model(plugins.load(kind, folder, GROUP))
     except UserError:
         return None
+
+
+def _model(made: Any) -> type[BaseModel] | None:
+    found = getattr(made, "Options", None)
     return found if isinstance(found, type) and issubclass(found, BaseModel) else None
+
+
+def checked(options: type[BaseModel], given: Mapping[str, Any]) -> BaseModel:
+    """The keys as the model of a class has them. Raises ValidationError, of a key that no field has too."""
+    return _strict(options).model_validate(given)
+
+
+@cache
+def _strict(model: type[BaseModel]) -> type[BaseModel]:
+    """The same model, which refuses keys that it doesn't have, as sections do; one that says it takes any as it is."""
+    if model.model_config.get("extra") in ("allow", "forbid") or issubclass(model, RootModel):
+        return model
+    return cast("type[BaseModel]", types.new_class(model.__name__, (model,), {"extra": "forbid"}))
 
 
 def _options(section: CustomSection, made: Any) -> dict[str, Any]:
     """The class's own keys, checked by its ``Options`` if it has that."""
-    options: type[BaseModel] | None = getattr(made, "Options", None)
+    options = _model(made)
     if options is None:
         return section.options
     try:
-        checked = options.model_validate(section.options)
+        found = checked(options, section.options)
     except ValidationError as error:  # of a record, whose class was another: where it is loaded all is said
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"])) or "options"
         if first["type"] == "extra_forbidden":
             raise UserError(
-                f"estimator {section.name}: {key}: unknown key: {choice(key, list(options.model_fields))}"
+                f"estimator {section.name}: {key}: unknown key: {choice(key, [*keys_of(options)])}"
             ) from None
         raise UserError(f"estimator {section.name}: {key}: {first['msg']}, not {shown(first['input'])}") from None
-    return {name: getattr(checked, name) for name in options.model_fields} | dict(checked.model_extra or {})
+    return {name: getattr(found, name) for name in options.model_fields} | dict(found.model_extra or {})
 
 
 # --- running it

@@ -16,6 +16,7 @@ from testbed.estimators.federated import LocalSection
 from testbed.estimators.section import DEFAULT_ESTIMATOR
 from testbed.scenario import keypath
 from testbed.scenario.keypath import KeyPath
+from testbed.schema import keys_of
 from testbed.sensors import registry as sensor_registry
 
 ERRORS_SHOWN = 20
@@ -90,7 +91,7 @@ def _locate(details: ErrorDetails, root: type[BaseModel], written: Written) -> t
             elif isinstance(step, str) and named:
                 named = False
             elif isinstance(step, str):
-                fields = [m.model_fields[step].annotation for m in models if step in m.model_fields]
+                fields = [m.model_fields[keys_of(m)[step]].annotation for m in models if step in keys_of(m)]
                 models = [model for annotation in fields for model in _sections(annotation)]
                 named = any(get_origin(annotation) is dict for annotation in fields)
     if loc and (_holds(here, loc[-1]) or details["type"] in ("missing", "union_tag_not_found", "scenario")):
@@ -162,7 +163,8 @@ def _say(details: ErrorDetails, path: KeyPath, models: Sequence[type[BaseModel]]
 
 def _missing(path: KeyPath, models: Sequence[type[BaseModel]]) -> str:
     """That a key has to be added, and what it is."""
-    fields = [model.model_fields[key] for model in models for key in path[-1:] if key in model.model_fields]
+    key = str(path[-1])
+    fields = [model.model_fields[keys_of(model)[key]] for model in models if key in keys_of(model)]
     what = next((field.description for field in fields if field.description), None)
     return f"{MISSING} ({what})" if what else MISSING
 
@@ -182,4 +184,4 @@ def _elsewhere(path: KeyPath, models: Sequence[type[BaseModel]]) -> str:
 
 
 def _keys(models: Sequence[type[BaseModel]]) -> list[str]:
-    return list(dict.fromkeys(key for model in models for key in model.model_fields))
+    return list(dict.fromkeys(key for model in models for key in keys_of(model)))

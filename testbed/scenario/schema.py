@@ -80,7 +80,7 @@ def _estimator(table: object, info: ValidationInfo) -> EstimatorSection:
             plugins.load(found.kind, folder, custom.GROUP)
             options = custom.options_of(found.kind, folder)
             if options is not None:
-                options.model_validate(found.options)
+                custom.checked(options, found.options)
         except ValidationError:
             raise
         except UserError as error:

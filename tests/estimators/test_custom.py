@@ -13,6 +13,7 @@ from worlds.loop import same
 from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
+from testbed.estimators.custom import CustomSection, build
 from testbed.many import campaign as campaigns
 from testbed.many import check
 
@@ -24,7 +25,7 @@ MINE = """
 import sys
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
 from nav.samples import Estimate, GnssSample
 
 
@@ -72,6 +73,30 @@ class Mine:
             return 3.0
         lla = np.array([self.fix.lat, self.fix.lon, self.fix.h])
         return Estimate.of(self.t, q_nb=np.array([1.0, 0, 0, 0]), lla=lla, v_n=self.fix.v_n)
+
+
+class Loose(Mine):  # says nothing of keys that it does not have
+    class Options(BaseModel):
+        after_s: float = Field(1e9, alias="until_s", description="how long")
+        how: str = Field(validation_alias=AliasChoices("way", "manner"))
+        limit: float = 1.0
+
+        @model_validator(mode="before")
+        @classmethod
+        def _renamed(cls, keys):
+            return {"limit" if key == "bound" else key: value for key, value in keys.items()}
+
+    def __init__(self, rig, after_s, how, limit):
+        super().__init__(rig, after_s, f"{how} {after_s:g} {limit:g}")
+
+
+class Open(Mine):
+    class Options(BaseModel):
+        model_config = ConfigDict(extra="allow")
+        after_s: float = 1e9
+
+    def __init__(self, rig, after_s, **more):
+        super().__init__(rig, after_s, str(more))
 
 
 class Bare:
@@ -204,7 +229,7 @@ def test_an_estimate_is_made_of_what_is_given() -> None:
         ("inss", "did you mean ins?"),
         ("./none.py:Mine", "can't be read: No such file or directory: a path is relative to the scenario file"),
         ("./filters.py:Mind", 'there is no class in ./filters.py "Mind": did you mean Mine?'),
-        ("./filters.py:Nope", 'there is no class in ./filters.py "Nope": choose from Mine, Bare'),
+        ("./filters.py:Nope", 'there is no class in ./filters.py "Nope": choose from Mine, Loose'),
         ("nowhere.filters:Mine", "there is no module nowhere.filters: install it, or give its file, such as"),
         ("./filters.py:Bare", "./filters.py:Bare lacks propagate, update, estimate"),
         ("math:pi", "math:pi can't be made: TypeError"),
@@ -232,6 +257,46 @@ def test_what_is_wrong_with_its_keys_is_said(folder: Path, options: dict[str, ob
     with pytest.raises(UserError) as told:
         flown(folder, **options)
     assert says in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"way": "", "until": 3}, "estimator[1].until: unknown key: did you mean until_s? Choose from name, kind,"),
+        ({"way": "", "after_s": 3}, "estimator[1].after_s: unknown key: choose from name, kind,"),
+        ({"until_s": 3}, "estimator[1].way: is missing: add it"),
+    ],
+)
+def test_a_key_that_its_options_do_not_have_is_said(folder: Path, options: dict[str, object], says: str) -> None:
+    """Pydantic dropped it, and the run went on without what was meant."""
+    with pytest.raises(UserError) as told:
+        flown(folder, kind="./filters.py:Loose", **options)
+    assert says in str(told.value)
+    assert "after_s, how" not in str(told.value)  # which a file calls otherwise
+
+
+def test_a_key_that_the_options_of_a_record_do_not_have_is_said(folder: Path) -> None:
+    section = CustomSection(name="mine", kind="./filters.py:Loose", way="", limits=3)
+    with pytest.raises(UserError, match=r"^estimator mine: limits: unknown key: did you mean limit\? Choose from"):
+        build(section, SimpleNamespace(folder=folder))
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "how"),
+    [
+        ("Loose", {"until_s": 3, "manner": "so", "bound": 2}, "so 3 2"),
+        ("Loose", {"way": "so", "limit": 4}, "so 1e+09 4"),
+        ("Open", {"after_s": 3, "further": 4}, "{'further': 4}"),
+    ],
+)
+def test_keys_that_its_options_have_by_other_names_are_taken(
+    folder: Path, kind: str, options: dict[str, object], how: str
+) -> None:
+    """By an alias, by a validator of the model's, or any at all where it says so."""
+    keys = {f"estimator[1].{key}": value for key, value in {"kind": f"./filters.py:{kind}", **options}.items()}
+    scenario = Scenario.load(folder / "own.toml", SHORT | keys)
+    lane = build(scenario.estimator[1], scenario.rig(1))
+    assert lane.horizon.estimator.inner.how == how
 
 
 def test_all_that_is_wrong_with_its_keys_is_said_with_its_line(folder: Path) -> None:
