@@ -177,6 +177,8 @@ class Adapter:
 
     def update(self, sample: Sample) -> list[UpdateReport]:
         """Use a sample that is valid at the estimator's own time."""
+        if np.isnan(self._t):
+            self._given.handed(sample.t)
         return self._asked(self._update, [], sample)
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:

@@ -36,13 +36,20 @@ class Given:
     """Looks at what one estimator gives; the length of what has a name must stay as it was at first.
 
     Numbers and arrays of another type than that of the record become of that type. An estimate may be off its time by
-    ``tick_s`` [s], as a clock that counts ticks is between them.
+    ``tick_s`` [s], as a clock that counts ticks is between them. Before the first increment nobody tells it the time:
+    then it may be of the run's start, or as old as a sample that it was handed.
     """
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
+        self._told = [0.0]  # times that it knows before the first increment
         self._innovations: dict[str, int] = {}  # by aid
         self._states: dict[str, int] = {}
+
+    def handed(self, t: float) -> None:
+        """Before the first increment a sample of ``t`` [s] is handed over."""
+        if math.isfinite(t):
+            self._told = [min(t, *self._told), max(t, *self._told)]
 
     def estimate(self, given: Any, method: str, t: float) -> Estimate:
         """What a method gave as an estimate at ``t`` [s], NaN before the first increment. Raises Unfit."""
@@ -68,8 +75,8 @@ class Given:
         if type(given.extra) is not dict or given.extra:
             changes["extra"] = self._extra(given.extra, f"{method}: extra")
         fit = dataclasses.replace(given, **changes) if changes else given
-        if fit.status & Status.ALIGNED and abs(fit.t - t) > self._tick_s * (1 + LENGTH):  # false for NaN
-            raise Unfit(f"{method} is of {fit.t:.10g} s, not of {t:.10g} s, the end of the last increment")
+        if fit.status & Status.ALIGNED:
+            self._require_time(fit.t, method, t)
         for name, limit in LIMITS.items():
             angle = getattr(fit, name)
             if limit < abs(angle) < math.inf:  # what is not finite is counted
@@ -77,6 +84,15 @@ class Given:
         if not _is_symmetric(fit.covariance):
             raise Unfit(f"{method}: covariance is not symmetric: give 0.5 * (P + P.T)")
         return fit
+
+    def _require_time(self, own: float, method: str, t: float) -> None:
+        """Raises Unfit of an estimate of another time than ``t`` [s], NaN before the first increment."""
+        begun, tick_s = not math.isnan(t), self._tick_s * (1 + LENGTH)
+        known = [t] if begun else self._told
+        if own < min(known) - tick_s or own > max(known) + tick_s:  # false for NaN
+            when = f"not of {t:.10g} s, the end of the last increment"
+            early = "before the first increment: there its t is nan, 0, or that of a sample"
+            raise Unfit(f"{method} is of {own:.10g} s, {when if begun else early}")
 
     def reports(self, given: Any, method: str) -> list[UpdateReport]:
         """What a method gave as a list of reports. Raises Unfit."""

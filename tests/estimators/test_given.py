@@ -41,6 +41,7 @@ class Giving:
 
 def told(**changes: Any) -> tuple[Estimate, str]:
     adapter = Adapter(Giving(dataclasses.replace(SOUND, **changes)), TICK_S)
+    adapter.propagate(IMU)
     return adapter.estimate(), adapter.failure
 
 
@@ -155,6 +156,27 @@ def test_the_time_may_be_unknown_or_a_tick_off_or_any_before_alignment() -> None
         assert adapter.failure == ""
 
 
+@pytest.mark.parametrize("ask", [lambda a: a.estimate(), lambda a: a.predict(IMU)])
+def test_before_the_first_increment_it_is_no_older_than_the_run_and_no_younger_than_a_sample(
+    ask: Callable[[Adapter], Any],
+) -> None:
+    """Its first estimates were of any time, and told as such."""
+    for t, sample in ((-5.0, SAMPLE), (1.1, SAMPLE), (1.0, None), (np.inf, SAMPLE)):
+        adapter = Adapter(Giving(dataclasses.replace(SOUND, t=t)), TICK_S)
+        if sample is not None:
+            adapter.update(sample)
+        ask(adapter)
+        assert adapter.failure == (
+            f"estimate is of {t:g} s, before the first increment: there its t is nan, 0, or that of a sample"
+        )
+    for t in (np.nan, 0.0, 1.0):
+        adapter = Adapter(Giving(dataclasses.replace(SOUND, t=t)), TICK_S)
+        adapter.update(dataclasses.replace(SAMPLE, t=np.nan))
+        adapter.update(SAMPLE)
+        ask(adapter)
+        assert adapter.failure == ""
+
+
 @pytest.mark.parametrize(
     ("given", "says"),
     [
@@ -216,6 +238,7 @@ def test_lengths_stay_as_they_were() -> None:
     adapter.update(SAMPLE)
     assert adapter.failure == "update: a report's innovation of gnss_position has 2 numbers, and had 3 before"
     adapter = Adapter(inner, TICK_S)
+    adapter.propagate(IMU)
     adapter.estimate()
     inner.given = dataclasses.replace(SOUND, extra={"b": pair(1)})
     adapter.estimate()
@@ -304,12 +327,30 @@ class Unusual:
 """
 
 
+def test_an_estimate_of_an_impossible_time_is_no_event(tmp_path: Path) -> None:
+    """Aligned at -5 s, said the record, of one that was refused for that."""
+    early = UNUSUAL.replace("self.fix is None", "False").replace(
+        "[self.fix.lat, self.fix.lon, self.fix.h]", "[0.8, 0, 0]"
+    )
+    early = early.replace("Estimate.of(self.t, q_nb", "Estimate.of(-5.0, q_nb").replace("v_n=self.fix.v_n, ", "")
+    result = run(Scenario.load(written(tmp_path, early), {"duration_s": 1, "expect": {}}))
+    (told,) = [one for one in result.dataset["events"]["text"].values.tolist() if one.startswith("own ")]
+    assert told.startswith("own has ended: estimate is of -5 s, before the first increment")
+    assert (result.dataset["events"]["time"].values >= 0.0).all()
+    assert (result.dataset["estimators/own/time"].values >= 0.0).all()
+
+
+def written(folder: Path, text: str) -> Path:
+    """A scenario with an estimator of the user's alone."""
+    (folder / "unusual.py").write_text(text)
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[[estimator]]")[0]
+    (folder / "own.toml").write_text(f'{text}\n[[estimator]]\nname = "own"\nkind = "./unusual.py:Unusual"\n', "utf-8")
+    return folder / "own.toml"
+
+
 def test_a_known_name_for_another_thing_is_recorded(tmp_path: Path) -> None:
     """Position of two components, wind of three: their own components, not north, east and down."""
-    (tmp_path / "unusual.py").write_text(UNUSUAL)
-    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[[estimator]]")[0]
-    (tmp_path / "own.toml").write_text(f'{text}\n[[estimator]]\nname = "own"\nkind = "./unusual.py:Unusual"\n', "utf-8")
-    result = run(Scenario.load(tmp_path / "own.toml", {"duration_s": 5, "expect": {}}), out=tmp_path / "out")
+    result = run(Scenario.load(written(tmp_path, UNUSUAL), {"duration_s": 5, "expect": {}}), out=tmp_path / "out")
     assert not [one for one in result.remarks if "has ended" in one]
     record = load(tmp_path / "out/run.nc")
     assert column(record, "estimators/own/innovations/gnss_position/innovation").shape[1:] == (2,)
