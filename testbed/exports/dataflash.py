@@ -1,8 +1,9 @@
 """A record as a DataFlash log of ArduPilot, for its log viewers: units and scales are in it.
 
 Its clock begins `stream.START_US` before the run. Samples stand where they arrived, truth is SIM (of the centre of
-gravity), estimators are the cores of XKF1 (of the IMU), the first of them ATT and POS too. Messages that ArduPilot's
-Replay needs are not in it. Heights above the sea's level are those above the ellipsoid.
+gravity; without an attitude its angles are 0 and its quaternion is NaN), estimators are the cores of XKF1 (of the IMU),
+the first of them ATT and POS too. Messages that ArduPilot's Replay needs are not in it. Heights above the sea's level
+are those above the ellipsoid.
 
 Sources: LogStructure.h of AP_Logger, AP_GPS, AP_InertialSensor, AP_Compass, AP_AHRS and AP_NavEKF3 of ArduPilot 4.6.
 """

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from nav.earth import position_difference_n
 from nav.samples import Array
 from testbed.exports.track import Track, tracks
-from testbed.exports.view import Columns, View
+from testbed.exports.view import Columns, View, only, turned
 
 if TYPE_CHECKING:
     import xarray
@@ -116,11 +116,14 @@ def _locations(track: Track) -> Iterator[tuple[float, dict[str, Any]]]:
 
 def _poses(view: View, own: Columns) -> Iterator[tuple[float, dict[str, Any]]]:
     """Attitudes where a place is known; of one that knows none, at the origin."""
+    own = only(own, turned(own))
+    if not len(own["time"]):
+        return
     lat0, lon0, h0 = (np.array(x) for x in view.origin())
     place = position_difference_n(own["lat"], own["lon"], own["h"], lat0, lon0, h0) @ ENU_NED.T
     attitude = Rotation.from_quat(np.roll(own["q_nb"], -1, axis=-1))  # the scalar last
-    turned = (Rotation.from_matrix(ENU_NED) * attitude * Rotation.from_matrix(FLU_FRD)).as_quat()
-    for t, p, q in zip(own["time"], np.nan_to_num(place), turned, strict=True):
+    orientations = (Rotation.from_matrix(ENU_NED) * attitude * Rotation.from_matrix(FLU_FRD)).as_quat()
+    for t, p, q in zip(own["time"], np.nan_to_num(place), orientations, strict=True):
         orientation = dict(zip("xyzw", map(float, q), strict=True))
         yield float(t), {"frame_id": "map", "pose": {"position": _vector(p), "orientation": orientation}}
 

@@ -26,7 +26,7 @@ from nav.earth import SEA_LEVEL_DENSITY, isa_density, isa_temperature, pressure_
 from nav.samples import Array, Status
 from testbed.exports.stream import START_US, Rows, Stamps, stamps
 from testbed.exports.ulog import Topic, encode, rows
-from testbed.exports.view import Columns, View, carried, fixed
+from testbed.exports.view import Columns, View, carried, fixed, only, placed, turned
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import FLYING_MPS
 from testbed.score.accuracy import euler
@@ -233,14 +233,14 @@ def _estimates(view: View, version: str) -> Iterator[Topic]:
 
 
 def _states(view: View, own: Columns) -> dict[str, dict[str, Any]]:
-    """What PX4 says of attitude, local and global position; of an attitude alone only the first."""
-    t = stamps(own["time"])
-    said: dict[str, dict[str, Any]] = {"attitude": {"t": t, "timestamp_sample": t, "q": own["q_nb"]}}
-    known = np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"])
-    if not known.any():
+    """What PX4 says of attitude, local and global position, each where it is known: a heading may be NaN."""
+    upright = only(own, turned(own))
+    t = stamps(upright["time"])
+    said: dict[str, dict[str, Any]] = {"attitude": {"t": t, "timestamp_sample": t, "q": upright["q_nb"]}}
+    own = only(own, placed(own))
+    if not len(own["time"]):
         return said
-    own = {name: values[known] for name, values in own.items()}
-    t, lat, lon, h, v = t[known], own["lat"], own["lon"], own["h"], own["v_n"]
+    t, lat, lon, h, v = stamps(own["time"]), own["lat"], own["lon"], own["h"], own["v_n"]
     lat0, lon0, h0 = view.origin()
     place = local(lat, lon, lat0, lon0)
     blank = np.zeros((len(t), 3))
@@ -249,7 +249,7 @@ def _states(view: View, own: Columns) -> dict[str, dict[str, Any]]:
     accuracy = {"eph": np.hypot(sigma[:, 0], sigma[:, 1]), "epv": sigma[:, 2], "dead_reckoning": alone}
     valid: dict[str, Any] = dict.fromkeys(("xy_valid", "z_valid", "xy_global", "z_global"), True)
     moving = np.isfinite(v).all(axis=1)
-    valid |= {"v_xy_valid": moving, "v_z_valid": moving, "heading_good_for_control": True}
+    valid |= {"v_xy_valid": moving, "v_z_valid": moving, "heading_good_for_control": turned(own)}
     unlimited = ("vxy_max", "vz_max", "hagl_min", "hagl_max", "hagl_max_z", "hagl_max_xy")
     unknown = ("ax", "ay", "az", "unaided_heading", "dist_bottom", "dist_bottom_var")
     said["local_position"] = {

@@ -5,6 +5,9 @@
 * ``psins``: struct ``trj`` with ``imu`` [wm vm t], ``avp`` [att vn pos t], ``avp0`` and ``ts``, and ``gps`` [vn pos t],
   body axes right-forward-up, navigation axes east-north-up, att pitch, roll and yaw, which counts from north to west.
   Sources: trjfile.m, avpset.m and insupdate.m of PSINS.
+
+Of truth there are the rows that have an attitude. Where none has any, ``ref`` is without angles, and ``trj`` without
+``avp`` and ``avp0``.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ import numpy as np
 from nav.samples import Array
 from testbed.errors import UserError
 from testbed.exports.matlab import packed
-from testbed.exports.view import Columns, View, fixed
+from testbed.exports.view import Columns, View, fixed, only, turned
 from testbed.score.accuracy import euler
 from testbed.sensors.gnss import GnssConfig
 
@@ -36,7 +39,7 @@ def content(tree: xarray.DataTree, version: str) -> bytes:
 def _fixes(view: View) -> Columns:
     """The samples of the first receiver with a fix, none without a receiver."""
     own = view.first("gnss")
-    return {} if own is None else {name: values[fixed(own)] for name, values in own.items()}
+    return {} if own is None else only(own, fixed(own))
 
 
 def _hz(t: Array) -> float:
@@ -44,13 +47,14 @@ def _hz(t: Array) -> float:
 
 
 def _navego(view: View, imu: Columns) -> dict[str, Any]:
-    dt, truth = imu["dt"][:, None], view.truth
-    angles = euler(truth["q_nb"])
+    dt, upright = imu["dt"][:, None], turned(view.truth)
+    truth = only(view.truth, upright) if upright.any() else view.truth
+    angles = dict(zip(("roll", "pitch", "yaw"), euler(truth["q_nb"]).T, strict=True)) if upright.any() else {}
     root: dict[str, Any] = {
         "imu": {"t": imu["time"], "fb": imu["dv"] / dt, "wb": imu["dtheta"] / dt, "freq": _hz(imu["time"])},
         "ref": {
             "t": truth["time"],
-            **{name: angles[:, k] for k, name in enumerate(("roll", "pitch", "yaw"))},
+            **angles,
             **{name: truth[name] for name in ("lat", "lon", "h")},
             "vel": truth["v_n"],
             "freq": _hz(truth["time"]),
@@ -72,13 +76,13 @@ def _navego(view: View, imu: Columns) -> dict[str, Any]:
 
 
 def _psins(view: View, imu: Columns) -> dict[str, Any]:
-    truth = view.truth
+    truth = only(view.truth, turned(view.truth))
     roll, pitch, heading = euler(truth["q_nb"]).T
     att = np.column_stack([pitch, roll, -heading])
     avp = np.column_stack([att, _enu(truth["v_n"]), truth["lat"], truth["lon"], truth["h"], truth["time"]])
     increments = np.column_stack([_enu(imu["dtheta"]), _enu(imu["dv"]), imu["time"]])
-    own = {"imu": increments, "avp": avp, "avp0": avp[0, :9, None], "ts": float(np.median(imu["dt"]))}
-    root: dict[str, Any] = {"trj": own}
+    own = {"imu": increments, "ts": float(np.median(imu["dt"]))}
+    root: dict[str, Any] = {"trj": own | ({"avp": avp, "avp0": avp[0, :9, None]} if len(avp) else {})}
     if gnss := _fixes(view):
         root["gps"] = np.column_stack([_enu(gnss["v_n"]), gnss["lat"], gnss["lon"], gnss["h"], gnss["time"]])
     return root

@@ -10,7 +10,7 @@ import numpy as np
 
 from nav.earth import radii
 from nav.samples import Array
-from testbed.exports.view import Columns, View, fixed
+from testbed.exports.view import Columns, View, fixed, placed
 
 CONFIDENT = 5.991  # chi-square of two degrees of freedom at 95 %
 CORNERS = 36  # of an ellipse
@@ -50,7 +50,7 @@ def tracks(view: View, receivers: bool = False) -> list[Track]:
 
 
 def _track(name: str, own: Columns, covariance: Array, estimated: bool = False) -> Track:
-    known = np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"])
+    known = placed(own)
     t, lat, lon, h = (np.asarray(own[key][known], float) for key in ("time", "lat", "lon", "h"))
     return Track(name, t, lat, lon, h, covariance[known], estimated)
 

@@ -34,13 +34,16 @@ KINDS = {
 
 
 class View:
-    """One record. Raises UserError where it holds no truth."""
+    """One record. ``truth`` is where it has a place or an attitude. Raises UserError where it never has any."""
 
     def __init__(self, tree: xarray.DataTree) -> None:
         self._tree = tree
-        self.truth = self._known("truth")
-        if not len(self.truth.get("time", ())):
+        rows = self.group("truth")
+        if not len(rows.get("time", ())):
             raise UserError("the record holds no row of truth: the run ended before its first")
+        self.truth = only(rows, placed(rows) | turned(rows))
+        if not len(self.truth["time"]):
+            raise UserError("the truth of the record is unknown: no row of it has a place or an attitude")
 
     def group(self, path: str) -> Columns:
         """The columns of one group, none where there is no such group."""
@@ -53,12 +56,9 @@ class View:
         return {name: np.asarray(one.values) for name, one in columns.items() if one.dims[:1] == (time,)}
 
     def _known(self, path: str) -> Columns:
-        """The rows of truth or an estimate in which the attitude is known: before alignment nothing is."""
+        """The rows of an estimate in which the attitude is known: before alignment nothing is."""
         own = self.group(path)
-        if "q_nb" not in own:
-            return own
-        known = np.isfinite(own["q_nb"]).all(axis=1)
-        return {name: values[known] for name, values in own.items()}
+        return only(own, turned(own)) if "q_nb" in own else own
 
     @cached_property
     def title(self) -> str:
@@ -79,7 +79,7 @@ class View:
             own = self.group(f"sensors/{name}")
             if "dtheta" in own:
                 known = np.isfinite(own["dtheta"]).all(axis=1) & np.isfinite(own["dv"]).all(axis=1)
-                own = {key: values[known] for key, values in own.items()}
+                own = only(own, np.asarray(known))
             for column, kind in KINDS.items():
                 if column in own and len(own["time"]):
                     found[kind][str(name)] = own
@@ -122,7 +122,7 @@ class View:
     def origin(self) -> tuple[float, float, float]:
         """The first place that truth has, else an estimate: latitude, longitude [rad], height [m]."""
         for own in (self.truth, *self.estimators.values()):
-            known = np.flatnonzero(np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"]))
+            known = np.flatnonzero(placed(own))
             if len(known):
                 lat, lon, h = (float(own[name][known[0]]) for name in ("lat", "lon", "h"))
                 return lat, lon, h
@@ -131,6 +131,21 @@ class View:
     def reports(self, estimator: str, aid: str) -> Columns:
         """What became of the samples of one aid, none where it is not used."""
         return self.group(f"estimators/{estimator}/innovations/{aid}")
+
+
+def placed(own: Columns) -> npt.NDArray[np.bool_]:
+    """In which rows of truth or an estimate a place is known."""
+    return np.asarray(np.isfinite(own["lat"]) & np.isfinite(own["lon"]) & np.isfinite(own["h"]))
+
+
+def turned(own: Columns) -> npt.NDArray[np.bool_]:
+    """In which rows of truth or an estimate an attitude is known. The reference of a recorded flight may have none."""
+    return np.asarray(np.isfinite(own["q_nb"]).all(axis=1))
+
+
+def only(own: Columns, rows: npt.NDArray[np.bool_]) -> Columns:
+    """These rows alone."""
+    return {name: values[rows] for name, values in own.items()}
 
 
 def fixed(own: Columns) -> npt.NDArray[np.bool_]:
