@@ -233,7 +233,7 @@ def campaign(
         interrupts.leaving(lambda: f"what is finished is in {folder}; the same command carries on"),
         progress.shown(console(stderr=True), scenario) as tell,
     ):
-        result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)))
+        result = campaigns.fly(plan, scheduler, lambda now: tell(now.fraction, str(now)), remark)
     for table in campaign_report.tables(result):
         console().print(table)
     print(printable(f"campaign: {folder}"))

@@ -30,7 +30,7 @@ import numpy as np
 from nav.samples import Array
 from testbed.data import write_file
 from testbed.errors import UserError
-from testbed.many import given, pool, progress
+from testbed.many import given, pool, progress, seeds
 from testbed.many.draws import DRAW, require_draw
 from testbed.many.folder import claim, code, own, require_code, require_own_code, versions
 from testbed.many.shared_flight import log_digests, require_control, share_truth
@@ -133,6 +133,7 @@ class CampaignResult:
     failures: Sequence[Failure]
     statistics: Statistics
     draw: int = 0
+    remarks: Sequence[str] = ()  # what its reader should know first
 
     def __repr__(self) -> str:
         """In a line, as the last of a notebook's cell is shown."""
@@ -209,9 +210,9 @@ class Plan:
     draw: int = 0
 
     def seeds(self, scenario: Scenario) -> range:
-        """The seeds of a scenario's runs."""
+        """The seeds of a scenario's runs: one where all runs would be the same."""
         first = scenario.seed + self.draw * DRAW
-        return range(first, first + self.runs)
+        return range(first, first + (self.runs if seeds.matter(scenario) else 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +243,8 @@ def campaign(
     ``overrides``, as `Scenario.load` takes them, apply to all runs. Each ``draw`` has other seeds. ``workers`` is
     the number of processes, one for each core without, or the address of a Dask scheduler. In ``out``,
     `usual_folder` without, there are at the end runs/, campaign.csv, campaign.json and figures; what is there
-    already of the same campaign is not flown again. How far it is is told on stderr.
+    already of the same campaign is not flown again. How far it is is told on stderr. Of a recorded flight in which
+    nothing follows the seed each combination is flown once, and ``remarks`` say so.
 
     A run that fails is in ``failures`` and stops no other. Raises UserError when anything given is wrong, when ``out``
     can't be written or holds another campaign, or when the scheduler can't be reached.
@@ -257,7 +259,7 @@ def campaign(
 
     with progress.shown(Console(stderr=True), str(scenario)) as tell:
         plan = Plan(scenario, runs, folder, varied, overrides, draw)
-        return fly(plan, workers, lambda now: tell(now.fraction, str(now)))
+        return fly(plan, workers, lambda now: tell(now.fraction, str(now)), progress.say)
 
 
 def usual_folder(scenario: str | Path, draw: int) -> Path:
@@ -265,20 +267,26 @@ def usual_folder(scenario: str | Path, draw: int) -> Path:
     return Path("runs", f"{Path(scenario).stem}_campaign{f'_draw{draw}' if draw else ''}")
 
 
-def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress], None] | None = None) -> CampaignResult:
-    """The same, for whoever shows by itself how far it is."""
+def fly(
+    plan: Plan, workers: int | str | None = None, tell: Callable[[Progress], None] | None = None,
+    say: Callable[[str], None] = lambda remark: None,
+) -> CampaignResult:  # fmt: skip
+    """The same, for whoever shows by itself how far it is, and what there is to say before it begins."""
     from testbed.report import campaign as campaign_report
 
     combinations = _combinations(plan)
     if plan.runs < 1:
         raise UserError(f"--runs {plan.runs}: give at least 1")
     require_draw(plan.draw, plan.runs if plan.draw else 0)
-    total = len(combinations) * plan.runs
+    remarks = seeds.remarks([one.scenario for one in combinations], plan.runs, plan.draw)
+    total = sum(len(plan.seeds(one.scenario)) for one in combinations)
     folder = plan.out.absolute()
     mine = own([one.scenario for one in combinations])
     claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan, mine))
     stored = _load_all(folder, combinations, plan)
     failures: list[Failure] = []
+    for remark in remarks:
+        say(remark)
     if len(stored) < total:
         teller = _Teller(tell, total, len(stored))
         with pool.opened(total - len(stored), workers) as crew:
@@ -295,7 +303,7 @@ def fly(plan: Plan, workers: int | str | None = None, tell: Callable[[Progress],
     outcomes = [stored[run] for run in sorted(stored)]
     failures.sort(key=lambda f: (f.combination, f.seed))
     statistics = campaign_report.statistics(combinations, outcomes)
-    result = CampaignResult(folder, combinations, outcomes, failures, statistics, plan.draw)
+    result = CampaignResult(folder, combinations, outcomes, failures, statistics, plan.draw, remarks)
     campaign_report.save(result)
     return result
 
@@ -486,8 +494,5 @@ class _Teller:
     def _now(self) -> None:
         if self._tell is not None:
             elapsed = time.monotonic() - self._started
-            self._tell(
-                Progress(
-                    self._done, self._failed, self._total, self._before, self._flying, elapsed, self._activity
-                )
-            )  # fmt: skip
+            counts = self._done, self._failed, self._total, self._before
+            self._tell(Progress(*counts, self._flying, elapsed, self._activity))

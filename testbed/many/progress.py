@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeAlias
 
 from rich.progress import BarColumn, Progress, TextColumn
+
+from testbed.errors import printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,6 +39,11 @@ def shown(console: Console, title: str) -> Iterator[Tell]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(title, total=1.0, text="starting; the first time, kernels are compiled")
         yield lambda fraction, text: bar.update(task, completed=fraction, text=pace.with_remaining(fraction, text))
+
+
+def say(text: str) -> None:
+    """One line on stderr for whoever reads along, above what is shown there of how far it is."""
+    print(printable(text), file=sys.stderr)
 
 
 class _Pace:

@@ -263,6 +263,7 @@ def _page(result: CampaignResult, shown: Sequence[Shown]) -> str:
         figures=shown,
         contents=interactive,
         script=script_of(interactive),
+        remarks=result.remarks,
         tables=[(table.title, table.rows) for table in texts(result)],
         failures=[
             (f"{result.combinations[failure.combination]} seed {failure.seed}".strip(), failure.message)
@@ -300,6 +301,7 @@ def _json(result: CampaignResult) -> dict[str, Any]:
         "combinations": [dict(combination.values) for combination in result.combinations],
         "draw": result.draw,
         "runs": len(result.outcomes),
+        "remarks": list(result.remarks),
         "spreads": plain(result.statistics.spreads),
         "consistency": plain(result.statistics.consistency),
         "means": plain(result.statistics.means),

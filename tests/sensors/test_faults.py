@@ -6,7 +6,7 @@ import datetime as dt
 import math
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pymap3d
@@ -22,6 +22,7 @@ from nav.terrain import Terrain
 from testbed import sensors
 from testbed.sensors import faults
 from testbed.sensors.faults import CHANNELS, Faults
+from testbed.sensors.faults.kinds import OnChannel
 
 DURATION_S = 30.0
 SITE = sensors.Site(dt.date(2026, 6, 1), 0.0, 0.0, 0.0, Terrain.flat(500.0))  # in sight from 800 m
@@ -421,6 +422,22 @@ def test_intermittent_comes_and_goes() -> None:
     gone = np.array([9.999 < x < 19.999 and (x - 10 + 1e-6) % 4.0 < 2.0 for x in healthy.t])
     np.testing.assert_array_equal(np.isnan(ours.dv).all(axis=1), gone)
     assert np.isfinite(ours.dtheta).all()
+
+
+def test_it_is_known_which_kinds_draw() -> None:
+    """Of a recorded flight nothing else does, so that runs of it are all the same."""
+    more = {"noise": {"factor": 3.0}, "scale": {"factor": 2.0}, "delay": {"delay_s": 1.0}, "slow": {"factor": 2},
+            "intermittent": {"period_s": 2.0}, "stuck": {}, "garbage": {}, "dropout": {},
+            "drag_off": {"bearing_deg": 0.0, "velocity_mps": 1.0}}  # fmt: skip
+    given = {kind: keys for kind, (keys, _) in ADDED.items()} | more
+    config = section("gnss")
+    samples = sensors.build("it", config, RATE_HZ, 5, SITE).sense(lively(round(DURATION_S * RATE_HZ) + 1))
+    for kind in get_args(faults.FaultConfig):
+        name = get_args(kind.model_fields["kind"].annotation)[0]
+        channel = {"channel": "down"} if issubclass(kind, OnChannel) else {}
+        at_work = fault(sensor="it", kind=name, **given[name], **channel)
+        one, other = (Faults([at_work], {"it": config}, seed).apply("it", samples) for seed in (5, 6))
+        assert alike(one, other) is (not issubclass(kind, faults.DRAWN)), name
 
 
 @pytest.mark.parametrize(("kind", "channel", "unit"), [("imu", "gyro", "deg/s"), ("magnetometer", "field", "uT")])

@@ -25,6 +25,6 @@ the channel of an IMU, and then loses these alone.
 
 from testbed.sensors.faults.acting import Faults, FaultTruth, label
 from testbed.sensors.faults.channels import CHANNELS, Channel
-from testbed.sensors.faults.kinds import Fault, FaultConfig, mistakes
+from testbed.sensors.faults.kinds import DRAWN, Fault, FaultConfig, mistakes
 
-__all__ = ["CHANNELS", "Channel", "Fault", "FaultConfig", "FaultTruth", "Faults", "label", "mistakes"]
+__all__ = ["CHANNELS", "DRAWN", "Channel", "Fault", "FaultConfig", "FaultTruth", "Faults", "label", "mistakes"]

@@ -211,6 +211,7 @@ FaultConfig: TypeAlias = (
     | DragOff
 )
 Fault: TypeAlias = Annotated[FaultConfig, Field(discriminator="kind")]
+DRAWN = (Noise, Garbage)  # of random numbers, which the seed of a run decides
 
 
 def mistakes(fault: FaultConfig, sensor: Any) -> Iterator[tuple[str, str]]:
