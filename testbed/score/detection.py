@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -192,6 +193,12 @@ def by_sensor(
         np.logical_or.at(taken, row, used[mine])
         result[name] = SensorLooks(when, alarm, ~taken | alarm)
     return result
+
+
+def taken(dataset: xarray.DataTree, estimator: str) -> set[str]:
+    """The sensors whose samples an estimator takes, the unit that it integrates among them."""
+    imus = json.loads(dataset.attrs.get("estimator_imus", "{}"))
+    return {*_recorded_looks(dataset, estimator), imus.get(estimator, "")}
 
 
 def _recorded_looks(dataset: xarray.DataTree, estimator: str) -> dict[str, SensorLooks]:

@@ -47,6 +47,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *not_finite(metrics),
         *_silent(dataset),
         *_refusing(dataset),
+        *_uncounted(dataset),
         *unfinished_leg(dataset),
         *_impossible(dataset),
         *_unjudged(dataset),
@@ -82,6 +83,23 @@ def _refusing(dataset: xarray.DataTree) -> Iterator[str]:
             gated = looks.gated[looks.t >= aligned_s]
             if len(gated) >= FEW and gated.mean() > MOST:
                 yield f"{name} refused {gated.mean():.0%} of {aid} since its alignment: it is wrong, or the sensor is"
+
+
+def _uncounted(dataset: xarray.DataTree) -> Iterator[str]:
+    """What faults did to whom before errors count, in a run that is scored: no metric of errors tells of it."""
+    faults = detection.faults(dataset)
+    for name in accuracy.names(dataset) if faults else ():
+        t, aligned_s = accuracy.alignment(dataset, name)
+        if aligned_s is None or t[-1] < aligned_s + accuracy.SETTLING_S:  # `unscored` says so
+            continue
+        counting, taken = aligned_s + accuracy.SETTLING_S, detection.taken(dataset, name)
+        for one in faults:
+            if one.start < counting - accuracy.SAME_TIME_S and one.sensor in taken:
+                how = "counted in part" if detection.fault_window(one)[1] > counting else "not counted"
+                yield (
+                    f"{name}: its errors with {one.name}, from {one.start:g} to {one.end:g} s, are {how}: errors count "
+                    f"from {counting:.1f} s, {accuracy.SETTLING_S:g} s after its alignment"
+                )
 
 
 def _impossible(dataset: xarray.DataTree) -> Iterator[str]:

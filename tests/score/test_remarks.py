@@ -18,10 +18,10 @@ from testbed.score.remarks import remarks
 from testbed.sensors.faults import FaultTruth
 
 
-def flown(honest: float = 1.0, window: tuple[float, float] = (100.0, 120.0)) -> Any:
+def flown(honest: float = 1.0, window: tuple[float, float] = (100.0, 120.0), sensor: str = "gnss") -> Any:
     """A made-up run of 200 s with one fault and two estimators: one claims what is so, the other a part of it."""
     recorder = Recorder(None, scenario(200.0), 1)
-    recorder.faults([FaultTruth("jump", "gnss", "x", "step", *window, 3.0, "m")])
+    recorder.faults([FaultTruth("jump", sensor, "x", "step", *window, 3.0, "m")])
     estimators = {"ins": Errors(aligned_after=0.0), "other": Errors(aligned_after=0.0, truth_over_claim=honest)}
     synthetic_run.record(recorder, circle(200.0), estimators)
     recorder.close()
@@ -81,6 +81,27 @@ def test_metrics_of_another_settling_time_are_no_error() -> None:
     found = metrics.compute(run, settling_s=5.0)
     assert found["other.error_over_3sigma.jump"] > 1.0
     assert all("astray" not in told for told in doubts(run, found))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "window", "how"),
+    [
+        ("gnss", (10.0, 20.0), "not counted"),
+        ("gnss", (10.0, 50.0), "not counted"),
+        ("gnss", (10.0, 60.0), "counted in part"),
+        ("gnss", (60.0, 70.0), ""),
+        ("imu", (0.0, 1.0), "not counted"),
+        ("rangefinder", (0.0, 1.0), ""),  # which nobody has
+    ],
+)
+def test_what_faults_did_before_errors_count_is_told(sensor: str, window: tuple[float, float], how: str) -> None:
+    """Of a step of 20 m in the first 20 s nothing was said, and all figures of errors were perfect."""
+    run = flown(window=window, sensor=sensor)
+    found = metrics.compute(run)
+    assert ("ins.error_over_3sigma.jump" in found) is (sensor == "gnss" and how != "not counted")
+    when = f"from {window[0]:g} to {window[1]:g} s"
+    told = f"its errors with jump, {when}, are {how}: errors count from 60.0 s, 60 s after its alignment"
+    assert doubts(run, found) == ([f"{name}: {told}" for name in ("ins", "other")] if how else [])
 
 
 @pytest.mark.ci
