@@ -93,7 +93,12 @@ class AhrsSection(EstimatorSection):
         " magnetic field and finds gyro biases at rest",
     )
     levelling: bool = Field(default=True, description="false: once it has begun, it goes by its gyros alone")
-    level: LevelSection | None = Field(default=None, description="how it levels; none: as light turbulence wants")
+    level: LevelSection | None = Field(
+        default=None,
+        description="how it levels; none: as light turbulence wants: force_sigma_mps2 0.3, limit_deg what the gyros"
+        " drift where that is more, and with airspeed acceleration_mps2 1, yaw_rate_degps 10 and roll_rate_degps 10;"
+        " a table of any one key sets all others to their own defaults instead",
+    )
     autopilot: bool = Field(default=False, description="true: it levels only while level flight is commanded")
 
     @property

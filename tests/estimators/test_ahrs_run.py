@@ -18,11 +18,12 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from worlds.lanes import lanes
 
-from nav.ahrs import Ahrs, AnyMotion
+from nav.ahrs import Ahrs, AhrsConfig, AnyMotion
 from nav.motion import LowDynamics
 from nav.samples import AirspeedSample, Outcome, UpdateReport
 from testbed import RunResult, Scenario, run
 from testbed.errors import UserError
+from testbed.estimators.ahrs import AhrsSection
 from testbed.exports import export
 from testbed.many import campaign
 from testbed.many.campaign import CampaignResult, Combination
@@ -113,6 +114,23 @@ def test_it_is_told_how_to_level() -> None:
     told = config(AHRS.replace("}", f", level={{{keys}}}}}"))
     assert told.motion == told.compensated_motion == LowDynamics(0.5, math.radians(1), math.radians(3), "vector")
     assert (told.force_sigma, told.phi_limit, told.gyro_bias_feedback) == (0.2, math.radians(0.4), True)
+
+
+def test_the_description_of_how_it_levels_says_what_one_key_changes() -> None:
+    """One key of `level` puts the paper's limits in place of all others, and only the defaults were said."""
+    house, one = config(AHRS), config(AHRS.replace("}", ", level={limit_deg=0.2}}"))
+    assert (one.compensated_motion, one.force_sigma) == (LowDynamics(), AhrsConfig.force_sigma)
+    limits = house.compensated_motion
+    told = AhrsSection.model_fields["level"].description
+    assert told is not None
+    for key, value in {
+        "force_sigma_mps2": house.force_sigma,
+        "acceleration_mps2": limits.acceleration_limit,
+        "yaw_rate_degps": math.degrees(limits.yaw_rate_limit),
+        "roll_rate_degps": math.degrees(limits.roll_rate_limit),
+    }.items():
+        assert f"{key} {value:g}" in told
+    assert "a table of any one key sets all others" in told
 
 
 def test_corrections_are_never_slower_than_the_drift() -> None:
