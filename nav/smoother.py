@@ -28,6 +28,7 @@ from nav.state import State, inject, integrate
 from nav.strapdown import step
 
 NOTHING = 1e-6  # two times this close are the same [s]
+PIECE = 25  # increments that are taken in at once
 NODE_S = 1.0  # between nodes; within it the noise of any IMU moves the state by far less than its smoothed sigma
 
 
@@ -59,9 +60,12 @@ class Smoother:
         self._model = model
         self._nodes: list[_Node] = []
         self._blocks: list[ImuSamples] = []
+        self._waiting: list[ImuSamples] = []  # since the last update, from this state on
+        self._from: State | None = None
 
     def begin(self, t: float, state: State) -> None:
         """The filter starts at ``t`` [s]: what comes after tells nothing of what was before."""
+        self._catch_up()
         if self._nodes:
             self._nodes[-1].M[:] = 0.0
         self._add(t, state)
@@ -72,21 +76,37 @@ class Smoother:
             return
         sound = _sound(imu, state.rates)
         self._blocks.append(sound)
-        model, common = self._model, len(state.imu)
-        Phi = np.zeros((MOTION, common))
-        T = _transition(
-            Phi, state.q_nb.copy(), state.v_n.copy(), state.lla.copy(), state.errors, state.imu, model.driven,
-            sound.dtheta, sound.dv, sound.dt,
-        )  # fmt: skip
-        M = self._nodes[-1].M
-        moved = M[:, :common] @ Phi.T
-        M *= np.exp(-T * model.decay_rate)
-        M[:, :MOTION] = moved
+        if self._from is None:
+            self._from = state.copy()
+        self._waiting.append(sound)
+
+    def _catch_up(self) -> None:
+        """Take in the increments since the last update, in pieces that no edge of a block changes by a bit."""
+        start, model = self._from, self._model
+        if start is None:
+            return
+        imu, common = _joined(self._waiting), len(start.imu)
+        self._waiting, self._from = [], None
+        for first in range(0, len(imu), PIECE):
+            piece = slice(first, first + PIECE)
+            Phi = np.zeros((MOTION, common))
+            T = _transition(
+                Phi, start.q_nb, start.v_n, start.lla, start.errors, start.imu, model.driven,
+                imu.dtheta[piece], imu.dv[piece], imu.dt[piece],
+            )  # fmt: skip
+            M = self._nodes[-1].M
+            moved = M[:, :common] @ Phi.T
+            decay = np.exp(-T * model.decay_rate)
+            M *= decay
+            M[:, :MOTION] = moved
+            start.imu[MOTION:] *= decay[MOTION:common]
+            sensor_errors(start.errors, start.imu, model.driven)
 
     def updated(self, P: Array, H: Array, nu: Array, S: Array) -> None:
         """The filter has used an innovation ``nu`` (m,) of covariance ``S``, its own having been ``P`` (n, n)."""
         if not self._nodes:
             return
+        self._catch_up()
         _, _, M, m, N = self._nodes[-1]
         MH = M @ H.T
         weighed = np.linalg.solve(S, MH.T).T  # M H' S^-1
@@ -97,6 +117,7 @@ class Smoother:
     def pause(self, t: float, state: State) -> None:
         """The filter is at ``t`` [s] and settled: a node, if the last one is `NODE_S` ago."""
         if not self._nodes or t - self._nodes[-1].t >= NODE_S:
+            self._catch_up()
             self._add(t, state)
 
     def _add(self, t: float, state: State) -> None:
@@ -105,12 +126,11 @@ class Smoother:
 
     def states(self, times: Sequence[float]) -> Iterator[Smoothed]:
         """The smoothed states at ``times`` [s], ascending; none of those before the filter's start."""
+        self._catch_up()
         nodes = self._look_back()
         if not nodes:
             return
-        imu = ImuSamples(
-            *(np.concatenate([getattr(b, name) for b in self._blocks]) for name in ("t", "dt", "dtheta", "dv"))
-        )
+        imu = _joined(self._blocks)
         starts = np.array([t for t, _ in nodes])
         own, at = -1, nodes[0]
         for t in times:
@@ -157,6 +177,10 @@ class Smoother:
             smoothed.P[0] = 0.5 * (spread + spread.T)
             found.append(Smoothed(t, smoothed))
         return found[::-1]
+
+
+def _joined(blocks: Sequence[ImuSamples]) -> ImuSamples:
+    return ImuSamples(*(np.concatenate([getattr(b, name) for b in blocks]) for name in ("t", "dt", "dtheta", "dv")))
 
 
 def _sound(imu: ImuSamples, rates: Array) -> ImuSamples:

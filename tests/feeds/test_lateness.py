@@ -96,7 +96,8 @@ def table(folder, lag, late, sigma=0.01):
         '[truth.columns.imu]\ntime = "t"\ngyro = "gyro"\naccel = "accel"\n[truth.columns.gnss]\ntime = "at"\n'
         'lat = { column = "lat", unit = "deg" }\nlon = { column = "lon", unit = "deg" }\nheight = "h"\n'
         'velocity = "v"\nsigma_position = "sp"\nsigma_velocity = "sv"\n'
-        '[sensors.imu]\ngrade = "mems-hobby"\n[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n[sensors.gnss]\n'
+        '[sensors.imu]\ngrade = "mems-hobby"\n[sensors.gnss]\n'
+        '[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
     )
     return Scenario.load(folder / "car.toml")
 
