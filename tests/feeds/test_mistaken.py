@@ -135,6 +135,8 @@ def test_a_steady_flight_without_its_receiver_is_no_rest():
     """As it circles, rates and forces are as steady as at rest."""
     lost = [one if not 100 < one.t < 140 else replace(one, fix_type=FixType.NO_FIX) for one in FIXES]
     assert [phase.name for phase in phases(log(fixes=lost))] == ["rest", "flying"]
+    taking_off = [one if not 15 < one.t < 30 else replace(one, fix_type=FixType.NO_FIX) for one in FIXES]
+    assert [phase.name for phase in phases(log(fixes=taking_off))] == ["rest", "moving", "flying"]
     late = [one if one.t > 10 else replace(one, fix_type=FixType.NO_FIX) for one in FIXES]
     assert [phase.name for phase in phases(log(fixes=late))] == ["rest", "flying"]
 
