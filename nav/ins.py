@@ -414,15 +414,18 @@ class Ins:
         )
         statistic, threshold, shown = self._filter.gated("gnss_position", sample, nu, S, nis)
         sigma_p = self._filter.learned_sigma("gnss_position", sample.sigma_position_n)
-        odds = self._filter.odds(self._winds, state, v_n, sample.t) if statistic > threshold else 0.0
+        use_velocity, inside, odds, both = with_velocity and aid.use_velocity, statistic <= threshold, 0.0, False
+        if not inside:
+            odds = self._filter.odds(self._winds, state, v_n, sample.t)
+            off = self._filter.off(self._reference, state, aid, "gnss_velocity", sample) if use_velocity else None
+            both = off is not None and self._monitor.led(sample.t, nu[:2])
         fix = sample if sigma_p is sample.sigma_position_n else replace(sample, sigma_position_n=sigma_p)
-        verdict = self._monitor.judge(fix, v_n, sigma_v, statistic <= threshold, odds)
+        verdict = self._monitor.judge(fix, v_n, sigma_v, inside, odds, both)
         if verdict is not Verdict.PROBATION:
             self._filter.heard(self._reference, state, "gnss_position", sample, nis, 3)
         self._doubt[:] = 0.0
         if self._monitor.contradicted:
             self._doubt[POS : POS + 3], self._doubt[VEL : VEL + 3] = nu, v_n - state.v_n
-        use_velocity = with_velocity and aid.use_velocity
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]
@@ -463,12 +466,9 @@ class Ins:
         P = state.P[0]
         self._filter.claim_as_told(self._reference, state)
         if use_velocity:
-            velocity = self._filter.measure(self._reference, state, aid, "gnss_velocity", sample)
-            assert velocity is not None
-            nu_v, H, R = velocity.nu, velocity.H, velocity.R
-            S_v, nis = self._filter.absorb(self._reference, state, nu_v, H, R, -math.inf, velocity.at_points)
-            if not nis <= self._gate.threshold(3):
-                forget(P, VEL, nu_v**2 + np.diag(S_v))
+            off = self._filter.off(self._reference, state, aid, "gnss_velocity", sample)
+            if off is not None:
+                forget(P, VEL, off)
                 self._filter.forget_air(state)
         forget(P, POS, nu**2 + np.diag(S))
 

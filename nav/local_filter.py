@@ -34,7 +34,7 @@ from nav.error_model import MOTION, POS, VEL, ErrorModel, ImuModel, sensor_error
 from nav.kalman import innovate, scratch
 from nav.monitor import Monitor, MonitoredAid, Patience
 from nav.reference import Reference, forget, remove_open
-from nav.samples import Array, BarometerSample, GnssSample, Outcome, Sample, UpdateReport
+from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, Outcome, Sample, UpdateReport
 from nav.smoother import Smoother
 from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
@@ -80,6 +80,7 @@ class LocalFilter:
         self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
         self.starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
+        self._air_used = True  # the latest airspeed
         self._scatters = {aid.sensor: Scatter() for aid in aids if isinstance(aid, BarometerAid) and aid.scatters}
         self._contradictions = {
             aid.sensor: Contradiction(aid.largest_jump) for aid in aids if isinstance(aid, GnssAid) and aid.largest_jump
@@ -125,7 +126,10 @@ class LocalFilter:
             memory.remember(t, state.x[self.row, wind], state.P[self.row].diagonal()[wind])
 
     def odds(self, memory: WindMemory | None, state: State, v_n: Array, t: float) -> float:
-        """What the ``memory`` of the wind says for a velocity (3,) against this filter's own: `WindMemory.odds`."""
+        """What the ``memory`` of the wind says for a velocity (3,) against this filter's own: `WindMemory.odds`.
+
+        It says nothing for the filter while airspeeds are not used: then its wind keeps still whatever its velocity is.
+        """
         if memory is None:
             return 0.0
         own = state.x[self.row]
@@ -133,7 +137,8 @@ class LocalFilter:
         air = own[self.model.slices["wind"]].copy()
         if "gust" in self.model.slices:
             air += own[self.model.slices["gust"]]
-        return memory.odds(t, air, (v_n - v_own)[:2])
+        odds = memory.odds(t, air, (v_n - v_own)[:2])
+        return odds if self._air_used else max(odds, 0.0)
 
     def forget_air(self, state: State) -> None:
         """Give wind and gusts, if there are any, the variances that they began with."""
@@ -371,7 +376,18 @@ class LocalFilter:
             ruling = self.weigh(reference, state, sample, part, measurement, S)
         if not withheld:
             self.heard(reference, state, part, sample, nis, len(nu))
+        if isinstance(sample, AirspeedSample):
+            self._air_used = ruling.weight > 0
         return report_on(sample, part, nu, S, nis, threshold, ruling)
+
+    def off(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Array | None:
+        """Squares (m,) of what a part that a sample has may be off by, where that is outside its gate."""
+        measurement = self.measure(reference, state, aid, part, sample)
+        assert measurement is not None
+        nu, H, R, at_points = measurement.nu, measurement.H, measurement.R, measurement.at_points
+        S, nis = self.absorb(reference, state, nu, H, R, -math.inf, at_points)
+        squares: Array = nu**2 + np.diag(S)
+        return None if nis <= self.gate.threshold(len(nu)) else squares
 
     def weigh(
         self, reference: Reference, state: State, sample: Sample, part: str, measurement: Measurement, S: Array

@@ -10,13 +10,14 @@ import numpy as np
 
 from nav._jit import njit
 from nav.detection.witness import SURE
-from nav.earth import displacement_n
+from nav.earth import STANDARD_GRAVITY, displacement_n
 from nav.samples import Array, GnssSample
 
 # The mean of two velocities misses V w^2 dt^3 / 12 of a turn; this covers 0.5 rad/s at 30 m/s [m/s^3].
 TURN_ERROR = 0.6
 PROBATION_S, RECOVERY_S = 1.0, 4.0  # fixes that agree for so long may be used after an outage, overrule the filter
 ASTRAY_S = 10.0  # as long as a slow vehicle needs to show it again
+LED_ASTRAY_S = 15.0  # fixes that agree for so long overrule a filter whose velocity they contradict too
 SLOW_ERROR = 0.1  # of a velocity, for as long as a streak lasts, at least [m/s]
 JUMP_FLOOR = 0.5  # a smaller jump harms nobody: it also covers the swing of an antenna on its lever arm [m]
 
@@ -38,11 +39,13 @@ class GnssMonitor:
     needs no trust in the filter. A position that stands still, or goes elsewhere than its velocity, may do so from
     one fix to the next: with the first of the streak, or the last that was fused, it must agree as well. While the
     filter is being aided, a fix inside the gate is fused and one outside rejected, and only a streak that stays
-    outside for ``patience_s`` is believed against the filter. After an outage of ``outage_s`` the filter's
-    covariance is wide enough to swallow a bad first fix, so nothing is fused before a streak
-    has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
+    outside for ``patience_s`` is believed against the filter. A filter that an inertial unit has led astray has a wrong
+    velocity too, and goes farther away by the second: there `LED_ASTRAY_S` do, which leave `nav.heading_recovery` the
+    time to find another attitude, unless the wind is a witness for the filter (`nav.detection.witness`). After an
+    outage of ``outage_s`` the filter's covariance is wide enough to swallow a bad first fix, so nothing is fused before
+    a streak has lasted ``probation_s``; if it then lies outside the gate, the filter was too sure of itself, and after
     ``recovery_s`` the streak is believed. So it is without an outage where the wind is a witness that the filter was
-    led astray (`nav.detection.witness`), as when a spoofer lets go.
+    led astray, as when a spoofer lets go.
     """
 
     outage_s: float
@@ -68,10 +71,13 @@ class GnssMonitor:
             self._interval = min(self._interval, t - self._heard)
         self._heard = t
 
-    def judge(self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool, odds: float = 0.0) -> Verdict:
+    def judge(
+        self, fix: GnssSample, v_n: Array, sigma_v: Array, inside_gate: bool, odds: float = 0.0, both: bool = False
+    ) -> Verdict:
         """Verdict on a sound ``fix`` given its velocity [m/s], 1-sigma, and whether its position is inside the gate.
 
-        ``odds`` are those for the fix against the filter by what else is known [nats].
+        ``odds`` are those for the fix against the filter by what else is known [nats]; ``both`` says that its velocity
+        is outside its gate as well, and its position where the filter may have been `led` from.
         """
         self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
@@ -84,7 +90,7 @@ class GnssMonitor:
             self._strayed = fix.t
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
-        wait = self.patience_s if self._was_aided and odds < SURE else self.recovery_s
+        wait = self._wait(odds, both)
         # a place that stands still is inside a gate that has grown wide, each time that the vehicle comes by
         comes_by = inside_gate and self.astray(fix.t) and fix.t - self.last_fused > self.outage_s
         if comes_by or (not self._was_aided and lasted < self.probation_s):
@@ -104,9 +110,21 @@ class GnssMonitor:
         """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""
         return self._was_aided and t - before <= self.outage_s
 
+    def led(self, t: float, off: Array) -> bool:
+        """Whether, at ``t`` [s], a filter may be ``off`` (2,) [m] over ground by what an inertial unit told it since a
+        fix was fused last.
+        """
+        return math.hypot(*off) <= STANDARD_GRAVITY * (t - self.last_fused) ** 2
+
     def astray(self, t: float) -> bool:
         """Whether, of late, refused positions went elsewhere than the receiver's own velocities, at ``t`` [s]."""
         return t - self._strayed <= ASTRAY_S
+
+    def _wait(self, odds: float, both: bool) -> float:
+        """For how long fixes must agree to be believed against the filter [s]."""
+        if not self._was_aided or odds >= SURE:
+            return self.recovery_s
+        return min(LED_ASTRAY_S, self.patience_s) if both and odds > -SURE else self.patience_s
 
     def _longest_gap(self) -> float:
         """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""

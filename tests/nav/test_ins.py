@@ -270,6 +270,38 @@ def test_a_receiver_that_jumps_away_for_a_while_is_not_followed(velocity):
 
 
 @pytest.mark.ci
+@pytest.mark.parametrize("aids", [(), ("barometer", "magnetometer"), ("airspeed",)])
+def test_after_a_shock_to_the_accelerometers_the_fixes_are_believed(aids):
+    """6 m/s^2 for two seconds: the filter goes astray by metres a second, and the fixes that it refuses are right.
+
+    The wind keeps still while airspeeds are refused, and so is no witness for the filter.
+    """
+    config = dataclasses.replace(CONFIG, aids=tuple(aid for aid in CONFIG.aids if aid.sensor in ("gnss", *aids)))
+    truth = flight(160)
+    increments, fixes, others = everything(truth, np.random.default_rng(16))
+    shaken = (increments.t > 60) & (increments.t <= 62)
+    increments.dv[shaken] += increments.dt[shaken, None] * np.array([6.0, 0.0, 0.0])
+    estimates, reports = feed(FusionHorizon(Ins(config, field)), increments, fixes + others, 0.2)
+    fused = [r.t for r in reports if r.aid == "gnss_position" and r.t > 60 and r.weight == 1]
+    assert 10 < np.diff(fused).max() < 15.5
+    assert max(np.hypot(*error(e, truth)[:2]) for e in estimates if e.t > 120) < 5.0
+
+
+@pytest.mark.parametrize(("off", "odds", "waits"), [(2e-4, 0.0, 15.0), (2e-4, -9.0, 30.0), (3e-3, 0.0, 30.0)])
+def test_fixes_that_contradict_position_and_velocity_are_believed_sooner(off, odds, waits):
+    """1.3 km away, but not where the wind speaks for the filter, nor 19 km away, where nothing felt could lead."""
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    sigma = np.full(3, 1.0)
+    for k in range(1, 400):
+        fix = GnssSample(k / 5, k / 5, 0.8, 0.1, 100.0, np.zeros(3), sigma, sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        inside = k <= 50  # up to 10 s
+        both = not inside and monitor.led(fix.t, np.array([off * 6.37e6, 0.0]))
+        if monitor.judge(fix, np.zeros(3), 0.1 * sigma, inside, odds, both) is Verdict.RECOVER:
+            break
+    assert fix.t == pytest.approx(10 + waits)
+
+
+@pytest.mark.ci
 def test_correlated_gnss_errors_do_not_make_it_sure_of_itself():
     """White 0.9 m and a Markov error of 1.2 m reported as 1.5 m: without the states it would claim half a metre."""
     truth = flight(120)
