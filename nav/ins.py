@@ -91,7 +91,7 @@ class InsConfig:
     outage_s: float = 10.0  # this long without a fused position is an outage
     probation_s: float = PROBATION_S  # fixes must agree with each other for this long after it
     recovery_s: float = RECOVERY_S  # after an outage, fixes that agree for this long overrule the filter
-    patience_s: float = 30.0  # and this long when they left the gate without an outage; so long is a bias held as well
+    patience_s: float = 30.0  # the longest, without an outage (see `GnssMonitor`); so long is a bias held, too
 
     alignment_s: float = 2.0  # shortest time over which the initial attitude is found
 
@@ -221,6 +221,7 @@ class Ins:
 
     def took(self, sample: Sample) -> None:
         """See `nav.batch.Taker`."""
+        self._filter.took(sample)
         if isinstance(sample, GnssSample):
             if not sample.has_fix:
                 self._monitor.heard(sample.t)
@@ -465,11 +466,10 @@ class Ins:
         """
         P = state.P[0]
         self._filter.claim_as_told(self._reference, state)
-        if use_velocity:
-            off = self._filter.off(self._reference, state, aid, "gnss_velocity", sample)
-            if off is not None:
-                forget(P, VEL, off)
-                self._filter.forget_air(state)
+        off = self._filter.off(self._reference, state, aid, "gnss_velocity", sample) if use_velocity else None
+        if off is not None:
+            forget(P, VEL, off)
+            self._filter.forget_air(state)
         forget(P, POS, nu**2 + np.diag(S))
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:

@@ -40,6 +40,7 @@ from nav.state import State, absorb
 from nav.unscented import CURVED, Scaling
 from nav.weighting import Fading, Policy, SageHusa, split
 
+AIRED_S = 5.0  # after an airspeed, as long as the slowest of receivers and tubes leave between two samples
 LEFT_OUT = Ruling(Outcome.WEAKENED, "left out by the measurement policy")
 
 
@@ -80,7 +81,7 @@ class LocalFilter:
         self._at_points = {aid.sensor: aid for aid in aids if isinstance(aid, AidAtPoints)}
         self.starts = {aid.sensor: tuple(map(self.model.start, aid.states)) for aid in aids}
         air = self._air()
-        self._air_used = True  # the latest airspeed
+        self._aired = -math.inf  # when an airspeed was used last
         self._scatters = {aid.sensor: Scatter() for aid in aids if isinstance(aid, BarometerAid) and aid.scatters}
         self._contradictions = {
             aid.sensor: Contradiction(aid.largest_jump) for aid in aids if isinstance(aid, GnssAid) and aid.largest_jump
@@ -119,6 +120,11 @@ class LocalFilter:
         """What stands in for a pitot tube that has fallen silent, once a sound ``sample`` of any sensor was used."""
         return None if self.silence is None else self.silence.stand_in(sample)
 
+    def took(self, sample: Sample) -> None:
+        """A sample was used."""
+        if isinstance(sample, AirspeedSample):
+            self._aired = sample.t
+
     def remember_wind(self, memory: WindMemory | None, state: State, t: float) -> None:
         """Put the mean wind into the ``memory``, if there is one."""
         if memory is not None:
@@ -128,7 +134,7 @@ class LocalFilter:
     def odds(self, memory: WindMemory | None, state: State, v_n: Array, t: float) -> float:
         """What the ``memory`` of the wind says for a velocity (3,) against this filter's own: `WindMemory.odds`.
 
-        It says nothing for the filter while airspeeds are not used: then its wind keeps still whatever its velocity is.
+        It says nothing for a filter that used no airspeed for `AIRED_S`: its wind keeps still whatever its velocity is.
         """
         if memory is None:
             return 0.0
@@ -138,7 +144,7 @@ class LocalFilter:
         if "gust" in self.model.slices:
             air += own[self.model.slices["gust"]]
         odds = memory.odds(t, air, (v_n - v_own)[:2])
-        return odds if self._air_used else max(odds, 0.0)
+        return odds if t - self._aired <= AIRED_S else max(odds, 0.0)
 
     def forget_air(self, state: State) -> None:
         """Give wind and gusts, if there are any, the variances that they began with."""
@@ -376,8 +382,8 @@ class LocalFilter:
             ruling = self.weigh(reference, state, sample, part, measurement, S)
         if not withheld:
             self.heard(reference, state, part, sample, nis, len(nu))
-        if isinstance(sample, AirspeedSample):
-            self._air_used = ruling.weight > 0
+        if ruling.weight > 0:
+            self.took(sample)
         return report_on(sample, part, nu, S, nis, threshold, ruling)
 
     def off(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Array | None:
