@@ -221,7 +221,6 @@ class Ins:
 
     def took(self, sample: Sample) -> None:
         """See `nav.batch.Taker`."""
-        self._filter.took(sample)
         if isinstance(sample, GnssSample):
             if not sample.has_fix:
                 self._monitor.heard(sample.t)

@@ -120,11 +120,6 @@ class LocalFilter:
         """What stands in for a pitot tube that has fallen silent, once a sound ``sample`` of any sensor was used."""
         return None if self.silence is None else self.silence.stand_in(sample)
 
-    def took(self, sample: Sample) -> None:
-        """A sample was used."""
-        if isinstance(sample, AirspeedSample):
-            self._aired = sample.t
-
     def remember_wind(self, memory: WindMemory | None, state: State, t: float) -> None:
         """Put the mean wind into the ``memory``, if there is one."""
         if memory is not None:
@@ -382,8 +377,8 @@ class LocalFilter:
             ruling = self.weigh(reference, state, sample, part, measurement, S)
         if not withheld:
             self.heard(reference, state, part, sample, nis, len(nu))
-        if ruling.weight > 0:
-            self.took(sample)
+        if ruling.weight > 0 and isinstance(sample, AirspeedSample):
+            self._aired = sample.t  # nobody asks where steps are taken many at once: while no fix contradicts
         return report_on(sample, part, nu, S, nis, threshold, ruling)
 
     def off(self, reference: Reference, state: State, aid: Aid, part: str, sample: Sample) -> Array | None:
