@@ -125,7 +125,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
         elif kind == "reference":
-            reference = _reference(t, values, notes)
+            reference = _reference(*newly(name, t, values, imus, notes), notes)
         else:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"', notes)
@@ -203,8 +203,7 @@ def load(path: Path) -> Table:
         raise
     except ImportError:
         raise UserError(f"{path}: is Parquet, for which pyarrow is needed: pip install pyarrow") from None
-    except (ValueError, TypeError, KeyError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile) as error:
-        # NotImplementedError is scipy's word for a MATLAB file of version 7.3.
+    except (ValueError, TypeError, KeyError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
     except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
@@ -308,6 +307,8 @@ def _stream(
     for key, array in values.items():
         if len(array) != len(stamps):
             raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")
+    if not len(stamps):
+        raise UserError(f"{where}.time: has no rows")
     blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
     apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]

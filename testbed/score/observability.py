@@ -57,6 +57,7 @@ from nav.samples import (
     StarSample,
     Status,
     WindSample,
+    usable,
 )
 from testbed.errors import UserError
 from testbed.estimators import registry
@@ -156,12 +157,14 @@ def _felt(dataset: xarray.DataTree, unit: str, begins: Array, ends: Array) -> tu
     t = column(dataset, f"sensors/{unit}/time")
     first, stop = (np.searchsorted(t, edges + KNOWN, side="right") for edges in (begins, ends))
 
-    def between(name: str) -> Array:
-        total = np.cumsum(np.nan_to_num(column(dataset, f"sensors/{unit}/{name}")), axis=0)
-        total = np.vstack([np.zeros(3), total])
+    dt, dtheta, dv = (column(dataset, f"sensors/{unit}/{name}") for name in ("dt", "dtheta", "dv"))
+    sound = usable(dtheta, dv, dt)[:, None]  # no filter takes the others
+
+    def between(increments: Array) -> Array:
+        total = np.vstack([np.zeros(3), np.cumsum(np.where(sound, increments, 0.0), axis=0)])
         return np.asarray(total[stop] - total[first])
 
-    return between("dtheta"), between("dv")
+    return between(dtheta), between(dv)
 
 
 def _used(dataset: xarray.DataTree, name: str, edges: Array, part: tuple[str, int], sensor: str = "") -> Array:

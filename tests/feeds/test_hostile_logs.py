@@ -176,10 +176,15 @@ def wide_text(path: Path) -> None:
     path.write_text("t,a\n0.1,2\n", encoding="utf-16")
 
 
+def matlab_7_3(path: Path) -> None:
+    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(128) + bytes(384) + b"\x89HDF\r\n\x1a\n")
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
         (nothing, "is empty"),
+        (matlab_7_3, "is a MATLAB file of version 7.3: save it with -v7"),
         (compressed, "is compressed: unpack it first"),
         (wide_text, "is text in UTF-16: save it as UTF-8"),
         (words, "is no log of a known format"),

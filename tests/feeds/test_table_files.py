@@ -323,9 +323,11 @@ def test_columns_without_rows_are_told(tmp_path: Path) -> None:
     assert set(load(tmp_path / "a.csv").others.values()) == {"has no rows"}
     np.savez(tmp_path / "a.npz", **{name: np.empty(0) for name in NAMES})
     columns = {"time": "t", "gyro": ["gx", "gy", "gz"], "accel": ["fx", "fy", "fz"]}
-    for file in ("a.csv", "a.npz"):
-        truth = LogTruth.model_validate({"source": "log", "file": file, "columns": {"imu": columns}})
-        with pytest.raises(UserError, match=r"rows|has no inertial data"):
+    arrays = {"time": "t", "gyro": "gyro", "accel": "accel"}
+    np.savez(tmp_path / "b.npz", t=np.empty(0), gyro=np.empty((0, 3)), accel=np.empty((0, 3)))
+    for file, own in (("a.csv", columns), ("a.npz", columns), ("b.npz", arrays)):
+        truth = LogTruth.model_validate({"source": "log", "file": file, "columns": {"imu": own}})
+        with pytest.raises(UserError, match=r"truth\.columns\.imu\.time: .*has no rows|has no rows"):
             formats.read(tmp_path / file, truth.columns)
 
 

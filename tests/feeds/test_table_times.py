@@ -193,8 +193,15 @@ def test_fixes_that_are_held_on_are_no_new_ones(tmp_path: Path) -> None:
     assert not ((t > 20.3) & (t < 39.7)).any()
     assert np.median(np.diff(t)) == pytest.approx(1 / GNSS_HZ)
     notes = [note for note in log.notes if "hold what the one before had" in note]
-    assert [type(note) for note in notes] == [Loss]
-    assert notes[0].startswith("gnss: ")
+    assert [(note.split(":")[0], type(note)) for note in notes] == [("gnss", Loss), ("reference", Loss)]
+
+
+def test_a_reference_that_is_held_on_is_as_seldom_as_it_was(tmp_path: Path) -> None:
+    """Its rows between would be a vehicle that stands still and jumps."""
+    log = read(held(T), tmp_path)
+    assert log.solution is not None
+    assert np.median(np.diff(log.solution.t)) == pytest.approx(1 / GNSS_HZ)
+    assert any(note.startswith("reference: ") and "hold what the one before had" in note for note in log.notes)
 
 
 @pytest.mark.parametrize("hz", [1, 5, 20])

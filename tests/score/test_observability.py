@@ -219,6 +219,14 @@ def test_of_a_recorded_flight_it_is_by_what_its_imu_felt() -> None:
     assert imu_error(Run(flown), "ins") is None
 
 
+def test_increments_that_no_filter_takes_are_not_felt() -> None:
+    broken = ["fault=[{sensor='imu', kind='garbage', channel='accel', window=[40, 42]}]", "expect={}"]
+    flown = run(Scenario.load("recorded_flight", broken)).dataset
+    found = visibility.of_run(flown)
+    assert np.isfinite(found["ins"].seen_from()).any()
+    assert (share(found["ins"], "phi north", "phi east") > 0.9).all()
+
+
 def test_the_figure_is_pale_where_only_the_past_helps() -> None:
     dataset = run(Scenario.load("static_bench", ["duration_s=12", "expect={}"])).dataset
     drawn = Run(dataset)
