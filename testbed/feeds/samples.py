@@ -20,13 +20,14 @@ from nav.samples import (
     Sample,
 )
 from testbed.feeds.stamps import left_out
+from testbed.feeds.survey import usual_step
 from testbed.sensors.gnss import NO_FIX_DOP, without_fix
 
 UNKNOWN = np.full(3, np.nan)
 HELD_SHARE = 0.9  # of a sensor's rows that are at the times of an inertial unit, if it is told with that
-# What a slower clock makes: so many times that rows are held, and of these the share that are as long as the usual one,
-# to so much of it and a row at least.
-LEAST_HELD, ALIKE_SHARE, ALIKE = 20, 0.9, 0.25
+# What a slower clock makes: so many times that rows are held, and of these the share that last about as long as the
+# usual one, to so much of it and of a row at least.
+LEAST_HELD, ALIKE_SHARE, ALIKE, ALIKE_ROWS = 20, 0.9, 0.25, 1.5
 
 
 class Fixes:
@@ -71,7 +72,7 @@ def newly(
     """Times (N,) and quantities of a sensor without the rows that repeat the one before, of one that is only held.
 
     A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
-    it, to the last bit, comes again about as often each time, as a slower clock makes it, at the unit's own times: by a
+    it, to the last bit, is held about as long each time, as a slower clock makes it, at the unit's own times: by a
     receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's rate that says the same by
     chance, or since nothing changes. Of a receiver latitude and longitude tell, where the rest changes no more often:
     it may come in rows of its own.
@@ -83,10 +84,11 @@ def newly(
         placed = _changes([values["lat"], values["lon"]])
         if max(len(_changes([one])) for one in values.values()) <= (1 + ALIKE) * len(placed):
             first = placed
-    counts = np.diff(first, append=len(t))
-    usual = float(np.median(counts))
-    alike = np.mean(np.abs(counts - usual) <= max(ALIKE * usual, 1.0))
-    if usual < 2 or len(first) < LEAST_HELD or alike < ALIKE_SHARE:
+    rows = np.diff(first, append=len(t))
+    lasts = np.diff(t[first], append=t[-1])
+    usual = float(np.median(lasts))
+    alike = np.mean(np.abs(lasts - usual) <= max(ALIKE * usual, ALIKE_ROWS * usual_step(t)))
+    if np.median(rows) < 2 or len(first) < LEAST_HELD or alike < ALIKE_SHARE:
         return t, dict(values)
     held = len(t) - len(first)
     told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"

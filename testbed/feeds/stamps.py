@@ -29,6 +29,7 @@ EDGE_S = 1e-6  # times closer than this are one
 GAP_PERIODS, GAP_S = 5.0, 0.1  # beyond which rates are not held on
 PIECE = 1.5  # usual increments: the longest that there may be
 ABOUT, SLOWER = 51, 1.2  # rows about one that tell what is usual there, where that is so much longer than elsewhere
+BESIDE = 5  # rows before one and after it that tell what it felt
 # A clock that is off by more than any quartz is by temperature runs by a wrong frequency. By how much must be alike in
 # half of what is seen, over as long as jitter of 0.1 s is small beside it.
 CLOCK_OFF, CLOCK_ALIKE, CLOCK_S = 0.005, 0.2, 30.0
@@ -263,8 +264,9 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     """Increments as a table has them, with others where rows are missing: of a step they are its last part alone.
 
     A step is too long if no others, before it or after it, are as much shorter: times of rows may come early or late;
-    nor is one that is as long as most of those about it, of a unit that was slower for a while. Up to `GAP_PERIODS`
-    rows are as those about them, as no filter aligns on what has holes all the time; more are NaN.
+    nor is one that is as long as most of those about it, of a unit that was slower for a while; nor one that felt as
+    much as those beside it would have in all its time (`_felt_s`). Up to `GAP_PERIODS` rows are as those about them, as
+    no filter aligns on what has holes all the time; more are NaN.
     """
     unknown = int(np.sum(~np.isfinite(np.hstack([imu.dtheta, imu.dv])).all(axis=1)))
     if unknown:
@@ -283,7 +285,9 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     near = np.arange(STRAY + 1)[:, None]
     later, earlier = even[np.minimum(rows + near, len(imu) - 1)], even[np.maximum(rows - 1 - near, 0)]
     missing = later.min(axis=0, initial=np.inf) - earlier.max(axis=0, initial=-np.inf)
-    rows, missing = rows[missing > period[rows] / 2], missing[missing > period[rows] / 2]
+    lacks = missing > period[rows] / 2
+    lacks &= ~(_felt_s(imu, imu.dt <= PIECE * period, rows) > imu.dt[rows] - missing / 2)
+    rows, missing = rows[lacks], missing[lacks]
     if not len(rows):
         return imu
     long = missing > GAP_PERIODS * period[rows]
@@ -298,6 +302,17 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
         np.insert(imu.t, rows, imu.t[rows] - dt[rows]), np.insert(dt, rows, missing),
         np.insert(imu.dtheta, rows, between[0], axis=0), np.insert(imu.dv, rows, between[1], axis=0),
     )  # fmt: skip
+
+
+def _felt_s(imu: ImuSamples, ordinary: Mask, rows: Rows) -> Array:
+    """How long (M,) [s] it takes to feel the velocity that ``rows`` (M,) felt, by the `ordinary` ones beside each."""
+    known = ordinary & np.isfinite(imu.dv).all(axis=1)
+    felt = np.where(known[:, None], np.column_stack([imu.dt, imu.dv]), 0.0)
+    sums = np.vstack([np.zeros(4), np.cumsum(felt, axis=0)])
+    beside = sums[np.minimum(rows + BESIDE + 1, len(imu))] - sums[np.maximum(rows - BESIDE, 0)]
+    dt, dv = beside[:, 0], beside[:, 1:]
+    with np.errstate(divide="ignore", invalid="ignore"):  # in free fall nothing tells
+        return np.asarray(dt * np.sum(imu.dv[rows] * dv, axis=1) / np.sum(dv * dv, axis=1))
 
 
 def _period(dt: Array) -> float:

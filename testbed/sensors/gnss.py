@@ -172,7 +172,7 @@ class GnssConfig(AidingTiming):
     grade: Literal["perfect", "standalone", "sbas", "rtk", "u-blox-m8"] = Field(
         default="standalone", description="datasheet that presets every error below"
     )
-    rate_hz: float = Field(5.0, gt=0, le=100, description="samples per second; divides the tick rate")
+    rate_hz: float = Field(5.0, gt=0, le=10_000, description="samples per second; divides the tick rate")
 
     horizontal_white_m: float = Field(0.0, ge=0, le=1e4, description="white error of position, north and east each")
     horizontal_correlated_m: float = Field(

@@ -66,6 +66,20 @@ def test_increments_may_be_slower_for_a_while(fast: int, missing: int, tmp_path:
     assert any("rows are missing in 1 places" in note for note in log.notes) == (missing > 0)
 
 
+@pytest.mark.parametrize("lost", [0, 30])
+def test_increments_of_steps_that_differ_are_whole(lost: int, tmp_path: Path) -> None:
+    """A unit that is read when there is time for it says what it felt since it was read last; rows may be lost too."""
+    rng = np.random.default_rng(51003)
+    dt = rng.gamma(16.0, 0.01 / 16, 6000)
+    table = {"t": np.cumsum(dt), "w": np.outer(dt, [0.1, 0, 0]), "f": np.outer(dt, [0, 3.0, -9.8])}
+    table["f"] += 0.005 * rng.standard_normal((6000, 3))
+    kept = np.ones(6000, bool)
+    kept[rng.choice(np.arange(100, 5900, 10), lost, replace=False)] = False
+    log = read(tmp_path, {name: one[kept] for name, one in table.items()}, imu={**IMU, "form": "increments"})
+    assert log.imus["imu"].dtheta[:, 0].sum() == pytest.approx(0.1 * dt.sum(), rel=0.005 if lost else 1e-9)
+    assert any("rows are missing" in note for note in log.notes) == (lost > 0)
+
+
 COARSE = np.round(9500 + 0.2 * np.random.default_rng(1).standard_normal(6000)) * 10
 STEPS = np.repeat(np.random.default_rng(2).standard_normal(3000), np.random.default_rng(3).geometric(0.4, 3000))[:6000]
 
@@ -87,6 +101,15 @@ def test_who_is_held_by_a_slower_clock_is_heard_at_its_own_rate(hz: int, tmp_pat
     table = unit(t) | {"p": np.where((t > 20) & (t < 30), 0.0, np.sin(own))}
     log = read(tmp_path, table, barometer={"time": "t", "pressure": "p"})
     assert len(log.samples["barometer"]) == pytest.approx(50 * hz, abs=3)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_who_is_held_is_told_by_time_where_rows_come_anyhow(seed: int, tmp_path: Path) -> None:
+    """Between one fix and the next a unit that is read by a busy computer has more rows or fewer."""
+    t = np.cumsum(np.random.default_rng(seed).gamma(1.0, 0.01, 6000))
+    own = np.floor(t * 4) / 4
+    log = read(tmp_path, unit(t) | fixes(own) | {"gt": t}, gnss=GNSS)
+    assert len(log.samples["gnss"]) == len(np.unique(own))
 
 
 @pytest.mark.parametrize("begins", [-400.0, -5.0, 61.0, 600.0])
@@ -134,6 +157,14 @@ def test_a_second_unit_may_have_been_heard_later(moved: float, tmp_path: Path) -
         (tmp_path / "a.toml").write_text(TWO + '[sensors.spare]\nkind = "imu"\n')
         with pytest.raises(UserError, match=r"sensors\.spare: was heard from "):
             run(Scenario.load(tmp_path / "a.toml"))
+
+
+def test_fixes_may_come_as_often_as_increments(tmp_path: Path) -> None:
+    """As those of a receiver's solution that somebody interpolated: no one gave that rate, nor can mend it."""
+    t = np.arange(6000) / 200
+    np.savez(tmp_path / "a.npz", **unit(t) | fixes(t) | {"t2": t})
+    (tmp_path / "a.toml").write_text(TWO)
+    assert len(run(Scenario.load(tmp_path / "a.toml")).dataset["truth/lat"]) == 51
 
 
 def test_a_log_that_begins_later_than_it_is_heard_says_so(tmp_path: Path) -> None:
