@@ -139,7 +139,8 @@ def _rows(name: str, t: Stamps, **values: Any) -> Rows:
             whole = np.rint(np.nan_to_num(np.asarray(value) * factors[field]))
             made[field] = np.clip(whole, limit.min, limit.max).astype(kind)
         else:
-            made[field] = value
+            with np.errstate(over="ignore"):  # of what a broken sensor says: no smaller number has room for it
+                made[field] = value
     return made
 
 

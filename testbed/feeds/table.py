@@ -197,6 +197,8 @@ def load(path: Path) -> Table:
             import pandas
 
             frame = pandas.read_parquet(path, engine="pyarrow")
+            if not isinstance(frame.index, pandas.RangeIndex):  # often of times
+                frame = frame.reset_index(drop=frame.index.name in frame.columns)
             return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
         return _sorted(path, text.columns(path))
     except UserError:

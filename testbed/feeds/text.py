@@ -17,6 +17,7 @@ SPACES = " "
 QUOTED = re.compile(r'"[^"]*"')
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
+SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole
 MISSING = ("", "NA", "N/A", "null")  # in place of numbers
 
 
@@ -38,10 +39,10 @@ class Layout(NamedTuple):
 def layout(lines: Iterable[str]) -> Layout:
     """How a text is to be read: its first line has the names, unless it is numbers, or a comment that has not as many.
 
-    ``lines`` are at least those up to the second that is no comment.
+    ``lines`` are at least those up to the second that is no comment; of numbers up to `SHOWN` are looked at.
     """
     comment = 0, ""  # the last one before the first other line, with its number
-    plain: list[tuple[int, str]] = []  # the first two of these
+    plain: list[tuple[int, str]] = []  # the first of these
     for number, raw in enumerate(lines):
         line = raw.strip("\ufeff\r\n")
         if SAID.fullmatch(line) and not plain:
@@ -50,14 +51,15 @@ def layout(lines: Iterable[str]) -> Layout:
             comment = number, line
         elif line.strip():
             plain.append((number, line))
-        if len(plain) == 2:
+        if len(plain) == SHOWN:
             break
     if not plain:
         return Layout(",", ".", comment[0], _fields(comment[1], ","), 0)
-    (number, first), (_, row) = plain[0], plain[-1]
+    (number, first), (_, row) = plain[0], plain[:2][-1]
     mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES if " " in row.strip() else ",")
     fields = _fields(row, mark)
-    decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, fields)) else "."
+    shown = (one for _, line in plain[-SHOWN + 1 :] for one in _fields(line, mark))
+    decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
     width, top = len(fields), _fields(first, mark)
     first_names = not _are_numbers(top, decimal) and _are_numbers(fields, decimal)
     for names, hidden in ((_fields(comment[1], mark), False), (_fields(comment[1][1:], mark), True)):
@@ -111,7 +113,7 @@ def columns(path: Path) -> Iterator[tuple[str, Any]]:
             )
     except UnicodeDecodeError:
         raise UserError(f"{path}: is text, but not in UTF-8: save it as that") from None
-    return ((str(name), frame[name].to_numpy()) for name in frame.columns)
+    return ((str(name).strip(), frame[name].to_numpy()) for name in frame.columns)
 
 
 def _fields(line: str, mark: str) -> list[str]:

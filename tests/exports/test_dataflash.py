@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from pymavlink import DFReader
 
+from testbed import Scenario, run
 from testbed.exports import dataflash, export
 from testbed.exports.dataflash import MESSAGES
 from testbed.record.reader import load
+from testbed.report.page import write_report
 from testbed.score.accuracy import euler
 
 pytestmark = pytest.mark.ci
@@ -115,3 +117,12 @@ def test_what_is_too_large_for_a_field_is_the_largest() -> None:
     assert (one["HAcc"][0], one["VAcc"][0]) == (65535, 0)
     with pytest.raises(KeyError):
         dataflash._rows("GPA", np.array([us(0.0)]), Hacc=1.0)
+
+
+def test_what_no_sensor_measures_is_no_matter(tmp_path: Path) -> None:
+    """Numbers beyond those of the message, and none at all, end neither the report nor the export, nor warn."""
+    garbage = {"sensor": "imu", "channel": "accel", "kind": "garbage", "window": [20.0, 25.0]}
+    scenario = Scenario.load("static_bench", {"duration_s": 40.0, "fault": [garbage]})
+    found = run(scenario, out=tmp_path)
+    write_report(found.dataset, found.metrics, tmp_path)
+    assert export(tmp_path / "run.nc", "bin", tmp_path / "run.bin").stat().st_size > 0

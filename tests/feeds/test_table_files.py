@@ -88,6 +88,25 @@ def test_names_with_spaces_between_spaces_are_told(tmp_path: Path) -> None:
         load(tmp_path / "a.txt")
 
 
+def test_names_have_no_blanks_about_them(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("\n".join(["t , a , b", *(f"{k / 10} , 1.5 , 2.5" for k in range(20))]))
+    assert list(load(tmp_path / "a.csv").numbers) == ["t", "a", "b"]
+
+
+def test_a_decimal_comma_may_show_in_a_later_row(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("\n".join(["t;a", "0;0", "1;2", "1,5;3", "2;3,25"]))
+    assert load(tmp_path / "a.csv").numbers["a"].tolist() == [0.0, 2.0, 3.0, 3.25]
+
+
+@pytest.mark.parametrize("name", ["time", None])
+def test_an_index_of_parquet_is_a_column(name: str | None, tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    index = pandas.Index([0.5, 1.5], name=name)
+    pandas.DataFrame({"a": [1.0, 2.0]}, index=index).to_parquet(tmp_path / "a.parquet", engine="pyarrow")
+    assert load(tmp_path / "a.parquet").numbers[name or "index"].tolist() == [0.5, 1.5]
+
+
 @pytest.mark.parametrize("words", ["Dear diary, we flew", "we flew\nand landed", "1 fish 2 fish\n3 fish"])
 def test_prose_is_no_table(words: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(words)

@@ -99,8 +99,9 @@ def imu_error(run: Run, estimator: str) -> dict[str, Array] | None:
 
 
 def _increments(run: Run, imu: str, name: str) -> Array:
-    """Recorded increments (N, 3) of a unit in body axes, as truth is, however it is mounted."""
+    """Recorded increments (N, 3) of a unit in body axes, as truth is, however it is mounted; NaN if none can be so."""
     increments, errors = column(run.dataset, f"sensors/{imu}/{name}"), run.datasheet(imu)
+    increments = np.where(_sound(increments)[:, None], increments, np.nan)
     return increments if errors is None else np.asarray(increments @ errors.C_sb)
 
 
