@@ -27,6 +27,7 @@ from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
 PARQUET = b"PAR1"
 DATE = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d")  # as ISO 8601 has it, with a time of day
+DAY, CLOCK = re.compile(r"\d{4}[-/]\d\d[-/]\d\d"), re.compile(r"\d\d:\d\d:\d\d(\.\d+)?")  # in columns of their own
 LONGEST_SHOWN = 20  # of what is no number
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -218,11 +219,13 @@ def _stacked(values: Any) -> Any:
 
 
 def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
-    """Those that hold numbers, as floats, and the others."""
+    """Those that hold numbers, as floats, and the others. A time of day goes with the date in the column before it."""
     numbers, others, dates = {}, {}, set()
+    before = np.empty(0)
     for name, values in columns:
         read = np.asarray(values)
-        array = _seconds(read)
+        array = _seconds(_dated(read, before))
+        before = read
         if array is not read:
             dates.add(name)
         if array.ndim in (1, 2) and array.dtype.kind in "fiub":
@@ -232,12 +235,24 @@ def _sorted(path: Path, columns: Iterable[tuple[str, Any]]) -> Table:
     return Table(path, numbers, others, frozenset(dates))
 
 
+def _dated(clock: Any, day: Any) -> Any:
+    """Times of day with the dates (N,) that are their own, as ISO 8601 has them; any other column as it is."""
+    apart = DAY.fullmatch(_first_text(day)) and CLOCK.fullmatch(_first_text(clock))
+    if not apart or day.shape != clock.shape:
+        return clock
+    return np.array([f"{one}T{time}".replace("/", "-") for one, time in zip(day, clock, strict=True)], object)
+
+
+def _first_text(array: Any) -> str:
+    """What the first row of a column that is text says."""
+    return next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
+
+
 def _seconds(array: Any) -> Any:
     """Dates and times of day, which are UTC where they don't say, as seconds since 1970; any other column as it is."""
     if array.ndim != 1:
         return array
-    said = next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
-    if not (array.dtype.kind == "M" or DATE.match(said)):
+    if not (array.dtype.kind == "M" or DATE.match(_first_text(array))):
         return array
     import pandas
 

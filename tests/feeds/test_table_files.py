@@ -243,6 +243,32 @@ def test_a_log_whose_times_are_dates_has_a_date(tmp_path: Path) -> None:
         assert formats.read(tmp_path / "a.csv", {"imu": stream}).date == date
 
 
+POS = """% program   : RTKPOST
+% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,ns=# of satellites)
+%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)
+2024/06/01 23:59:59.800   47.000000000    8.000000000   500.0000   1  10   0.0050   0.0060   0.0100
+2024/06/02 00:00:00.000   47.000001000    8.000000000   500.1000   1  10   0.0050   0.0060   0.0100
+2024/06/02 00:00:00.200   47.000002000    8.000000000   500.2000   2  10   0.0500   0.0600   0.1000
+"""
+
+
+def test_a_date_and_a_time_of_day_in_two_columns_are_one_time(tmp_path: Path) -> None:
+    """As RTKLIB writes its solutions, and loggers their rows."""
+    midnight = dt.datetime(2024, 6, 2, tzinfo=dt.UTC).timestamp()
+    (tmp_path / "a.pos").write_text(POS)
+    found = load(tmp_path / "a.pos")
+    np.testing.assert_allclose(found.numbers["GPST"] - midnight, [-0.2, 0.0, 0.2], atol=1e-6)
+    assert found.numbers["sdn(m)"].tolist() == [0.005, 0.005, 0.05]
+    assert found.dates == {"GPST"}
+    (tmp_path / "a.csv").write_text("Date,Time,a\n2024-06-02,00:00:01,1.5\n2024-06-02,00:00:02,2.5\n")
+    assert (load(tmp_path / "a.csv").numbers["Time"] - midnight).tolist() == [1.0, 2.0]
+
+
+def test_a_time_of_day_without_a_date_is_text(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Time,a\n00:00:01,1.5\n00:00:02,2.5\n")
+    assert load(tmp_path / "a.csv").others["Time"] == 'holds text, first "00:00:01" in row 1'
+
+
 def test_each_quantity_may_have_its_file(tmp_path: Path) -> None:
     """As gnss-ins-sim writes them: times, rates and forces of one unit in three files, one of a single column."""
     columns = {"time": ["time (sec)"], "gyro-0": NAMES[1:4], "accel-0": NAMES[4:]}
