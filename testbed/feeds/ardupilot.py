@@ -15,6 +15,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -29,11 +30,11 @@ from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
 from testbed.feeds.stamps import integrated, joined, ordered, pace
 from testbed.motion.logged import Stream
+from testbed.sensors.gnss import GPS_EPOCH, LEAPS, WEEK_S
 
 NEEDED = "IMU with GyrX to AccZ, or GYR and ACC: log them with LOG_BITMASK (IMU) or INS_RAW_LOG_OPT"
 MILLIGAUSS = 1e-7  # that MAG is in [T]
 BINARY = b"\xa3\x95"  # how every message begins; text may begin with lines of the ground station
-GPS_EPOCH, WEEK_S = dt.datetime(1980, 1, 6), 604_800
 ACCURACY_WITHIN_S = 0.3  # GPA comes right after the GPS that it belongs to
 
 # The messages by what they become, old names for the second and third unit among them.
@@ -81,7 +82,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         path, "ArduPilot DataFlash", imus, samples, solution, beginning(imus, samples, solution, notes), found, notes,
         date=_date(units), remark=remark(solution, imus, samples),
     )  # fmt: skip
-    return at_pace(log, _pace(units))
+    runs = _pace(units)
+    return replace(at_pace(log, runs), utc=_utc(units, runs))
 
 
 def _messages(path: Path, notes: list[str]) -> dict[str, list[dict[str, Any]]]:
@@ -315,6 +317,18 @@ def _date(units: Mapping[str, Mapping[str, Rows]]) -> dt.date | None:
         told = told[np.isfinite(told)]
         if len(told):
             return (GPS_EPOCH + dt.timedelta(seconds=float(told[-1]))).date()
+    return None
+
+
+def _utc(units: Mapping[str, Mapping[str, Rows]], pace: float) -> float | None:
+    """What the first receiver that tells says of the time at 0 of the autopilot's clock [s since 1970]."""
+    for rows in units.get("gnss", {}).values():
+        t, kept = _times("", rows, [])
+        since = _satellite_time(rows)[kept] - t / pace
+        since = since[np.isfinite(since)]
+        if len(since):
+            zero = GPS_EPOCH + dt.timedelta(seconds=float(np.median(since)))
+            return zero.timestamp() - next((ahead for begins, ahead in LEAPS if zero >= begins), 0)
     return None
 
 

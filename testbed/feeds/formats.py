@@ -72,13 +72,21 @@ def _read_once(truth: str, states: tuple[tuple[int, int], ...]) -> Log:
 
 
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
-    """A log by its path and, of a table, its ``columns``. Raises UserError as `open_log`."""
+    """A log by its path and its ``columns``: of a table, or of what another log is judged by.
+
+    Raises UserError as `open_log`.
+    """
     found = known(path)
     made: Reader = import_module(f"testbed.feeds.{found.module}").read
     try:
-        return made(path, columns)
+        log = made(path, columns)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:  # what a damaged file leads to
         raise UserError(f"{path}: is damaged, or no {found.name} as it should be: {error!r}") from None
+    if not columns or found.module == "table":
+        return log
+    from testbed.feeds.beside import judged_by  # which asks here itself what a file is
+
+    return judged_by(log, columns)
 
 
 def known(path: Path) -> Format:

@@ -73,6 +73,8 @@ class Log:
     be taken off. Accuracies and velocities that a receiver does not report are NaN. ``t0`` is when it begins,
     ``start`` where the log itself says that it begins; ``messages`` the number of each kind that the file holds;
     ``notes`` what was odd with it, a sentence each; ``remark`` what whoever is judged by its solution should know.
+    ``utc`` is what its receiver says of the time at 0 of its clock [s since 1970], as late as that tells of a fix;
+    ``solution_by_utc`` that the times of its solution are by that, and as late.
     """
 
     path: Path
@@ -87,6 +89,8 @@ class Log:
     date: dt.date | None = None
     start: Place | None = None
     remark: str = ""
+    utc: float | None = None
+    solution_by_utc: bool = False
 
     @property
     def names(self) -> list[str]:

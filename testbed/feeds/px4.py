@@ -73,7 +73,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     start = beginning(imus, samples, solution, notes)
     return Log(
         path, "PX4 ULog", imus, samples, solution, start, found, notes, date=_date(topics),
-        remark=remark(solution, imus, samples),
+        remark=remark(solution, imus, samples), utc=_utc(topics),
     )  # fmt: skip
 
 
@@ -342,3 +342,13 @@ def _date(topics: Topics) -> dt.date | None:
     gps = _first(topics, RECEIVERS)
     utc = 0 if gps is None or "time_utc_usec" not in gps else int(gps["time_utc_usec"].max())
     return dt.datetime.fromtimestamp(utc / 1e6, dt.UTC).date() if utc else None
+
+
+def _utc(topics: Topics) -> float | None:
+    """What the receiver says of the time at 0 of the autopilot's clock [s since 1970]."""
+    gps = _first(topics, RECEIVERS)
+    if gps is None or "time_utc_usec" not in gps:
+        return None
+    told = gps["time_utc_usec"] > 0
+    since = gps["time_utc_usec"][told] / 1e6 - _seconds(gps)[told]
+    return float(np.median(since)) if len(since) else None

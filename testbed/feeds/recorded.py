@@ -18,6 +18,7 @@ from testbed.feeds.feed import Turn
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
+from testbed.feeds.samples import Fixes
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency, usual_step, velocity_lag
 from testbed.motion.logged import LogTruth, Place
@@ -186,7 +187,8 @@ class Recorded:
             return NOBODY
         solution = log.solution
         if solution is not None and truth.reference == "solution" and "lat" in solution.columns:
-            found = replace(solution, t=solution.t - self._start)
+            found = _by_imu(solution, log, sections)
+            found = replace(found, t=found.t - self._start)
         elif (receiver := log.receiver) is None:
             return NOBODY if solution is None else replace(solution, t=solution.t - self._start)
         else:
@@ -260,6 +262,20 @@ def _as_used(log: Log, sections: Mapping[str, SensorConfig]) -> Log:
 def _losses(log: Log, streams: Collection[str]) -> list[str]:
     """What is told of rows that were left out of streams that a run makes use of, where they are many."""
     return [note for note in log.notes if isinstance(note, Loss) and note.stream in streams]
+
+
+def _by_imu(solution: Reference, log: Log, sections: Mapping[str, SensorConfig]) -> Reference:
+    """A solution by the IMU's times, of one by a receiver's: as its velocities show, or else as late as is told."""
+    if not log.solution_by_utc or log.receiver is None:
+        return solution
+    section = sections.get(log.receiver)
+    late, by = section.latency_s if isinstance(section, GnssConfig) else 0.0, "as told"
+    if "v_n" in solution.columns and log.imus:
+        rows = Fixes(solution.t, *(solution.columns[key] for key in ("lat", "lon", "h")))
+        rows.v_n = solution.columns["v_n"]
+        shown = latency(next(iter(log.imus.values())), rows.samples(log.receiver))
+        late, by = (late, by) if shown is None else (shown, "by the IMU")
+    return replace(solution, name=f"{solution.name}, its dates {late:.2f} s late {by}", t=solution.t - late)
 
 
 def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:

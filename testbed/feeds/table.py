@@ -120,19 +120,19 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = _stream(of_files, path, name, kind, stream, heard, notes)
+        t, values = quantities(of_files, path, name, kind, stream, heard, notes)
         if kind == "imu":
             t, values = _whole(name, t, values, stream, notes)
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
             imus[name] = with_holes(name, imu, notes) if stream.form == "increments" else imu
         elif kind == "reference":
-            reference = _reference(*newly(name, t, values, imus, notes), notes)
+            reference = known_motion(*newly(name, t, values, imus, notes), notes)
         else:
             samples[name] = _samples(name, kind, *newly(name, t, values, imus, notes), notes)
     require_imu(path, imus, found, 'columns of time, gyro and accel of a sensor of kind "imu"', notes)
     require_one_clock(path, imus, samples)
     start = beginning(imus, samples, reference, notes)
-    remark = _contradicted(reference, imus, samples)
+    remark = contradicted(reference, imus, samples)
     date = _date(of_files, path, columns.values(), start)
     return Log(path, "table", imus, samples, reference, start, found, notes, date=date, remark=remark)
 
@@ -159,7 +159,7 @@ def _whole(
     return t[known], {key: one[known] for key, one in values.items()}
 
 
-def _contradicted(
+def contradicted(
     reference: Reference | None, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]
 ) -> str:  # fmt: skip
     """What speaks against the reference of a table.
@@ -296,7 +296,7 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
             yield before + name, value
 
 
-def _stream(
+def quantities(
     tables: Mapping[Path, Table], main: Path, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None,
     notes: list[str],
 ) -> tuple[Array, dict[str, Array]]:  # fmt: skip
@@ -443,7 +443,7 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
     return fixes.samples(name)
 
 
-def _reference(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:
+def known_motion(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:
     """What the table says of the motion: where there is no whole place, or that of zeros, it is unknown."""
     named = {"height": "h", "velocity": "v_n", "attitude": "q_nb"}
     columns = {named.get(key, key): array for key, array in values.items()}

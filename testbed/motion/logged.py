@@ -181,7 +181,9 @@ class LogTruth(Section):
     start: Place | None = Field(default=None, description="where it begins; none: where the log's GNSS says")
     terrain: Terrain = Field(default=Terrain(), description="the ground, as filters are told of it")
     columns: dict[str, Stream] = Field(
-        default_factory=dict, description="of a table: the columns of each sensor, by name, and of the `reference`"
+        default_factory=dict,
+        description="of a table: the columns of each sensor, by name, and of the `reference`; beside any other log a "
+        "`reference` alone, with its own `file`, in place of the log's solution",
     )
 
     @property

@@ -29,7 +29,12 @@ from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
 
 GPS_EPOCH, WEEK_S = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC), 604_800  # of GPS time
-LEAP_S = 18  # that GPS time is ahead of UTC, since 2017
+# How far GPS time is ahead of UTC [s] since which day, the newest first (IERS, Bulletin C).
+LEAPS = tuple(
+    (datetime.datetime(year, month, 1, tzinfo=datetime.UTC), ahead)
+    for year, month, ahead in ((2017, 1, 18), (2015, 7, 17), (2012, 7, 16), (2009, 1, 15), (2006, 1, 14), (1980, 1, 13))
+)
+LEAP_S = LEAPS[0][1]
 NO_FIX_DOP = 99.99  # what receivers report when they have none
 REPORTED_AT_LEAST = 1e-3  # accuracy is reported in whole millimetres, never as none at all [m], [m/s]
 SATELLITES_SIGMA = 1.0  # how the number in view comes and goes

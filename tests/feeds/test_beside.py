@@ -1,0 +1,111 @@
+"""A table beside an autopilot's log, by which it is judged."""
+
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from testbed import Scenario, run
+from testbed.errors import UserError
+from testbed.feeds import formats
+from testbed.feeds.log import Reference
+
+LOG = Path("scenarios/recorded_flight.bin").absolute()
+LATE_S = 0.1  # that its receiver's fixes come, as its scenario says
+PLACE = {"lat": {"column": "lat", "unit": "deg"}, "lon": {"column": "lon", "unit": "deg"}, "height": "h"}
+RMS = "ins.position_horizontal_rms_m"
+SHORT: dict[str, Any] = {"duration_s": 90.0, "expect": {}, "sensors.gnss.denied": []}
+
+
+@pytest.fixture(scope="module")
+def solution() -> tuple[Reference, float]:
+    """What the autopilot says of its motion, and UTC at 0 of its clock."""
+    log = formats.read(LOG, {})
+    assert log.solution is not None
+    assert log.utc is not None
+    return log.solution, log.utc + LATE_S
+
+
+def written(folder: Path, known: Reference, zero: float | None = None, ahead: float = 0.0) -> Path:
+    """A table of it, by UTC, and what is ahead of that, in two columns as RTKLIB has it, or by the log's clock."""
+    columns = [np.degrees(known.columns[name]) for name in ("lat", "lon")] + [known.columns["h"]]
+    lines = [("time" if zero is None else "day,time") + ",lat,lon,h,vn,ve,vd"]
+    for t, *values in zip(known.t, *columns, *known.columns["v_n"].T, strict=True):
+        at = f"{t:.6f}"
+        if zero is not None:
+            when = dt.datetime.fromtimestamp(t + zero + ahead, dt.UTC)
+            at = f"{when:%Y/%m/%d},{when:%H:%M:%S.%f}"
+        lines.append(",".join([at, *(f"{value:.9f}" for value in values)]))
+    (folder / "ppk.csv").write_text("\n".join(lines))
+    return folder / "ppk.csv"
+
+
+def flown(table: Path, time: Any = "time", log: Path = LOG, **more: Any) -> Any:
+    stream = {"file": str(table), "time": time, **PLACE, **more}
+    changes = {"truth.file": str(log), "truth.columns": {"reference": stream}}
+    return run(Scenario.load("recorded_flight", SHORT | changes))
+
+
+@pytest.fixture(scope="module")
+def own() -> float:
+    """How far the estimator is from the autopilot's solution, as the log has it [m]."""
+    return float(run(Scenario.load("recorded_flight", SHORT)).metrics[RMS])
+
+
+@pytest.mark.parametrize("more", [{}, {"velocity": ["vn", "ve", "vd"]}])
+def test_dates_are_taken_to_the_clock_of_the_log(
+    more: dict[str, Any], solution: tuple[Reference, float], own: float, tmp_path: Path
+) -> None:
+    """By the receiver: 30 m/s make 3 m of its latency, which velocities show, or the scenario tells."""
+    found = flown(written(tmp_path, *solution), **more)
+    assert found.metrics[RMS] == pytest.approx(own, abs=0.3)
+    reference = found.dataset.attrs["reference"]
+    assert "ppk.csv" in reference
+    assert f"{LATE_S:.2f} s late" in reference
+
+
+def test_gps_time_is_told_by_an_offset(solution: tuple[Reference, float], own: float, tmp_path: Path) -> None:
+    table = written(tmp_path, *solution, ahead=18.0)
+    assert flown(table, {"column": "time", "offset": -18}).metrics[RMS] == pytest.approx(own, abs=0.3)
+    late = flown(table)
+    assert late.metrics[RMS] > 100
+    assert any('truth.reference = "gnss" judges by the receiver' in remark for remark in late.remarks)
+
+
+def test_seconds_are_those_of_the_log(solution: tuple[Reference, float], own: float, tmp_path: Path) -> None:
+    assert flown(written(tmp_path, solution[0])).metrics[RMS] == pytest.approx(own, abs=0.1)
+
+
+def test_a_log_without_the_time_of_day_asks_for_its_own_seconds(
+    solution: tuple[Reference, float], tmp_path: Path
+) -> None:
+    run(Scenario.load("static_bench", {"duration_s": 20.0}), out=tmp_path)
+    with pytest.raises(UserError, match=r"truth\.columns\.reference\.time: holds dates, and .* doesn't say what time"):
+        flown(written(tmp_path, *solution), log=tmp_path / "run.nc")
+
+
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ({"gnss": {"file": "{table}", "time": "time", **PLACE}}, r"columns\.gnss: .* says itself what its sensors are"),
+        ({"reference": {"time": "time", **PLACE}}, r"columns\.reference\.file: is missing"),
+        (
+            {name: {"kind": "reference", "file": "{table}", "time": "time", **PLACE} for name in ("a", "b")},
+            "is judged by one reference, and has a, b",
+        ),
+    ],
+)
+def test_a_log_that_knows_its_sensors_has_nothing_else_beside_it(
+    columns: dict[str, dict[str, Any]], told: str, solution: tuple[Reference, float], tmp_path: Path
+) -> None:
+    """It was not read, without a word."""
+    table = str(written(tmp_path, solution[0]))
+    for stream in columns.values():
+        if "file" in stream:
+            stream["file"] = table
+    with pytest.raises(UserError, match=told):
+        run(Scenario.load("recorded_flight", {"truth.columns": columns}))
