@@ -114,6 +114,11 @@ def _file(path: Path) -> ModuleType:
     return module
 
 
+def can_be_name(name: object) -> bool:
+    """Whether a group or a column of the record can be called so."""
+    return isinstance(name, str) and bool(name.strip(".")) and "/" not in name and name.isprintable()
+
+
 def raised(error: BaseException) -> str:
     """What was raised and where, on one line: in the user's code if it can be told, not in what that calls."""
     found = [

@@ -25,7 +25,7 @@ from testbed.commands.shared import (
     remark,
 )
 from testbed.errors import UserError
-from testbed.results import METRICS, RECORD, REPORT, require_own
+from testbed.results import MANIFEST, METRICS, RECORD, REPORT, require_own
 
 if TYPE_CHECKING:
     from testbed.bridges.gps_input import GpsInput
@@ -226,7 +226,8 @@ def _connect(
     shown_estimator(scenario.estimator, estimator)
     for url in urls:
         path = log_path(url)
-        if path is not None and path.resolve().parent == folder.resolve() and path.name in (RECORD, METRICS, REPORT):
+        results = (RECORD, METRICS, REPORT, MANIFEST)
+        if path is not None and path.resolve().parent == folder.resolve() and path.name in results:
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 

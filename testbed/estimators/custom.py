@@ -215,16 +215,20 @@ class Adapter:
 
     def _propagate(self, imu: ImuSamples) -> list[UpdateReport]:
         given = self.inner.propagate(_copied(imu))
-        return [] if given is None else self._given.reports(given, "propagate")
+        return [] if given is None else self._given.reports(given, "propagate", self._t)
 
     def _update(self, sample: Sample) -> list[UpdateReport]:
         given = self.inner.update(_copied(sample))
-        return [] if given is None else self._given.reports(given, "update")
+        return [] if given is None else self._given.reports(given, "update", self._until(sample))
 
     def _refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         refuse = getattr(self.inner, "refuse", None)
         given = None if refuse is None else refuse(_copied(sample), reason)
-        return [] if given is None else self._given.reports(given, "refuse")
+        return [] if given is None else self._given.reports(given, "refuse", self._until(sample))
+
+    def _until(self, sample: Sample) -> float:
+        """The newest time that it knows of [s]."""
+        return float(np.fmax(self._t, sample.t_arrival))
 
     def _estimate(self) -> Estimate | None:
         return self._given.estimate(self.inner.estimate(), "estimate", self._t)

@@ -48,7 +48,7 @@ from testbed.estimators.section import (
     slip_mistakes,
 )
 from testbed.schema import IDENTIFIER, Section
-from testbed.sensors import SensorConfig, geomagnetic_field_n
+from testbed.sensors import SensorConfig, custom, geomagnetic_field_n
 
 # Per sample, of detectors that judge by one sample, and of those that gather many.
 SNAPSHOT_FALSE_ALARM, GATHERED_FALSE_ALARM = 1e-3, 1e-6
@@ -229,6 +229,7 @@ def configuration(section: FederatedSection, rig: Rig) -> Config:
         if all(rig.sensors[name].kind != kind for name in used):
             used |= dict.fromkeys([name for name, s in rig.sensors.items() if s.kind == kind][:1])
     aids = {name: made for name in used if (made := aid(name)) is not None}  # one of the user's may aid none
+    custom.require_alike(aids.values())
     local_filters = tuple(
         Local(
             local.name,

@@ -12,6 +12,7 @@ import numpy as np
 
 from nav.columns import VECTORS
 from nav.samples import Array, Estimate, Outcome, Status, UpdateReport
+from testbed import plugins
 from testbed.errors import shown
 
 FLOAT = np.dtype(float)
@@ -94,25 +95,29 @@ class Given:
             early = "before the first increment: there its t is nan, 0, or that of a sample"
             raise Unfit(f"{method} is of {own:.10g} s, {when if begun else early}")
 
-    def reports(self, given: Any, method: str) -> list[UpdateReport]:
-        """What a method gave as a list of reports. Raises Unfit."""
+    def reports(self, given: Any, method: str, t: float) -> list[UpdateReport]:
+        """What a method gave as a list of reports, of times until ``t`` [s]. Raises Unfit."""
         if isinstance(given, UpdateReport):
-            return [self._report(given, f"{method}: a report's")]
+            return [self._report(given, f"{method}: a report's", t)]
         if not isinstance(given, Iterable) or isinstance(given, str):
             raise Unfit(f"{method} gave {_told(given)}, not a list of reports")
         reports = []
         for one in given:
             if not isinstance(one, UpdateReport):
                 raise Unfit(f"{method} gave a list with {_told(one)} in it, not a nav.samples.UpdateReport")
-            reports.append(self._report(one, f"{method}: a report's"))
+            reports.append(self._report(one, f"{method}: a report's", t))
         return reports
 
-    def _report(self, given: UpdateReport, of: str) -> UpdateReport:
+    def _report(self, given: UpdateReport, of: str, until: float) -> UpdateReport:
         changes: dict[str, Any] = {}
         for name in ("t", "nis", "threshold", "weight"):
             value = getattr(given, name)
             unknown = value is None and name in ("nis", "threshold")
             changes[name] = math.nan if unknown else _number(value, f"{of} {name}")
+            if name != "t" and changes[name] < 0:
+                raise Unfit(f"{of} {name} is {changes[name]:.6g}, below 0")
+        if not -math.inf < changes["t"] <= until + self._tick_s * (1 + LENGTH):
+            raise Unfit(f"{of} t is {changes['t']:.10g} s, where the run is at {until:.10g} s: give that of the sample")
         for name in ("sensor", "reason"):
             if not _is_text(getattr(given, name)):
                 raise Unfit(f"{of} {name} is {_told(getattr(given, name))}, not a text")
@@ -203,7 +208,7 @@ def _status(value: Any, what: str) -> Status:
 
 def _require_name(name: Any, what: str) -> None:
     """Raises Unfit when a group or a column of the record can't be called so."""
-    if not isinstance(name, str) or not name.strip(".") or "/" in name or not name.isprintable():
+    if not plugins.can_be_name(name):
         raise Unfit(f"{what} is {_told(name)}, not a text that can be a name: no slash, no control character")
 
 

@@ -36,7 +36,7 @@ from testbed.estimators.section import (
     slip_mistakes,
 )
 from testbed.schema import Section
-from testbed.sensors import SensorConfig, geomagnetic_field_n
+from testbed.sensors import SensorConfig, custom, geomagnetic_field_n
 
 STATE_ORDER = ("gnss", "barometer", "magnetometer", "airspeed")  # the order in the state, which decides on its rounding
 GNSS_MEASUREMENTS = ("gnss_position", "gnss_velocity", "gnss_course")
@@ -134,6 +134,7 @@ def build(section: InsSection, rig: Rig) -> Lane:
     singles = [name for kind in STATE_ORDER for name in section.aids if sensors[name].kind == kind]
     several = [name for name in section.aids if sensors[name].kind not in ONE_EACH]
     aids = [made for made in map(aid, (*singles, *several)) if made is not None]
+    custom.require_alike(aids)
     if section.course is not None:
         aids = _with_course(aids, section.course)
     used = tuple(dict.fromkeys((*offered.values(), *(made.sensor for made in aids))))

@@ -31,6 +31,8 @@ from typing import Protocol
 
 from testbed.errors import UserError
 
+STAMP_BYTES, FRAMES = 8, (b"\xfd", b"\xfe")  # of a telemetry log: the time, and how the frame after it begins
+
 CONNECT_TIMEOUT_S = 5.0
 MOST_STATIONS = 16  # on one port; more are not let in
 FORGET_S = 30.0  # a station on udpin that is silent for longer has gone: they all send heartbeats
@@ -121,11 +123,25 @@ def resolve(url: str, where: str, forms: str = _FORMS) -> tuple[str, int]:
     return address
 
 
+def _require_log(url: str, path: Path) -> None:
+    """Raise UserError when there is a file that is no telemetry log of earlier: it is somebody else's."""
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            head = file.read(STAMP_BYTES + 1)
+    except OSError:
+        return  # to be told when it is opened
+    if head and head[STAMP_BYTES:] not in FRAMES:
+        raise UserError(f"{url}: {path.name} is there already, and is no telemetry log: give the log another name")
+
+
 class TelemetryLog:
     """A telemetry log (.tlog) as ground stations, mavlogdump and MAVExplorer read it."""
 
     def __init__(self, url: str, path: Path) -> None:
         self._url = url
+        _require_log(url, path)
         try:
             self._file = path.open("wb")
         except FileNotFoundError:

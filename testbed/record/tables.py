@@ -125,12 +125,13 @@ class Table:
         column = self.columns[name]
         if not self.blocks:
             return np.empty((0, *column.shape), column.dtype)
-        parts = [
-            np.asarray(block[name], column.dtype)
-            if name in block
-            else blank((len(block[self.time_name]), *column.shape), column.dtype)
-            for block in self.blocks
-        ]
+        with np.errstate(over="ignore", invalid="ignore"):  # what has diverged is inf in single precision
+            parts = [
+                np.asarray(block[name], column.dtype)
+                if name in block
+                else blank((len(block[self.time_name]), *column.shape), column.dtype)
+                for block in self.blocks
+            ]
         return np.ascontiguousarray(parts[0] if len(parts) == 1 else np.concatenate(parts))
 
     def count_written(self) -> None:

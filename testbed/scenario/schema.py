@@ -220,9 +220,13 @@ class Scenario(Section):
         ``key=value`` strings as `testbed.scenario.keypath.assign` takes them. Raises UserError with every mistake
         found: file, line, key path and what to do.
         """
+        if not isinstance(path_or_name, str | Path):
+            raise UserError(f"Scenario.load: {shown(str(path_or_name))} is neither a file nor a shipped name")
         path = _find(path_or_name)
         if isinstance(overrides, Mapping):
-            overrides = [keypath.override(key, value) for key, value in overrides.items()]
+            overrides = [keypath.override(str(key), value) for key, value in overrides.items()]
+        elif isinstance(overrides, str):
+            overrides = [overrides]
         return cls._parsed(_read(path), overrides, path, {"options": path.parent})
 
     @classmethod

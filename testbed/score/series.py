@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nav.samples import Array
-from testbed.errors import UserError
+from testbed.errors import UserError, shown
 from testbed.score import accuracy
 
 if TYPE_CHECKING:
@@ -41,7 +41,10 @@ def error_series(run: RunResult | xarray.DataTree, estimator: str) -> pandas.Dat
     import pandas
     import xarray
 
-    dataset = run if isinstance(run, xarray.DataTree) else run.dataset
+    dataset = run if isinstance(run, xarray.DataTree) else getattr(run, "dataset", None)
+    if dataset is None:
+        told = "give what `testbed.run` gave back, or a record as xarray.open_datatree reads it"
+        raise UserError(f"error_series: {shown(str(run))} is no run: {told}")
     known = accuracy.names(dataset)
     if estimator not in known:
         raise UserError(f"the run has no estimator {estimator}: choose from {', '.join(known) or 'none'}")

@@ -7,7 +7,8 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from numbers import Real
 from typing import Any, cast
@@ -123,6 +124,11 @@ class AidGuard:
         except (TypeError, ValueError):
             given = f"parts = {shown(str(own.parts))} and states = {shown(str(own.states))}"
             raise UserError(f"{called}: {given}: give pairs of a name and its axes, and names") from None
+        names = [name for name, _ in self.parts]
+        for name in names:
+            if not plugins.can_be_name(name) or names.count(name) > 1:
+                told = "a name without a slash or control characters, another for each"
+                raise UserError(f"{called}: parts has {shown(name)}: give {told}")
 
     def blocks(self) -> list[Block]:
         """Its error states."""
@@ -131,6 +137,16 @@ class AidGuard:
     def measure(self, part: str, sample: Any, at: OperatingPoint) -> Measurement | None:
         """One part of a sample."""
         return _measured(self._called, dict(self.parts)[part], self._aid.measure, part, sample, at)
+
+
+def require_alike(aids: Iterable[Any]) -> None:
+    """Raise UserError when parts of two aids of a filter have one name, as in the record, and not as many axes."""
+    known: dict[str, int] = {}
+    for aid in aids:
+        for part, axes in aid.parts:
+            if known.setdefault(part, axes) != axes:
+                told = f"has {axes} axes, and that of another {known[part]}: give it a name of its own"
+                raise UserError(f"sensor {aid.sensor}: aid: part {shown(part)} {told}")
 
 
 def _blocks(called: str, ask: Callable[[], Any]) -> list[Block]:
@@ -186,6 +202,7 @@ class Guard:
         self._name, self._called, self._sensor = name, _called(name, section), sensor
         self._kind: type | None = None  # of all its samples
         self._shapes: dict[str, tuple[int, ...]] = {}  # of their numbers
+        self._shared: dict[int, tuple[Any, Any]] = {}  # arrays that were in several samples, and with what
 
     def sense(self, truth: TruthBlock) -> list[Any]:
         """The samples inside a block. Raises UserError where there are none such, or it raises."""
@@ -193,16 +210,33 @@ class Guard:
             given = self._sensor.sense(_copy(truth))
             if not isinstance(given, Iterable):
                 raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
-            samples = [_timed(sample) for sample in given]
+            # One that is made at a time is copied at once: the next may be written into the same arrays.
+            samples = [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
         except UserError:
             raise
-        except (Exception, SystemExit) as error:
+        except (Exception, SystemExit, GeneratorExit) as error:
             raise UserError(f"{self._called}: {plugins.raised(error)}") from error
         for sample in samples:
             wrong = self._wrong(sample)
             if wrong:
                 raise UserError(f"{self._called}: sense gave {wrong}")
-        return samples
+        if not isinstance(given, Sequence):
+            return samples
+        if wrong := self._overwritten(samples):
+            raise UserError(f"{self._called}: sense gave {wrong}")
+        return [_owned(sample) for sample in samples]
+
+    def _overwritten(self, samples: Sequence[Any]) -> str:
+        """That an array is in several samples, and has changed: they all have what was written last."""
+        found = [(name, value) for sample in samples for name, value in _arrays(sample).items()]
+        times, shared = Counter(id(value) for _, value in found), {}
+        for name, value in found:
+            if times[id(value)] > 1:
+                shared[id(value)] = before = self._shared.get(id(value), (value, value.copy()))
+                if not np.array_equal(before[1], value, equal_nan=value.dtype.kind == "f"):
+                    return f"one array as {name} of several samples, and overwrote it: give each a copy"
+        self._shared = shared
+        return ""
 
     def _wrong(self, sample: Any) -> str:
         """What is wrong with a sample; empty when nothing is."""
@@ -233,17 +267,39 @@ class Guard:
         self._kind = self._kind or kind
         if kind is not self._kind:
             return f"{kind.__name__} after {self._kind.__name__}: all samples of a sensor are of one class"
-        if kind.__module__ == nav.samples.__name__:
-            return ""
-        for name in (field.name for field in dataclasses.fields(sample) if field.name != "sensor"):
+        ours = kind.__module__ == nav.samples.__name__
+        for name, of in ((field.name, field.type) for field in dataclasses.fields(sample) if field.name != "sensor"):
             value = getattr(sample, name)
             try:
                 shape = np.asarray(value, dtype=float).shape
             except (TypeError, ValueError):
+                shape = None
+            if shape is None or value is None:
                 return f"a sample whose {name} is {shown(value)}: it must be a number or a list of them"
+            if ours and shape != (() if of != "Array" else (4,) if name == "q_ib" else (3,)):
+                return f"a {kind.__name__} whose {name} has shape {shape}"
             if len(shape) > 1 or self._shapes.setdefault(name, shape) != shape:
                 return f"a sample whose {name} has shape {shape}: it must be a number, or as many in every sample"
         return ""
+
+
+def _arrays(sample: Any) -> dict[str, Any]:
+    """The arrays of a sample."""
+    values = {field.name: getattr(sample, field.name) for field in dataclasses.fields(sample)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+
+
+def _owned(sample: Any) -> Any:
+    """The same with arrays that nobody else writes into."""
+    if not dataclasses.is_dataclass(sample):
+        return sample
+    arrays = _arrays(sample)
+    if not arrays:
+        return sample
+    own = copy.copy(sample)
+    for name, value in arrays.items():
+        object.__setattr__(own, name, value.copy())  # it may be frozen
+    return own
 
 
 def _copy(truth: TruthBlock) -> TruthBlock:

@@ -120,6 +120,18 @@ def test_log_has_what_is_written(tmp_path):
     assert path.read_bytes() == FRAME + b"two"
 
 
+def test_no_log_goes_over_a_file_that_is_none(tmp_path):
+    """Such as the scenario that is flown; one of an earlier run is written anew."""
+    mine = tmp_path / "mine.toml"
+    mine.write_text("title = 'mine'")
+    with pytest.raises(UserError, match=r"mine\.toml is there already, and is no telemetry log: give the log another"):
+        connect(f"tlog:{mine}")
+    assert mine.read_text() == "title = 'mine'"
+    for head in (bytes(8) + b"\xfd", b""):
+        mine.write_bytes(head)
+        connect(f"tlog:{mine}").close()
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_full_disk_is_an_error_with_a_name():
     log = connect("tlog:/dev/full")

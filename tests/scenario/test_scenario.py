@@ -251,3 +251,15 @@ def test_line_numbers_cover_exactly_what_the_parser_finds(tables: list[dict[str,
     for number, line in enumerate(text.splitlines(), start=1):
         if line == "[[t]]":
             assert number in lines.values()
+
+
+@pytest.mark.parametrize("name", [None, 3])
+def test_what_is_no_file_is_told(name: Any) -> None:
+    with pytest.raises(UserError, match=r"Scenario\.load: .* is neither a file nor a shipped name"):
+        Scenario.load(name)
+
+
+def test_one_override_may_be_a_text() -> None:
+    assert Scenario.load("static_bench", "duration_s=61").duration_s == 61.0
+    with pytest.raises(UserError, match="unknown key"):
+        Scenario.load("static_bench", {3: True})  # type: ignore[dict-item]

@@ -116,6 +116,12 @@ def test_error_series_of_an_estimator_that_is_not_there(run: Any) -> None:
         error_series(run, "mine")
 
 
+@pytest.mark.parametrize("given", ["run.nc", None])
+def test_error_series_of_no_run(given: Any) -> None:
+    with pytest.raises(UserError, match=r"is no run: give what `testbed\.run` gave back"):
+        error_series(given, "ins")
+
+
 def test_estimators_that_are_not_scored_are_told_and_why() -> None:
     run = synthetic_run.dataset(
         100.0, {"ins": Errors(), "late": Errors(aligned_after=70.0), "other": Errors(aligned_after=np.inf)}

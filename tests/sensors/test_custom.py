@@ -6,14 +6,18 @@ import re
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from nav.aids import GnssAid
 from nav.aids.base import Aid
+from nav.samples import MagnetometerSample
 from testbed import Scenario, run
 from testbed.errors import UserError
+from testbed.motion.table import TruthBlock
 from testbed.report import page as report
 from testbed.sensors import custom, registry
 from testbed.sensors.magnetometer import MagnetometerConfig
@@ -25,7 +29,7 @@ import numpy as np
 from pydantic import Field
 
 from nav.earth import isa_pressure
-from nav.samples import BarometerSample
+from nav.samples import BarometerSample, MagnetometerSample
 from nav.aids import BarometerAid
 from nav.aids.base import Measurement
 from testbed.noise import Process, stream
@@ -84,6 +88,10 @@ def generated():
 
 
 WRONG = {
+    "gone": lambda: (_ for _ in ()).throw(GeneratorExit),
+    "two axes": lambda: [MagnetometerSample(0.0, 0.0, np.zeros(2), "radar")],
+    "one": lambda: [BarometerSample(0.0, 0.0, np.zeros(1), "radar")],
+    "nothing": lambda: [BarometerSample(0.0, 0.0, None, "radar")],
     "none": lambda: None,
     "dict": lambda: [{"t": 0.0}],
     "timeless": lambda: [Timeless(1.0)],
@@ -105,7 +113,9 @@ class HeightAid:
 
     def __init__(self, how):
         self.how = how
-        self.parts = 3 if how == "parts" else self.parts
+        named = {"parts": 3, "aid slash": (("a/b", 1),), "aid twice": (("radar", 1), ("radar", 1))}
+        named["aid ours"] = (("gnss_position", 1),)
+        self.parts = named.get(how, self.parts)
 
     def blocks(self):
         return ["bias"] if self.how == "blocks" else []
@@ -289,6 +299,10 @@ def test_a_scenario_with_it_can_be_sent(scenario: Path, monkeypatch: pytest.Monk
         ("init exit", f"can't be made: SystemExit: 4 ({at('SystemExit(4)')})"),
         ("raise", f"LinAlgError: Singular matrix ({at('linalg')})"),
         ("late", f"ValueError: no echo ({at('no echo')})"),
+        ("gone", "GeneratorExit"),
+        ("two axes", "sense gave a MagnetometerSample whose field_b has shape (2,)"),
+        ("one", "sense gave a BarometerSample whose pressure has shape (1,)"),
+        ("nothing", "sense gave a sample whose pressure is null: it must be a number"),
         ("none", "sense gave NoneType: give a list of samples"),
         ("dict", "sense gave dict where a sample was expected"),
         ("timeless", "sense gave Timeless, which lacks t, t_arrival, sensor"),
@@ -306,6 +320,35 @@ def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, sa
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {"sensors.radar.how": how}))
     assert re.match(rf"sensor radar: \./radar\.py:Radar:? {re.escape(says)}", str(told.value)), told.value
+
+
+def sensed(given: Any) -> list[list[float]]:
+    """The fields of three blocks of a sensor that writes into one array, of samples as ``given`` by a list or so."""
+    array = np.zeros(3)
+
+    def samples() -> Any:
+        for k in range(3):
+            array[:] += 1
+            yield MagnetometerSample(0.1 * k, 0.1 * k, array, "radar")
+
+    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: given(samples())))
+    return [one.field_b.tolist() for _ in range(3) for one in guard.sense(TruthBlock.empty(0, 1))]
+
+
+def test_an_array_that_is_written_anew_for_each_sample_is_copied() -> None:
+    """All samples had what was in it in the end; of those of a list it can't be had any more, and is told."""
+    assert sensed(lambda samples: samples) == [[k] * 3 for k in range(1, 10)]
+    assert sensed(lambda samples: [next(samples)]) == [[k] * 3 for k in range(1, 4)]
+    with pytest.raises(UserError, match="gave one array as field_b of several samples, and overwrote it: give each"):
+        sensed(list)
+
+
+def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
+    array = np.ones(3)
+    made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
+    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
+    for _ in range(2):
+        assert [one.field_b.tolist() for one in guard.sense(TruthBlock.empty(0, 1))] == [[1.0] * 3] * 3
 
 
 @pytest.mark.parametrize(
@@ -327,6 +370,8 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
     ("how", "says"),
     [
         ("parts", 'parts = "3" and states = "()": give pairs of a name and its axes, and names'),
+        ("aid slash", 'parts has "a/b": give a name without a slash or control characters, another for each'),
+        ("aid twice", 'parts has "radar": give a name without a slash'),
         ("blocks", """blocks gave "['bias']": give a list of nav.error_model.Block"""),
         ("aid raise", f"AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' ({at('no_such')})"),
         ("aid dict", 'measure gave dict where a Measurement or None was expected of "radar" at '),
@@ -343,6 +388,14 @@ def test_what_is_no_measurement_ends_the_run_with_a_line(scenario: Path, how: st
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how}))
     assert f"sensor radar: ./radar.py:Aided: aid: {says}" in str(told.value)
+
+
+def test_an_aid_with_a_part_of_ours_has_as_many_axes(scenario: Path) -> None:
+    keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    with pytest.raises(
+        UserError, match='sensor radar: aid: part "gnss_position" has 1 axes, and that of another 3: gi'
+    ):
+        run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": "aid ours"}))
 
 
 @pytest.mark.parametrize(("how", "looks"), [("", 1), ("aid lists", 1), ("aid none", 0)])
