@@ -327,8 +327,8 @@ def _utc(units: Mapping[str, Mapping[str, Rows]], pace: float) -> float | None:
         since = _satellite_time(rows)[kept] - t / pace
         since = since[np.isfinite(since)]
         if len(since):
-            zero = GPS_EPOCH + dt.timedelta(seconds=float(np.median(since)))
-            return zero.timestamp() - next((ahead for begins, ahead in LEAPS if zero >= begins), 0)
+            zero = GPS_EPOCH.timestamp() + float(np.median(since))
+            return zero - next((ahead for begins, ahead in LEAPS if zero >= begins), 0)
     return None
 
 

@@ -185,10 +185,9 @@ class Recorded:
         """What is judged against."""
         if truth.reference == "none":
             return NOBODY
-        solution = log.solution
+        solution = None if log.solution is None else _by_imu(log.solution, log, sections)
         if solution is not None and truth.reference == "solution" and "lat" in solution.columns:
-            found = _by_imu(solution, log, sections)
-            found = replace(found, t=found.t - self._start)
+            found = replace(solution, t=solution.t - self._start)
         elif (receiver := log.receiver) is None:
             return NOBODY if solution is None else replace(solution, t=solution.t - self._start)
         else:
@@ -270,7 +269,7 @@ def _by_imu(solution: Reference, log: Log, sections: Mapping[str, SensorConfig])
         return solution
     section = sections.get(log.receiver)
     late, by = section.latency_s if isinstance(section, GnssConfig) else 0.0, "as told"
-    if "v_n" in solution.columns and log.imus:
+    if {"lat", "v_n"} <= set(solution.columns) and log.imus:
         rows = Fixes(solution.t, *(solution.columns[key] for key in ("lat", "lon", "h")))
         rows.v_n = solution.columns["v_n"]
         shown = latency(next(iter(log.imus.values())), rows.samples(log.receiver))

@@ -291,7 +291,7 @@ def _arrays(sample: Any) -> dict[str, Any]:
 
 def _owned(sample: Any) -> Any:
     """The same with arrays that nobody else writes into."""
-    if not dataclasses.is_dataclass(sample):
+    if not dataclasses.is_dataclass(sample) or isinstance(sample, type):
         return sample
     arrays = _arrays(sample)
     if not arrays:

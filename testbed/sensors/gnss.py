@@ -29,9 +29,9 @@ from testbed.sensors.timing import AidingTiming, Schedule, Windows
 from testbed.sensors.units import DEG, LeverArm
 
 GPS_EPOCH, WEEK_S = datetime.datetime(1980, 1, 6, tzinfo=datetime.UTC), 604_800  # of GPS time
-# How far GPS time is ahead of UTC [s] since which day, the newest first (IERS, Bulletin C).
+# How far GPS time is ahead of UTC [s] since when [s since 1970], the newest first (IERS, Bulletin C).
 LEAPS = tuple(
-    (datetime.datetime(year, month, 1, tzinfo=datetime.UTC), ahead)
+    (datetime.datetime(year, month, 1, tzinfo=datetime.UTC).timestamp(), ahead)
     for year, month, ahead in ((2017, 1, 18), (2015, 7, 17), (2012, 7, 16), (2009, 1, 15), (2006, 1, 14), (1980, 1, 13))
 )
 LEAP_S = LEAPS[0][1]

@@ -392,9 +392,7 @@ def test_what_is_no_measurement_ends_the_run_with_a_line(scenario: Path, how: st
 
 def test_an_aid_with_a_part_of_ours_has_as_many_axes(scenario: Path) -> None:
     keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
-    with pytest.raises(
-        UserError, match='sensor radar: aid: part "gnss_position" has 1 axes, and that of another 3'
-    ):
+    with pytest.raises(UserError, match='sensor radar: aid: part "gnss_position" has 1 axes, and that of another 3'):
         run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "sensors.radar.how": "aid ours"}))
 
 
