@@ -284,7 +284,8 @@ class _Passage:
         """One turn: what the feed gives, estimated, recorded and handed out. False when the motion has ended."""
         began = time.monotonic()
         size = self.paced if self.director.pacer is not None else self.batch if self.quick else self.slow
-        ticks = min(size, self.ticks - self.tick, self.director.room(self.tick))
+        left = self.ticks - self.tick  # a few that are left over come with this turn: their deadline would be at once
+        ticks = min(size if left - size > size // 2 else left, self.director.room(self.tick))
         turn = self.feed.advance(ticks, self.cadence.rows(self.tick, ticks))
         block = turn.reference
         if not len(block):

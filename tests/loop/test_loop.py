@@ -19,6 +19,7 @@ from testbed.errors import UserError
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.loop.links import Stretch
+from testbed.loop.pacer import Pacer
 from testbed.motion import flight
 from testbed.motion.table import MotionSource, TruthBlock
 from testbed.record import reader as record
@@ -396,6 +397,16 @@ def test_slow_imu_gives_the_same_bits_live_and_batch(imu_hz: int) -> None:
     scenario = Scenario.load("u_turn", ["duration_s=20", "sensors.gnss.denied=[]", f"sensors.imu.rate_hz={imu_hz}"])
     batch = run(scenario)
     assert same(batch.dataset, run(scenario, links=[Watcher()], realtime=1000.0).dataset)
+
+
+@pytest.mark.parametrize("duration_s", [2.0, 2.01, 2.03])
+def test_no_deadline_comes_at_once_after_another(duration_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last, of the one row that is left over, was missed in every run."""
+    deadlines = []
+    monkeypatch.setattr(Pacer, "wait", lambda self, t, meanwhile=None: deadlines.append(t))
+    run(Scenario.load("static_bench", {"duration_s": duration_s}), links=[Watcher()], realtime=1000.0)
+    assert deadlines[-1] == pytest.approx(duration_s)
+    assert np.diff(deadlines).min() >= 0.5 * Watcher.period_s
 
 
 @pytest.mark.ci
