@@ -283,9 +283,11 @@ class _Passage:
     def advance(self) -> bool:
         """One turn: what the feed gives, estimated, recorded and handed out. False when the motion has ended."""
         began = time.monotonic()
-        size = self.paced if self.director.pacer is not None else self.batch if self.quick else self.slow
-        left = self.ticks - self.tick  # a few that are left over come with this turn: their deadline would be at once
-        ticks = min(size if left - size > size // 2 else left, self.director.room(self.tick))
+        left, live = self.ticks - self.tick, self.director.pacer is not None
+        size = self.paced if live else self.batch if self.quick else self.slow
+        if live and left <= size + size // 2:  # the last few rows come with these: their own deadline would be at once
+            size = left
+        ticks = min(size, left, self.director.room(self.tick))
         turn = self.feed.advance(ticks, self.cadence.rows(self.tick, ticks))
         block = turn.reference
         if not len(block):

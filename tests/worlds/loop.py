@@ -74,7 +74,8 @@ class Watcher:
         assert len(rows) == len(t) > 0
         assert rows.estimates.t == pytest.approx(t, abs=1e-9)
         assert rows.imu is not None
-        assert len(rows.imu) == 0 or rows.imu.t[-1] >= t[-1] - rows.imu.dt[-1] - 1e-9
+        # At the end of a run the next increment is still to come, and later than the last one was long: stamps jitter.
+        assert len(rows.imu) == 0 or rows.imu.t[-1] >= t[-1] - 1.5 * rows.imu.dt[-1] - 1e-9
         assert [row for row, _ in rows.samples] == sorted(row for row, _ in rows.samples)
         for row, sample in rows.samples:
             assert sample.t_arrival <= t[row] + 1e-9
