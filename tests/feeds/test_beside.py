@@ -56,6 +56,7 @@ def own() -> float:
     return float(run(Scenario.load("recorded_flight", SHORT)).metrics[RMS])
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("more", [{}, {"velocity": ["vn", "ve", "vd"]}])
 def test_dates_are_taken_to_the_clock_of_the_log(
     more: dict[str, Any], solution: tuple[Reference, float], own: float, tmp_path: Path
@@ -68,6 +69,7 @@ def test_dates_are_taken_to_the_clock_of_the_log(
     assert f"{LATE_S:.2f} s late" in reference
 
 
+@pytest.mark.ci
 def test_gps_time_is_told_by_an_offset(solution: tuple[Reference, float], own: float, tmp_path: Path) -> None:
     table = written(tmp_path, *solution, ahead=18.0)
     assert flown(table, {"column": "time", "offset": -18}).metrics[RMS] == pytest.approx(own, abs=0.3)

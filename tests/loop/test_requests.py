@@ -352,6 +352,7 @@ def requests_in(dataset: Any, rows: Sequence[Mapping[str, str]]) -> Any:
     return xarray.DataTree.from_dict({"/": dataset.to_dataset(), "requests": group})
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("kind", "content", "says"),
     [

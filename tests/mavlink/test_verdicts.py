@@ -72,6 +72,7 @@ def one_after_the_other(found, rows):
     return told
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("chunk", [1, 7, 600])
 def test_rows_have_what_reports_one_after_the_other_come_to(seed, chunk):

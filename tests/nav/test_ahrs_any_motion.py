@@ -306,6 +306,7 @@ FINE = replace(
 )
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("straight_s", "worst_deg"), [(60.0, 1.0), (0.0, 2.5)])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_circle_that_never_ends_does_not_tilt_the_horizon(straight_s, worst_deg, sign):
@@ -328,6 +329,7 @@ def test_airspeed_tells_the_circle_better():
     assert np.abs(phi[t > 30, :2]).max() < 0.4 * DEG
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("compass", [True, False])
 @pytest.mark.parametrize("speed", [20.0, 40.0])
 def test_a_heading_that_is_corrected_turns_what_is_known_along_it(speed, compass):

@@ -147,6 +147,7 @@ def same(a, b):
     return a == b
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("change", "offset_s", "spoilt"),
     [
@@ -204,6 +205,7 @@ def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
     assert stood_in
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("change", "detector"),
     [
@@ -242,6 +244,7 @@ THREE = ("magnetometer", "airspeed", "barometer")
 FURTHER = {"gyro_misalignment_sigma": 3e-3, "accel_bias_sigma": 0.03, "gust_sigma": 0.2}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("change", "offset_s", "spoilt", "advised"),
     [

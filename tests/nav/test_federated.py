@@ -322,6 +322,7 @@ def test_nees_over_many_flights():
     assert nees["fixed"] < bound < nees["none"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("kind", "structure", "with_velocity"),
     [

@@ -47,6 +47,7 @@ def flown(estimator, turn_deg, seed=0, seconds=1.0, change=lambda fix: fix, abou
     return truth, feed(FusionHorizon(estimator), increments, samples, seconds)[0], again
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
 @pytest.mark.parametrize("turn_deg", [-60.0, 90.0, 180.0])
 def test_a_wrong_heading_is_found_soon(kind, turn_deg):
@@ -67,6 +68,7 @@ def test_a_wrong_tilt_too():
     assert np.hypot(*error(estimates[-1], truth)[:2]) < 4.0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated"])
 def test_a_right_one_is_let_alone(kind):
     for seed in range(3):
@@ -81,6 +83,7 @@ def pulled(fix, speed, acceleration=0.0):
     return dataclasses.replace(fix, lon=fix.lon + east / (6.38e6 * math.cos(fix.lat)), v_n=v_n)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "false",
     [
@@ -112,6 +115,7 @@ def test_a_receiver_that_is_elsewhere_is_not_believed():
     assert min(again) >= InsConfig(SMALL).patience_s
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
 def test_however_it_is_cut_the_same_bits(kind):
     """Where no compass begins the doubt, too: fixes whose position was used and whose velocity was not."""

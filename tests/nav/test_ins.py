@@ -296,6 +296,7 @@ def test_after_a_shock_to_the_accelerometers_the_fixes_are_believed(aids, airspe
     assert max(np.hypot(*error(e, truth)[:2]) for e in estimates if e.t > 120) < 5.0
 
 
+@pytest.mark.ci
 def test_after_a_shock_the_same_bits_however_it_is_cut():
     """An airspeed is used one by one, or as a step among many: the wind is a witness, or not, all the same."""
     whole, parts = (shaken(("airspeed",), seconds)[1] for seconds in (10.0, 0.5))

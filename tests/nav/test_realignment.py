@@ -78,6 +78,7 @@ def right_in_three_seconds(truth, estimates, gap_s, most_m):
             assert np.hypot(*off[:2]) < most_m
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated", "smoother"])
 @pytest.mark.parametrize("gap_s", [3.0, 20.0])
 def test_after_a_gap_it_is_right_in_three_seconds_and_never_too_sure(kind, gap_s):
@@ -147,6 +148,7 @@ def test_what_can_not_be_aligned_goes_on_with_what_it_is_given():
     assert np.hypot(*error(estimates[-1], truth)[:2]) < 1e3
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated"])
 @pytest.mark.parametrize("gap_s", [7.0, 15.0])
 def test_of_increments_alone_it_is_right_in_three_seconds(kind, gap_s):

@@ -129,6 +129,7 @@ def test_a_steady_pull_is_told_from_a_tilt():
     assert 0.4 < np.mean(nees) < 2.5
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("strength", [0.0, 0.05])
 def test_noise_tells_nothing(strength):
     """A hovering body, and a receiver that is wrong by more than it moves."""
@@ -217,6 +218,7 @@ def test_a_filter_without_a_compass_finds_its_heading_below_the_speed_of_the_cou
         assert np.array_equal(one.q_nb, by_time[round(one.t, 3)].q_nb, equal_nan=True)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("gap_s", [2.0, 10.0, 30.0])
 @pytest.mark.parametrize("seed", [700, 701])
 def test_after_a_gap_it_waits_for_its_heading_and_is_not_too_sure(gap_s, seed):

@@ -65,6 +65,7 @@ def pictured(images: Iterable[str]) -> list[str]:
     return [name for name in images if name.endswith(("_allan.png", "_spectra.png")) or name == "visibility.png"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", KINDS)
 def test_report_is_written_for_every_kind_of_run(tmp_path: Path, kind: str) -> None:
     run = synthetic_run.dataset(**RUNS[kind])

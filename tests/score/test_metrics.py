@@ -440,6 +440,7 @@ def test_an_attitude_before_a_position_does_not_make_it_one_of_attitude_only() -
     assert metrics.compute(run)["ins.nonfinite_samples"] == last.sum()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("name", "wrong"), [("v_n", np.inf), ("lat", np.nan), ("h", 1e300)])
 def test_what_never_was_a_number_is_not_taken_for_what_is_never_told(name: str, wrong: float) -> None:
     run = synthetic_run.dataset(100.0)
@@ -452,6 +453,7 @@ def test_what_never_was_a_number_is_not_taken_for_what_is_never_told(name: str, 
     assert "ins.nonfinite_samples" not in metrics.compute(run)
 
 
+@pytest.mark.ci
 def test_errors_are_judged_without_a_covariance() -> None:
     """A covariance that ends took the errors with it, and the estimates were called not finite."""
     run = synthetic_run.dataset(130.0)
@@ -533,6 +535,7 @@ def test_a_hold_that_the_end_of_the_run_cuts_off_is_no_recovery(tmp_path: Path) 
     assert recovering(tmp_path, 169.0)["ins.recovery_s"] == pytest.approx(69.0, abs=0.11)
 
 
+@pytest.mark.ci
 def test_an_outage_at_the_end_is_not_judged() -> None:
     found = metrics.compute(synthetic_run.dataset(200.0, {"ins": Errors(aligned_after=0.0)}, ((150.0, 180.0),)))
     assert "ins.outage_position_horizontal_rms_m" in found

@@ -83,6 +83,7 @@ def test_metrics_of_another_settling_time_are_no_error() -> None:
     assert all("astray" not in told for told in doubts(run, found))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("sensor", "window", "how"),
     [
@@ -144,6 +145,7 @@ def test_covariances_that_give_no_nees_are_told() -> None:
     ]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("variance", "told"), [(1.0, False), (np.nan, False), (0.0, True), (-1.0, True)])
 def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> None:
     """Of those there is no NEES, nor what is judged against three sigma. NaN claims none."""
