@@ -114,6 +114,11 @@ def _file(path: Path) -> ModuleType:
     return module
 
 
+# Dimensions in the record that have labels (`testbed.record.columns`), and times: no column or group can be called so.
+DIMENSIONS = {"time", "sample_time", "ned", "body", "north_east", "cross", "fix_part", "body_xy", "quaternion",
+              "inertial_quaternion", "surface", "command", "error", "error_column", "element"}  # fmt: skip
+
+
 def can_be_name(name: object) -> bool:
     """Whether a group or a column of the record can be called so."""
     return isinstance(name, str) and bool(name.strip(".")) and "/" not in name and name.isprintable()

@@ -14,6 +14,7 @@ from nav.columns import VECTORS
 from nav.samples import Array, Estimate, Outcome, Status, UpdateReport
 from testbed import plugins
 from testbed.errors import shown
+from testbed.plugins import DIMENSIONS
 
 FLOAT = np.dtype(float)
 NUMBERS = ("t", "lat", "lon", "h")
@@ -21,9 +22,6 @@ ALL = sum(Status)
 LIMITS = {"lat": math.pi / 2, "lon": 2 * math.pi}  # [rad]
 LENGTH = 1e-3  # by which that of a quaternion may be off 1: angles are wrong by as much
 SYMMETRY = 1e-3  # by which correlations across the diagonal may differ: rounding of single precision is far below
-# Dimensions in the record that have labels (`testbed.record.columns`), and times: no column or group can be called so.
-DIMENSIONS = {"time", "sample_time", "ned", "body", "north_east", "cross", "fix_part", "body_xy", "quaternion",
-              "inertial_quaternion", "surface", "command", "error", "error_column", "element"}  # fmt: skip
 # What else the record has beside the further states of an estimate: columns and groups.
 TAKEN = {*DIMENSIONS, *NUMBERS, *VECTORS, "status", "innovations",
          "sigma_position_n", "sigma_velocity_n", "sigma_attitude_n"}  # fmt: skip

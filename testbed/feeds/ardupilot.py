@@ -325,7 +325,8 @@ def _utc(units: Mapping[str, Mapping[str, Rows]], pace: float) -> float | None:
     for rows in units.get("gnss", {}).values():
         t, kept = _times("", rows, [])
         since = _satellite_time(rows)[kept] - t / pace
-        since = since[np.isfinite(since)]
+        fixed = rows["Status"][kept] >= FixType.FIX_3D if "Status" in rows else np.ones(len(t), bool)
+        since = since[np.isfinite(since) & (fixed | ~fixed.any())]
         if len(since):
             zero = GPS_EPOCH.timestamp() + float(np.median(since))
             return zero - next((ahead for begins, ahead in LEAPS if zero >= begins), 0)

@@ -39,6 +39,8 @@ def judged_by(log: Log, columns: Mapping[str, Stream]) -> Log:
     zero = log.utc if dated and log.utc is not None else 0.0
     heard = float(imu.t[0]) + zero, float(imu.t[-1]) + zero
     t, values = quantities(tables, path, name, "reference", stream, heard, notes)
+    if not len(t):
+        raise UserError(f"truth.columns.{name}: {path} has no row with a time and anything else")
     found = known_motion(*newly(name, t - zero, values, log.imus, notes), notes)
     found = replace(found, name=f"the reference in {path.name}")
     said = contradicted(found, log.imus, log.samples)

@@ -349,6 +349,7 @@ def _utc(topics: Topics) -> float | None:
     gps = _first(topics, RECEIVERS)
     if gps is None or "time_utc_usec" not in gps:
         return None
-    told = gps["time_utc_usec"] > 0
+    told, fixed = gps["time_utc_usec"] > 0, gps["fix_type"] >= FixType.FIX_3D
+    told = told & fixed if (told & fixed).any() else told
     since = gps["time_utc_usec"][told] / 1e6 - _seconds(gps)[told]
     return float(np.median(since)) if len(since) else None

@@ -72,10 +72,10 @@ def newly(
     """Times (N,) and quantities of a sensor without the rows that repeat the one before, of one that is only held.
 
     A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
-    it, to the last bit, is held about as long each time, as a slower clock makes it, at the unit's own times: by a
-    receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's rate that says the same by
-    chance, or since nothing changes. Of a receiver latitude and longitude tell, where the rest changes no more often:
-    it may come in rows of its own.
+    it, to the last bit, is held about as long each time, or for about as many rows, as a slower clock makes it, at the
+    unit's own times: by a receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's
+    rate that says the same by chance, or since nothing changes. Of a receiver latitude and longitude tell, where the
+    rest changes no more often: it may come in rows of its own.
     """
     if len(t) < 2 or not any(np.isin(t, imu.t).mean() > HELD_SHARE for imu in imus.values()):
         return t, dict(values)
@@ -86,14 +86,19 @@ def newly(
             first = placed
     rows = np.diff(first, append=len(t))
     lasts = np.diff(t[first], append=t[-1])
-    usual = float(np.median(lasts))
-    alike = np.mean(np.abs(lasts - usual) <= max(ALIKE * usual, ALIKE_ROWS * usual_step(t)))
+    alike = max(_alike(rows, 1.0), _alike(lasts, usual_step(t)))
     if np.median(rows) < 2 or len(first) < LEAST_HELD or alike < ALIKE_SHARE:
         return t, dict(values)
     held = len(t) - len(first)
     told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
     notes.append(left_out(name, told, held, len(t)))
     return t[first], {key: one[first] for key, one in values.items()}
+
+
+def _alike(lasts: Array, step: float) -> float:
+    """The share of times (N,) that are about as long as the usual one, where one row is a ``step``."""
+    usual = float(np.median(lasts))
+    return float(np.mean(np.abs(lasts - usual) <= max(ALIKE * usual, ALIKE_ROWS * step)))
 
 
 def _changes(values: Iterable[Array]) -> Array:

@@ -264,9 +264,9 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     """Increments as a table has them, with others where rows are missing: of a step they are its last part alone.
 
     A step is too long if no others, before it or after it, are as much shorter: times of rows may come early or late;
-    nor is one that is as long as most of those about it, of a unit that was slower for a while; nor one that felt as
-    much as those beside it would have in all its time (`_felt_s`). Up to `GAP_PERIODS` rows are as those about them, as
-    no filter aligns on what has holes all the time; more are NaN.
+    nor is one that is as long as most of those about it, of a unit that was slower for a while; nor, where most of them
+    do so, one that felt as much as those beside it would have in all its time (`_felt_s`). Up to `GAP_PERIODS` rows are
+    as those about them, as no filter aligns on what has holes all the time; more are NaN.
     """
     unknown = int(np.sum(~np.isfinite(np.hstack([imu.dtheta, imu.dv])).all(axis=1)))
     if unknown:
@@ -286,7 +286,10 @@ def with_holes(name: str, imu: ImuSamples, notes: list[str]) -> ImuSamples:
     later, earlier = even[np.minimum(rows + near, len(imu) - 1)], even[np.maximum(rows - 1 - near, 0)]
     missing = later.min(axis=0, initial=np.inf) - earlier.max(axis=0, initial=-np.inf)
     lacks = missing > period[rows] / 2
-    lacks &= ~(_felt_s(imu, imu.dt <= PIECE * period, rows) > imu.dt[rows] - missing / 2)
+    if lacks.any():
+        more = _felt_s(imu, imu.dt <= PIECE * period, rows) - (imu.dt[rows] - missing / 2)
+        if np.nanmedian(np.append(more[lacks], -np.inf)) > 0:  # it is a unit whose steps differ
+            lacks &= ~(more > 0)
     rows, missing = rows[lacks], missing[lacks]
     if not len(rows):
         return imu

@@ -198,8 +198,8 @@ def load(path: Path) -> Table:
             import pandas
 
             frame = pandas.read_parquet(path, engine="pyarrow")
-            if not isinstance(frame.index, pandas.RangeIndex):  # often of times
-                frame = frame.reset_index(drop=frame.index.name in frame.columns)
+            if not isinstance(frame.index, pandas.RangeIndex) and not {*frame.index.names} & {*frame.columns}:
+                frame = frame.reset_index()  # often of times
             return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
         return _sorted(path, text.columns(path))
     except UserError:
@@ -240,12 +240,16 @@ def _dated(clock: Any, day: Any) -> Any:
     apart = DAY.fullmatch(_first_text(day)) and CLOCK.fullmatch(_first_text(clock))
     if not apart or day.shape != clock.shape:
         return clock
-    return np.array([f"{one}T{time}".replace("/", "-") for one, time in zip(day, clock, strict=True)], object)
+    both = [isinstance(one, str) and isinstance(time, str) for one, time in zip(day, clock, strict=True)]
+    said = [f"{one}T{time}".replace("/", "-") for one, time in zip(day, clock, strict=True)]
+    return np.array([one if known else None for one, known in zip(said, both, strict=True)], object)
 
 
 def _first_text(array: Any) -> str:
     """What the first row of a column that is text says."""
-    return next((one for one in array if isinstance(one, str)), "") if array.dtype.kind in "OUT" else ""
+    if array.ndim != 1 or array.dtype.kind not in "OUT":
+        return ""
+    return next((one for one in array if isinstance(one, str)), "")
 
 
 def _seconds(array: Any) -> Any:

@@ -15,7 +15,7 @@ COMMENTS = ("#", "%")
 MARKS = (";", "\t", ",")  # that part fields, the first that a row has; else spaces do
 SPACES = " "
 QUOTED = re.compile(r'"[^"]*"')
-DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+")
+DECIMAL_COMMA, DECIMAL_POINT = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?\d*\.\d+(e[-+]?\d+)?", re.IGNORECASE)
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole
 MISSING = ("", "NA", "N/A", "null")  # in place of numbers
@@ -58,8 +58,9 @@ def layout(lines: Iterable[str]) -> Layout:
     (number, first), (_, row) = plain[0], plain[:2][-1]
     mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES if " " in row.strip() else ",")
     fields = _fields(row, mark)
-    shown = (one for _, line in plain[-SHOWN + 1 :] for one in _fields(line, mark))
-    decimal = "," if mark == ";" and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
+    shown = [one for _, line in plain[1:] or plain for one in _fields(line, mark)] if mark == ";" else []
+    pointed = any(map(DECIMAL_POINT.fullmatch, shown))
+    decimal = "," if not pointed and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
     width, top = len(fields), _fields(first, mark)
     first_names = not _are_numbers(top, decimal) and _are_numbers(fields, decimal)
     for names, hidden in ((_fields(comment[1], mark), False), (_fields(comment[1][1:], mark), True)):
@@ -113,7 +114,13 @@ def columns(path: Path) -> Iterator[tuple[str, Any]]:
             )
     except UnicodeDecodeError:
         raise UserError(f"{path}: is text, but not in UTF-8: save it as that") from None
-    return ((str(name).strip(), frame[name].to_numpy()) for name in frame.columns)
+    names = [str(name) for name in frame.columns]
+    return ((_free(str(name), names), frame[name].to_numpy()) for name in frame.columns)
+
+
+def _free(name: str, names: list[str]) -> str:
+    """A name without the blanks about it, unless another is called so."""
+    return name if name.strip() in names else name.strip()
 
 
 def _fields(line: str, mark: str) -> list[str]:

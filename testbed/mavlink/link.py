@@ -132,7 +132,7 @@ def _require_log(url: str, path: Path) -> None:
             head = file.read(STAMP_BYTES + 1)
     except OSError:
         return  # to be told when it is opened
-    if head and head[STAMP_BYTES:] not in FRAMES:
+    if head and head[STAMP_BYTES:] not in FRAMES:  # one that was cut off before its first frame too
         raise UserError(f"{url}: {path.name} is there already, and is no telemetry log: give the log another name")
 
 

@@ -8,7 +8,7 @@ import copy
 import dataclasses
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from numbers import Real
 from typing import Any, cast
@@ -25,6 +25,8 @@ from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.schema import Section
 from testbed.sensors import registry
 
+# Of the arrays in samples of ours, those that have not three numbers.
+OURS: Mapping[str, tuple[int, ...]] = {"q_ib": (4,), "wind_n": (2,), "flow_b": (2,), "rotation_b": (2,)}
 AID = ("sensor", "parts", "states", "blocks", "measure")  # what an aid has (`nav.aids.base.Aid`)
 
 
@@ -64,6 +66,7 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
     if _is_ours(type(found)):
         return found
     if any(map(_is_ours, type(found).__mro__)):
+        _require_names(f"{_called(name, section)}: aid", found.parts)
         return _as_made(found, getattr(section, "kind", ""))
     return AidGuard(name, f"{_called(name, section)}: aid", found)
 
@@ -110,6 +113,15 @@ def _guarding(kind: Any, of: str) -> type:
     return Guarded
 
 
+def _require_names(called: str, parts: Sequence[tuple[str, int]]) -> None:
+    """Raise UserError where groups of the record can't be called as parts are."""
+    names = [name for name, _ in parts]
+    for name in names:
+        if not plugins.can_be_name(name) or name in plugins.DIMENSIONS or names.count(name) > 1:
+            told = "a name without a slash or control characters, no dimension of the record, another for each"
+            raise UserError(f"{called}: parts has {shown(name)}: give {told}")
+
+
 class AidGuard:
     """An aid of the user's. Of what `measure` gives only measurements come through (`nav.aids.base.Aid`).
 
@@ -124,11 +136,7 @@ class AidGuard:
         except (TypeError, ValueError):
             given = f"parts = {shown(str(own.parts))} and states = {shown(str(own.states))}"
             raise UserError(f"{called}: {given}: give pairs of a name and its axes, and names") from None
-        names = [name for name, _ in self.parts]
-        for name in names:
-            if not plugins.can_be_name(name) or names.count(name) > 1:
-                told = "a name without a slash or control characters, another for each"
-                raise UserError(f"{called}: parts has {shown(name)}: give {told}")
+        _require_names(called, self.parts)
 
     def blocks(self) -> list[Block]:
         """Its error states."""
@@ -228,12 +236,12 @@ class Guard:
 
     def _overwritten(self, samples: Sequence[Any]) -> str:
         """That an array is in several samples, and has changed: they all have what was written last."""
-        found = [(name, value) for sample in samples for name, value in _arrays(sample).items()]
-        times, shared = Counter(id(value) for _, value in found), {}
-        for name, value in found:
-            if times[id(value)] > 1:
-                shared[id(value)] = before = self._shared.get(id(value), (value, value.copy()))
-                if not np.array_equal(before[1], value, equal_nan=value.dtype.kind == "f"):
+        found = [{_place(value): (name, value) for name, value in _arrays(sample).items()} for sample in samples]
+        times, shared = Counter(place for one in found for place in one), {}
+        for place, (name, value) in [pair for one in found for pair in one.items()]:
+            if times[place] > 1:
+                shared[place] = before = self._shared.get(place, (value, value.copy()))
+                if not np.array_equal(np.asarray(before[1], float), np.asarray(value, float), equal_nan=True):
                     return f"one array as {name} of several samples, and overwrote it: give each a copy"
         self._shared = shared
         return ""
@@ -276,17 +284,23 @@ class Guard:
                 shape = None
             if shape is None or value is None:
                 return f"a sample whose {name} is {shown(value)}: it must be a number or a list of them"
-            if ours and shape != (() if of != "Array" else (4,) if name == "q_ib" else (3,)):
-                return f"a {kind.__name__} whose {name} has shape {shape}"
+            wanted = OURS.get(name, (3,)) if of == "Array" else ()
+            if ours and shape != wanted:
+                return f"a {kind.__name__} whose {name} has shape {shape}, not {wanted}"
             if len(shape) > 1 or self._shapes.setdefault(name, shape) != shape:
                 return f"a sample whose {name} has shape {shape}: it must be a number, or as many in every sample"
         return ""
 
 
+def _place(value: Any) -> int:
+    """Where the numbers of an array are kept, or which list they are in."""
+    return int(value.__array_interface__["data"][0]) if isinstance(value, np.ndarray) else id(value)
+
+
 def _arrays(sample: Any) -> dict[str, Any]:
-    """The arrays of a sample."""
+    """The arrays and lists of a sample."""
     values = {field.name: getattr(sample, field.name) for field in dataclasses.fields(sample)}
-    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray | list)}
 
 
 def _owned(sample: Any) -> Any:

@@ -264,6 +264,21 @@ def test_a_date_and_a_time_of_day_in_two_columns_are_one_time(tmp_path: Path) ->
     assert (load(tmp_path / "a.csv").numbers["Time"] - midnight).tolist() == [1.0, 2.0]
 
 
+def test_a_blank_date_is_an_unknown_time(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("Date,Time,a\n2024-06-02,00:00:01,1.5\n,,2\n2024-06-02,00:00:02,2.5\n")
+    assert np.isnan(load(tmp_path / "a.csv").numbers["Time"]).tolist() == [False, True, False]
+
+
+def test_a_text_beside_arrays_is_no_matter(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", name="flight 1", t=np.arange(3.0))
+    assert load(tmp_path / "a.npz").numbers["t"].tolist() == [0.0, 1.0, 2.0]
+
+
+def test_a_comma_among_decimal_points_parts_no_numbers(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t;x;sats\n0.0;1.5;5\n0.1;1.5;5\n0.2;1.5;5,7")
+    assert load(tmp_path / "a.csv").numbers["x"].tolist() == [1.5] * 3
+
+
 def test_a_time_of_day_without_a_date_is_text(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("Time,a\n00:00:01,1.5\n00:00:02,2.5\n")
     assert load(tmp_path / "a.csv").others["Time"] == 'holds text, first "00:00:01" in row 1'

@@ -80,6 +80,22 @@ def test_increments_of_steps_that_differ_are_whole(lost: int, tmp_path: Path) ->
     assert any("rows are missing" in note for note in log.notes) == (lost > 0)
 
 
+@pytest.mark.parametrize("vibration", [2.0, 8.0])
+def test_of_a_steady_unit_that_vibrates_all_missing_rows_are_found(vibration: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(51007)
+    t = np.arange(1, 20001) / 100
+    table = {
+        "t": t,
+        "w": np.tile([1e-3, 0, 0], (20000, 1)),
+        "f": rng.normal([0, 0, -0.098], 0.01 * vibration, (20000, 3)),
+    }
+    kept = np.ones(20000, bool)
+    kept[rng.choice(np.arange(100, 19900, 10), 200, replace=False)] = False
+    log = read(tmp_path, {name: one[kept] for name, one in table.items()}, imu={**IMU, "form": "increments"})
+    assert log.imus["imu"].dtheta[:, 0].sum() == pytest.approx(20.0, rel=1e-6)
+    assert any("rows are missing in 200 places" in note for note in log.notes)
+
+
 COARSE = np.round(9500 + 0.2 * np.random.default_rng(1).standard_normal(6000)) * 10
 STEPS = np.repeat(np.random.default_rng(2).standard_normal(3000), np.random.default_rng(3).geometric(0.4, 3000))[:6000]
 
@@ -101,6 +117,13 @@ def test_who_is_held_by_a_slower_clock_is_heard_at_its_own_rate(hz: int, tmp_pat
     table = unit(t) | {"p": np.where((t > 20) & (t < 30), 0.0, np.sin(own))}
     log = read(tmp_path, table, barometer={"time": "t", "pressure": "p"})
     assert len(log.samples["barometer"]) == pytest.approx(50 * hz, abs=3)
+
+
+@pytest.mark.parametrize("steps", [(0.005, 0.04), (0.001, 0.037)])
+def test_who_is_held_is_told_by_rows_where_times_come_anyhow(steps: tuple[float, float], tmp_path: Path) -> None:
+    t = np.cumsum(np.random.default_rng(51006).uniform(*steps, 5000))
+    log = read(tmp_path, unit(t) | {"p": np.repeat(np.arange(1000.0), 5)}, barometer={"time": "t", "pressure": "p"})
+    assert len(log.samples["barometer"]) == 1000
 
 
 @pytest.mark.parametrize("seed", [1, 2])

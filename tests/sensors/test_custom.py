@@ -14,7 +14,7 @@ import pytest
 
 from nav.aids import GnssAid
 from nav.aids.base import Aid
-from nav.samples import MagnetometerSample
+from nav.samples import MagnetometerSample, WindSample
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
@@ -343,6 +343,12 @@ def test_an_array_that_is_written_anew_for_each_sample_is_copied() -> None:
         sensed(list)
 
 
+def test_samples_of_ours_may_have_two_numbers() -> None:
+    wind = WindSample(0.0, 0.0, np.zeros(2), 0.0, 1.0, "radar")
+    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: [wind]))
+    assert guard.sense(TruthBlock.empty(0, 1))[0].wind_n.tolist() == [0.0, 0.0]
+
+
 def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
     array = np.ones(3)
     made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
@@ -370,7 +376,7 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
     ("how", "says"),
     [
         ("parts", 'parts = "3" and states = "()": give pairs of a name and its axes, and names'),
-        ("aid slash", 'parts has "a/b": give a name without a slash or control characters, another for each'),
+        ("aid slash", 'parts has "a/b": give a name without a slash or control characters, no dimension'),
         ("aid twice", 'parts has "radar": give a name without a slash'),
         ("blocks", """blocks gave "['bias']": give a list of nav.error_model.Block"""),
         ("aid raise", f"AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' ({at('no_such')})"),
