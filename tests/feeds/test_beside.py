@@ -82,6 +82,12 @@ def test_seconds_are_those_of_the_log(solution: tuple[Reference, float], own: fl
     assert flown(written(tmp_path, solution[0])).metrics[RMS] == pytest.approx(own, abs=0.1)
 
 
+def test_a_table_without_a_row_that_says_anything_is_told(tmp_path: Path) -> None:
+    (tmp_path / "ppk.csv").write_text("time,lat,lon,h\n1.0,,,\n2.0,,,\n")
+    with pytest.raises(UserError, match=r"columns\.reference: .*ppk\.csv has no row with a time and anything else"):
+        flown(tmp_path / "ppk.csv")
+
+
 def test_a_log_without_the_time_of_day_asks_for_its_own_seconds(
     solution: tuple[Reference, float], tmp_path: Path
 ) -> None:

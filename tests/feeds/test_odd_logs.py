@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -83,6 +84,20 @@ def test_a_receiver_whose_time_says_nothing_of_a_clock_is_not_believed() -> None
     assert pace(t[:100], t[:100]) is None  # too short
     halting = t + np.floor(t / 20) * 20  # it jumps, as when it gets to know leap seconds or the week
     assert pace(t, halting) == 1.0
+
+
+@pytest.mark.parametrize("fixed", [0.3, 0.0])
+def test_what_a_receiver_says_of_the_time_counts_once_it_has_a_fix(fixed: float, tmp_path: Path) -> None:
+    """Before, it may be of some other week; where it never has one, that is all that there is."""
+    messages = circling()
+    unfixed = {k for k, (name, _) in enumerate(messages) if name == "GPS" and k < (1 - fixed) * len(messages)}
+    for k in unfixed:
+        told, instance, _, ms, week, *rest = messages[k][1]
+        messages[k] = ("GPS", (told, instance, 1, ms, week - 60, *rest))
+    week = WEEK if fixed else WEEK - 60
+    begins = dt.datetime(1980, 1, 6, tzinfo=dt.UTC) + dt.timedelta(weeks=week, milliseconds=FIRST_MS)
+    ahead = 16  # of UTC, from July 2012 to June 2015 (IERS bulletin C 43) [s]
+    assert read(messages, tmp_path).utc == pytest.approx(begins.timestamp() - ahead, abs=0.01)
 
 
 def test_the_scenario_of_a_slow_clock_lasts_as_long_as_the_flight(tmp_path: Path) -> None:

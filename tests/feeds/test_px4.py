@@ -12,6 +12,7 @@ from worlds.log_writers import ULOG, ulog
 from nav.samples import GnssSample
 from testbed.feeds import formats
 
+UTC = 1_700_000_000.0  # at 0 of the autopilot's clock [s since 1970]
 RECEIVERS = ("sensor_gps", "vehicle_gps_position")
 
 
@@ -39,3 +40,21 @@ def test_the_heights_of_a_px4_solution_are_those_of_its_fixes(
     for one in log.samples["gnss"]:
         assert isinstance(one, GnssSample)
         assert one.h == pytest.approx(557.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("fixed", [3, 10, 0])
+def test_what_a_receiver_says_of_the_time_counts_once_it_has_a_fix(
+    fixed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, it may be what its clock was set to; where it never has one, that is all that there is."""
+    fields, layout = ULOG["vehicle_gps_position"]
+    monkeypatch.setitem(ULOG, "vehicle_gps_position", (f"{fields}uint64_t time_utc_usec;", f"{layout}Q"))
+    messages: list[tuple[str, tuple[Any, ...]]] = []
+    for k in range(1, 11):
+        t, has_fix = 100_000 * k, k > 10 - fixed
+        utc = t + round(1e6 * (UTC if has_fix else 1e9))
+        messages.append(("vehicle_imu", (t, 0.0, 0.0, 0.0, 0.0, 0.0, -0.98, 100_000, 100_000)))
+        place = 470_000_000, 80_000_000, 510_000, 557_000
+        said = (t, *place, 0.3, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 3 if has_fix else 0, 9, utc)
+        messages.append(("vehicle_gps_position", said))
+    assert formats.read(ulog(messages, tmp_path / "flight.ulg"), {}).utc == pytest.approx(UTC if fixed else 1e9)

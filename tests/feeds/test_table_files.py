@@ -107,6 +107,22 @@ def test_an_index_of_parquet_is_a_column(name: str | None, tmp_path: Path) -> No
     assert load(tmp_path / "a.parquet").numbers[name or "index"].tolist() == [0.5, 1.5]
 
 
+def test_several_indices_of_parquet_are_columns(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    index = pandas.MultiIndex.from_arrays([[7.0, 8.0], [0.5, 1.5]], names=["flight", "time"])
+    pandas.DataFrame({"a": [1.0, 2.0]}, index=index).to_parquet(tmp_path / "a.parquet", engine="pyarrow")
+    assert load(tmp_path / "a.parquet").numbers["time"].tolist() == [0.5, 1.5]
+
+
+def test_an_index_of_parquet_that_is_called_as_a_column_is_left_out(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    path, index = tmp_path / "a.parquet", pandas.MultiIndex.from_arrays([[7.0, 8.0], [0.5, 1.5]], names=["b", "c"])
+    pandas.DataFrame({"a": [1.0, 2.0]}, index=index).assign(b=[3.0, 4.0]).to_parquet(path, engine="pyarrow")
+    assert load(path).numbers["b"].tolist() == [3.0, 4.0]
+
+
 @pytest.mark.parametrize("words", ["Dear diary, we flew", "we flew\nand landed", "1 fish 2 fish\n3 fish"])
 def test_prose_is_no_table(words: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(words)

@@ -115,6 +115,7 @@ class HeightAid:
         self.how = how
         named = {"parts": 3, "aid slash": (("a/b", 1),), "aid twice": (("radar", 1), ("radar", 1))}
         named["aid ours"] = (("gnss_position", 1),)
+        named["aid dimension"] = (("time", 1),)
         self.parts = named.get(how, self.parts)
 
     def blocks(self):
@@ -145,6 +146,10 @@ class HeightAid:
 # made of one of ours: what it measures is wrong by 20, unless it is told otherwise
 class HalfAid(BarometerAid):
     how = ""
+
+    @property
+    def parts(self):
+        return (("a/b", 1),) if type(self).how == "made slash" else super().parts
 
     def measure(self, part, sample, at):
         found = super().measure(part, sample, at)
@@ -322,14 +327,14 @@ def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, sa
     assert re.match(rf"sensor radar: \./radar\.py:Radar:? {re.escape(says)}", str(told.value)), told.value
 
 
-def sensed(given: Any) -> list[list[float]]:
+def sensed(given: Any, seen_as: Any = lambda array: array) -> list[list[float]]:
     """The fields of three blocks of a sensor that writes into one array, of samples as ``given`` by a list or so."""
     array = np.zeros(3)
 
     def samples() -> Any:
         for k in range(3):
             array[:] += 1
-            yield MagnetometerSample(0.1 * k, 0.1 * k, array, "radar")
+            yield MagnetometerSample(0.1 * k, 0.1 * k, seen_as(array), "radar")
 
     guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: given(samples())))
     return [one.field_b.tolist() for _ in range(3) for one in guard.sense(TruthBlock.empty(0, 1))]
@@ -341,6 +346,8 @@ def test_an_array_that_is_written_anew_for_each_sample_is_copied() -> None:
     assert sensed(lambda samples: [next(samples)]) == [[k] * 3 for k in range(1, 4)]
     with pytest.raises(UserError, match="gave one array as field_b of several samples, and overwrote it: give each"):
         sensed(list)
+    with pytest.raises(UserError, match="overwrote it: give each a copy"):
+        sensed(list, lambda array: array[:])  # another view each time, of the same numbers
 
 
 def test_samples_of_ours_may_have_two_numbers() -> None:
@@ -378,6 +385,7 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
         ("parts", 'parts = "3" and states = "()": give pairs of a name and its axes, and names'),
         ("aid slash", 'parts has "a/b": give a name without a slash or control characters, no dimension'),
         ("aid twice", 'parts has "radar": give a name without a slash'),
+        ("aid dimension", 'parts has "time": give a name without a slash'),
         ("blocks", """blocks gave "['bias']": give a list of nav.error_model.Block"""),
         ("aid raise", f"AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' ({at('no_such')})"),
         ("aid dict", 'measure gave dict where a Measurement or None was expected of "radar" at '),
@@ -451,6 +459,7 @@ def test_what_an_aid_made_of_one_of_ours_measures_is_asked_however_the_run_is_cu
     [
         ("made raise", "AttributeError: 'OperatingPoint' object has no attribute 'no_such_thing' (radar.py, line "),
         ("made nan", 'measure gave nu = [nan] of "barometer" at '),
+        ("made slash", 'parts has "a/b": give a name without a slash or control characters, no dimension'),
     ],
 )
 def test_an_aid_made_of_one_of_ours_is_guarded(scenario: Path, how: str, says: str) -> None:
