@@ -148,19 +148,21 @@ class FusionHorizon:
 
     def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Told) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
-        steps = Steps()
         lag = self.lag_s if self.estimator.listening else 0.0
         queue, accepts, due = self._queue, self.estimator.accepts, 0
         all_times = [*times, float(self._ahead.imu.t[-1])]
+        told: list[tuple[float, float, Sample | None]] = []
         for t, end in zip(all_times, self._ahead.ends_by(all_times), strict=True):
             horizon = end - lag
             while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
                 turn, _, _, sample = queue[due]
                 if accepts(sample):
-                    steps.append(sample.t, turn, sample)
+                    told.append((sample.t, turn, sample))
                 due += 1
-            steps.append(t, horizon)
+            told.append((t, horizon, None))
         del queue[:due]
+        t_of, horizons, samples = zip(*told, strict=True)
+        steps = Steps([*t_of], [*horizons], [*samples])
         steps.t[-1] = math.nan
         while steps.next < len(steps.t):
             taken = estimator.take(steps, self._ahead, reports, estimates)

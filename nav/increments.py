@@ -34,12 +34,6 @@ class Steps:
     next: int = 0
     plan: Any = None
 
-    def append(self, t: float, horizon: float, sample: Sample | None = None) -> None:
-        """One more."""
-        self.t.append(t)
-        self.horizon.append(horizon)
-        self.samples.append(sample)
-
     def last(self, count: int) -> Sample | None:
         """The sample of the last of the next ``count``."""
         return self.samples[self.next + count - 1]

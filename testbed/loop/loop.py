@@ -300,7 +300,8 @@ class _Passage:
         tracked = {name: self._track(name, turn, block.t[wanted[name]].tolist()) for name in self.lanes}
         self._record(turn)
         recorded = range(-self.tick % self.cadence.record, len(block), self.cadence.record)
-        told = {name: _Told.of(tracked[name].estimates, wanted[name]) for name in self.lanes}
+        known = {name for name, aligned in self.watch.aligned.items() if aligned}
+        told = {name: _Told.of(tracked[name].estimates, wanted[name], name in known) for name in self.lanes}
         for name, one in told.items():
             self.recorder.estimates(name, one.of_rows(recorded))
         self._hand_out(turn, tracked, told)
@@ -370,8 +371,8 @@ class _Passage:
             self.watch.sample(self.arrived.popleft())
         self.watch.row(t, leg, self.leg_names)
         for name, one in told.items():
-            if k in one.at:
-                self.watch.estimate(name, *one.aligned[one.at[k]])
+            if one.news and k in one.at:
+                self.watch.estimate(name, *one.news[one.at[k]])
             for report in self.backlog[name].until(t, lambda: self.watch.heeds_fused):
                 self.watch.report(name, report)
 
@@ -432,18 +433,21 @@ class _Passage:
 
 
 class _Told(NamedTuple):
-    """What an estimator told in a turn, and where each row of the turn is among it; time, and whether it is aligned."""
+    """What an estimator told in a turn, and where each row of the turn is among it; of the same, if it is news, time
+    and whether it is aligned.
+    """
 
     estimates: Estimates
     at: dict[int, int]
-    aligned: list[tuple[float, bool]]
+    news: list[tuple[float, bool]]
 
     @classmethod
-    def of(cls, estimates: Estimates, rows: Sequence[int]) -> _Told:
-        """Of the ``rows`` that were wanted."""
+    def of(cls, estimates: Estimates, rows: Sequence[int], known: bool) -> _Told:
+        """Of the ``rows`` that were wanted; that it is aligned may be ``known``."""
         aligned = (estimates.status & Status.ALIGNED).astype(bool)
         at = {row: k for k, row in enumerate(rows)}
-        return cls(estimates, at, list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)))
+        old = known and aligned.all()
+        return cls(estimates, at, [] if old else list(zip(estimates.t.tolist(), aligned.tolist(), strict=True)))
 
     def of_rows(self, rows: Sequence[int]) -> Estimates:
         """Those of some rows."""

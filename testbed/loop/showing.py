@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -75,21 +76,35 @@ class Backlog:
         self._behind = behind
         self._votes: deque[UpdateReport] = deque()  # on redundant units
         self._unread = Waiting()  # on samples
+        self._single = 0  # of these, so many that are not `FusedReports`
+        self._passed = -math.inf  # up to when nobody asked for these, and no other was there
 
     def add(self, votes: Sequence[UpdateReport], reports: Reports) -> None:
         """Some more of them."""
+        self._pass()
         self._votes.extend(votes)
         self._unread.add(reports)
+        self._single += sum(isinstance(piece, UpdateReport) for piece in reports.pieces)
 
     def until(self, t: float, fused: Callable[[], bool]) -> Iterator[UpdateReport]:
         """Remove and give those that are there at ``t``, of `FusedReports` only while these are asked for."""
         while self._votes and not self._votes[0].t > t:
             yield self._votes.popleft()
+        if not self._single and not fused():
+            self._passed = t - self._behind
+            return
+        self._pass()
         for piece, first, last in self._unread.until(t - self._behind):
             if not isinstance(piece, FusedReports):
+                self._single -= 1
                 yield piece
             elif fused():
                 yield from piece[first:last]
+
+    def _pass(self) -> None:
+        """Remove those that nobody asked for."""
+        for _ in self._unread.until(self._passed):
+            pass
 
 
 class Showing:
