@@ -185,9 +185,13 @@ def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:
         return np.array([getattr(one, key) for one in fixes], float)
 
     columns = {key: rows(key) for key in ("lat", "lon", "h")} | {"v_n": rows("v_n").reshape(-1, 3)}
-    sigma = [rows(key).reshape(-1, 3) for key in ("sigma_position_n", "sigma_velocity_n")]
-    position, velocity = (np.nanmedian(s, axis=0) if np.isfinite(s).any() else np.zeros(3) for s in sigma)
-    return Reference(f"{name} of the log, kept back where it is denied", rows("t"), columns, position, velocity)
+    sigma = [usual_sigma(rows(key).reshape(-1, 3)) for key in ("sigma_position_n", "sigma_velocity_n")]
+    return Reference(f"{name} of the log, kept back where it is denied", rows("t"), columns, *sigma)
+
+
+def usual_sigma(told: Array) -> Array:
+    """The median of what is known of each axis (3,), of (N, 3) that were told; 0 where nothing was."""
+    return np.array([np.median(axis[np.isfinite(axis)]) if np.isfinite(axis).any() else 0.0 for axis in told.T])
 
 
 def with_rates(reference: Reference, imu: ImuSamples, C_sb: Array) -> Reference:

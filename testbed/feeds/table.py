@@ -18,7 +18,7 @@ from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
 from testbed.feeds.formats import known
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.reference import doubt, elsewhere_in_height, silence
+from testbed.feeds.reference import doubt, elsewhere_in_height, silence, usual_sigma
 from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, left_out, ordered, spaced, with_holes
@@ -79,7 +79,7 @@ NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
 }
 OPTIONAL: Mapping[str, tuple[str, ...]] = {
     "gnss": ("velocity", "sigma_position", "sigma_velocity", "fix", "satellites", "hdop", "vdop"),
-    "reference": ("lat", "lon", "height", "velocity", "attitude"),
+    "reference": ("lat", "lon", "height", "velocity", "attitude", "sigma_position", "sigma_velocity"),
 }
 
 
@@ -448,10 +448,14 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
 
 
 def known_motion(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:
-    """What the table says of the motion: where there is no whole place, or that of zeros, it is unknown."""
+    """What the table says of the motion: where there is no whole place, or that of zeros, it is unknown.
+
+    It is as good as it says, in the median of its rows.
+    """
     named = {"height": "h", "velocity": "v_n", "attitude": "q_nb"}
     columns = {named.get(key, key): array for key, array in values.items()}
     place = {key: columns.pop(key) for key in ("lat", "lon", "h") if key in columns}
+    sigma = [usual_sigma(columns.pop(key, np.empty((0, 3)))) for key in ("sigma_position", "sigma_velocity")]
     if len(place) == 3:
         lat, lon, h = place.values()
         nowhere = (lat == 0) & (lon == 0)
@@ -465,4 +469,4 @@ def known_motion(t: Array, values: Mapping[str, Array], notes: list[str]) -> Ref
             columns["v_n"] = np.where(nowhere[:, None], np.nan, columns["v_n"])
     elif place:
         notes.append("reference: not all of lat, lon and height are said: nothing is judged by its place")
-    return Reference("reference of the log", t, columns)
+    return Reference("reference of the log", t, columns, *sigma)

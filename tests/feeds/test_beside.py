@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import json
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +81,20 @@ def test_gps_time_is_told_by_an_offset(solution: tuple[Reference, float], own: f
 
 def test_seconds_are_those_of_the_log(solution: tuple[Reference, float], own: float, tmp_path: Path) -> None:
     assert flown(written(tmp_path, solution[0])).metrics[RMS] == pytest.approx(own, abs=0.1)
+
+
+def test_a_reference_is_as_good_as_it_says(solution: tuple[Reference, float], tmp_path: Path) -> None:
+    """Its variance is a part of what errors should be; nothing else changes."""
+    sigma = 3.0
+    table = written(tmp_path, solution[0])
+    lines = table.read_text().splitlines()
+    unknown = [lines[0] + ",sn,se,sd", lines[1] + ",,,"]
+    table.write_text("\n".join([*unknown, *(f"{line},{sigma},{sigma},{2 * sigma}" for line in lines[2:])]))
+    exact, told = flown(table), flown(table, sigma_position=["sn", "se", "sd"])
+    assert json.loads(told.dataset.attrs["reference_sigma_n"]) == [sigma, sigma, 2 * sigma, 0.0, 0.0, 0.0]
+    assert json.loads(exact.dataset.attrs["reference_sigma_n"]) == [0.0] * 6
+    assert told.metrics[RMS] == exact.metrics[RMS]
+    assert told.metrics["ins.position_nees_mean"] < 0.8 * exact.metrics["ins.position_nees_mean"]
 
 
 def test_a_table_without_a_row_that_says_anything_is_told(tmp_path: Path) -> None:
