@@ -36,12 +36,12 @@ def judged_by(log: Log, columns: Mapping[str, Stream]) -> Log:
     if dated and log.utc is None:
         told = f"holds dates, and {log.path} doesn't say what time it was: give seconds of that one's clock"
         raise UserError(f"truth.columns.{name}.time: {told}")
-    zero = log.utc if dated and log.utc is not None else 0.0
-    heard = float(imu.t[0]) + zero, float(imu.t[-1]) + zero
+    zero, pace = (log.utc, 1.0) if dated and log.utc is not None else (0.0, log.pace)
+    heard = float(imu.t[0]) * pace + zero, float(imu.t[-1]) * pace + zero
     t, values = quantities(tables, path, name, "reference", stream, heard, notes)
     if not len(t):
         raise UserError(f"truth.columns.{name}: {path} has no row with a time and anything else")
-    found = known_motion(*newly(name, t - zero, values, log.imus, notes), notes)
+    found = known_motion(*newly(name, (t - zero) / pace, values, log.imus, notes), notes)
     found = replace(found, name=f"the reference in {path.name}")
     said = contradicted(found, log.imus, log.samples)
     return replace(log, solution=found, notes=notes, remark=said, solution_by_utc=dated)

@@ -74,7 +74,8 @@ class Log:
     ``start`` where the log itself says that it begins; ``messages`` the number of each kind that the file holds;
     ``notes`` what was odd with it, a sentence each; ``remark`` what whoever is judged by its solution should know.
     ``utc`` is what its receiver says of the time at 0 of its clock [s since 1970], as late as that tells of a fix;
-    ``solution_by_utc`` that the times of its solution are by that, and as late.
+    ``solution_by_utc`` that the times of its solution are by that, and as late. Its clock ran ``pace`` times as fast as
+    the times here.
     """
 
     path: Path
@@ -91,6 +92,7 @@ class Log:
     remark: str = ""
     utc: float | None = None
     solution_by_utc: bool = False
+    pace: float = 1.0
 
     @property
     def names(self) -> list[str]:
@@ -147,7 +149,8 @@ def at_pace(log: Log, pace: float) -> Log:
     slow = (
         f"its clock runs {abs(pace - 1):.1%} too {'fast' if pace > 1 else 'slow'} by the receiver's: times are mended"
     )
-    return replace(log, imus=imus, samples=samples, solution=solution, t0=log.t0 / pace, notes=[*log.notes, slow])
+    notes = [*log.notes, slow]
+    return replace(log, imus=imus, samples=samples, solution=solution, t0=log.t0 / pace, notes=notes, pace=pace)
 
 
 def require_imu(

@@ -18,11 +18,12 @@ from nav.samples import FixType, GnssSample, MagnetometerSample
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import draft, formats
+from testbed.feeds.beside import judged_by
 from testbed.feeds.log import Log, Reference
 from testbed.feeds.reference import doubt
 from testbed.feeds.stamps import pace
 from testbed.feeds.survey import survey
-from testbed.motion.logged import LogTruth
+from testbed.motion.logged import LogTruth, Stream
 from testbed.score.observability import of_run
 
 SECONDS, IMU_HZ, GNSS_HZ = 60.0, 50, 5
@@ -70,6 +71,17 @@ def test_a_clock_of_a_wrong_pace_is_mended_by_the_receivers_time(tmp_path: Path)
         pairs = zip(right.samples[name], slow.samples[name], strict=True)
         assert max(abs(a.t - b.t) + abs(a.t_arrival - b.t_arrival) for a, b in pairs) < 0.01
     assert abs(slow.t0 - right.t0) < 0.01
+
+
+def test_a_reference_by_a_clock_of_a_wrong_pace_is_mended_with_it(tmp_path: Path) -> None:
+    slow = read(circling(SLOW), tmp_path)
+    rows = [f"{SLOW * t},47,8,{500 + t}" for t in np.arange(1, SECONDS)]
+    (tmp_path / "ppk.csv").write_text("\n".join(["t,lat,lon,h", *rows]))
+    place = {"lat": {"column": "lat", "unit": "deg"}, "lon": {"column": "lon", "unit": "deg"}, "height": "h"}
+    stream = Stream.model_validate({"file": str(tmp_path / "ppk.csv"), "time": "t", **place})
+    found = judged_by(slow, {"reference": stream}).solution
+    assert found is not None
+    assert np.allclose(found.t, found.columns["h"] - 500, atol=1e-4)
 
 
 @pytest.mark.parametrize("drift", [1e-4, -3e-3])
