@@ -26,7 +26,8 @@ from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
 PARQUET = b"PAR1"
-DATE = re.compile(r"\s*\d{4}-\d\d-\d\d[T ]\d\d:\d\d")  # as ISO 8601 has it, with a time of day
+# As ISO 8601 has it, with a time of day; RTKLIB has slashes for its dashes.
+DATE = re.compile(r"\s*\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d")
 DAY, CLOCK = re.compile(r"\d{4}[-/]\d\d[-/]\d\d"), re.compile(r"\d\d:\d\d:\d\d(\.\d+)?")  # in columns of their own
 LONGEST_SHOWN = 20  # of what is no number
 
@@ -256,12 +257,16 @@ def _seconds(array: Any) -> Any:
     """Dates and times of day, which are UTC where they don't say, as seconds since 1970; any other column as it is."""
     if array.ndim != 1:
         return array
-    if not (array.dtype.kind == "M" or DATE.match(_first_text(array))):
+    dated = DATE.match(_first_text(array))
+    if not (array.dtype.kind == "M" or dated):
         return array
     import pandas
 
+    said = pandas.Series(array)
+    if dated and dated[1] == "/":
+        said = said.str.replace("/", "-")
     try:
-        times = pandas.to_datetime(pandas.Series(array), format="ISO8601", utc=True)
+        times = pandas.to_datetime(said, format="ISO8601", utc=True)
     except ValueError:
         return array
     since = times - pandas.Timestamp(0, tz="UTC")

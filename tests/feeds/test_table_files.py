@@ -248,6 +248,12 @@ def test_dates_are_times(tmp_path: Path) -> None:
         )
 
 
+def test_a_date_may_have_slashes(tmp_path: Path) -> None:
+    (tmp_path / "a.pos").write_text("t,a\n2024/06/01 12:00:00.250,1.5\n2024/06/01 12:00:01.250,1.5\n")
+    noon = dt.datetime(2024, 6, 1, 12, tzinfo=dt.UTC).timestamp()
+    assert load(tmp_path / "a.pos").numbers["t"].tolist() == [noon + 0.25, noon + 1.25]
+
+
 def test_a_log_whose_times_are_dates_has_a_date(tmp_path: Path) -> None:
     """That of its first row, in UTC, which the magnetic field of a drafted scenario needs; of numbers none is known."""
     start = dt.datetime(2024, 6, 1, 23, 30, tzinfo=dt.timezone(dt.timedelta(hours=-2)))
