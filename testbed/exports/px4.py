@@ -27,6 +27,7 @@ from nav.samples import Array, Status
 from testbed.exports.stream import START_US, Rows, Stamps, stamps
 from testbed.exports.ulog import Topic, encode, rows
 from testbed.exports.view import Columns, View, carried, fixed, only, placed, turned
+from testbed.feeds.px4 import SPHERE_M
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import FLYING_MPS
 from testbed.score.accuracy import euler
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 NEVER = 32767  # in ekf2_timestamps, of what is not new [0.1 ms]
 STEP_US = 100  # of ekf2_timestamps
 LATEST_STEPS = 32_000  # a sample is not told of after that
-SPHERE_M = 6_371_000.0  # PX4's Earth
 GAUSS, FREEZING = 1e-4, 273.15  # [T], [K]
 IMU_ID, MAGNETOMETER_ID, BAROMETER_ID, NEXT_ID = 1310988, 197388, 6620172, 256  # PX4's simulated devices
 ARMED, MISSION, FIXED_WING = 2, 3, 2

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from nav.earth import isa_pressure, radii, wrap_longitude
+from nav.earth import isa_pressure, wrap_longitude
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError
 from testbed.feeds.doubted import remark
@@ -33,6 +33,7 @@ from testbed.motion.logged import Stream
 
 NEEDED = "vehicle_imu, sensor_combined, or sensor_gyro and sensor_accel"
 GAUSS = 1e-4  # [T]
+SPHERE_M = 6_371_000.0  # PX4's Earth
 NEVER = 2**31 - 1  # a relative time of what is not there
 # Counts that are alike: of them the first way is taken. A way that is calibrated and in body axes is used from a lower
 # share of the most samples on, than one that is raw.
@@ -318,13 +319,24 @@ def _solution(topics: Topics) -> Reference | None:
         )
         lat0, lon0 = (np.radians(there(key, "xy_global")) for key in ("ref_lat", "ref_lon"))
         h0 = there("ref_alt", "z_global")
-        R_M, R_N = radii(lat0)
-        columns["lat"] = lat0 + there("x", "xy_valid") / (R_M + h0)
-        columns["lon"] = wrap_longitude(lon0 + there("y", "xy_valid") / ((R_N + h0) * np.cos(lat0)))
+        columns["lat"], columns["lon"] = placed(there("x", "xy_valid"), there("y", "xy_valid"), lat0, lon0)
         columns["h"] = h0 - there("z", "z_valid") + _geoid(topics)
         somewhere = is_flown(columns["lat"], columns["h"])
         columns |= {name: np.where(somewhere, columns[name], np.nan) for name in ("lat", "lon", "h")}
     return Reference("the autopilot's own solution (EKF)", t, columns)
+
+
+def placed(north: Array, east: Array, lat0: Array, lon0: Array) -> tuple[Array, Array]:
+    """Latitudes and longitudes (N,) [rad] of PX4's local positions [m], from the origins (N,) [rad] that go with them.
+
+    PX4's projection is azimuthal equidistant, on a sphere of `SPHERE_M` and whatever the height: its metres are up to
+    0.5 % off those over the ellipsoid. Snyder, "Map Projections: A Working Manual" (USGS 1395), Eq 20-14, 20-15, 25-15.
+    """
+    c = np.hypot(north, east) / SPHERE_M
+    per_m = np.sinc(c / np.pi) / SPHERE_M  # sin c over the distance
+    lat = np.arcsin(np.clip(np.cos(c) * np.sin(lat0) + per_m * north * np.cos(lat0), -1.0, 1.0))
+    along = np.cos(lat0) * np.cos(c) - np.sin(lat0) * per_m * north
+    return lat, wrap_longitude(lon0 + np.arctan2(per_m * east, along))
 
 
 def _geoid(topics: Topics) -> float:

@@ -11,6 +11,7 @@ from worlds.log_writers import ULOG, ulog
 
 from nav.samples import GnssSample
 from testbed.feeds import formats
+from testbed.feeds.px4 import placed
 
 UTC = 1_700_000_000.0  # at 0 of the autopilot's clock [s since 1970]
 RECEIVERS = ("sensor_gps", "vehicle_gps_position")
@@ -58,3 +59,13 @@ def test_what_a_receiver_says_of_the_time_counts_once_it_has_a_fix(
         said = (t, *place, 0.3, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 3 if has_fix else 0, 9, utc)
         messages.append(("vehicle_gps_position", said))
     assert formats.read(ulog(messages, tmp_path / "flight.ulg"), {}).utc == pytest.approx(UTC if fixed else 1e9)
+
+
+def test_local_positions_are_on_px4s_sphere() -> None:
+    """They were read as metres over the ellipsoid: 0.3 % of the way east, 30 m after 10 km."""
+    north, east = np.array([0.0, 11119.49, 4.840]), np.array([0.0, 0.0, 7583.47])  # a tenth of a degree each, by hand
+    lat, lon = placed(north, east, np.full(3, np.radians(47.0)), np.full(3, np.radians(8.0)))
+    np.testing.assert_allclose(np.degrees(lat), [47.0, 47.1, 47.0], atol=1e-7)
+    np.testing.assert_allclose(np.degrees(lon), [8.0, 8.0, 8.1], atol=1e-7)
+    far = placed(np.array([0.0]), np.array([2.0e4]), np.array([0.8]), np.array([np.pi - 1e-6]))
+    assert -np.pi < far[1][0] < -3.13  # over the date line

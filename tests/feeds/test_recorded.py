@@ -190,10 +190,11 @@ def test_a_flight_written_in_another_format_gives_the_same_within_its_resolution
     for key, most in near.items():
         before, after = (column(one.dataset, f"estimators/ins/{key}") for one in (first, again))
         np.testing.assert_allclose(after, before, rtol=0, atol=most, err_msg=key)
-    true, known = (column(one.dataset, "truth/lat") for one in (first, again))
-    judged = np.isfinite(known)
-    assert judged.mean() > 0.95
-    assert np.abs(known - true)[judged].max() < (1e-6 if name == "csv" else 1e-8)  # GNSS, or the solution
+    for key in ("truth/lat", "truth/lon"):
+        true, known = (column(one.dataset, key) for one in (first, again))
+        judged = np.isfinite(known)
+        assert judged.mean() > 0.95
+        assert np.abs(known - true)[judged].max() < (1e-6 if name == "csv" else 1e-8)  # GNSS, or the solution
 
 
 @pytest.mark.ci

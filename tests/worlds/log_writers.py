@@ -159,11 +159,13 @@ def ulog_rows(dataset: Any) -> list[tuple[str, tuple[Any, ...]]]:
 
 
 def _moved(first: Mapping[str, Any], r: Mapping[str, Any]) -> tuple[float, float]:
-    from nav.earth import radii
-
-    R_M, R_N = radii(first["lat"])
-    h = first["h"]
-    return (r["lat"] - first["lat"]) * (R_M + h), (r["lon"] - first["lon"]) * (R_N + h) * math.cos(first["lat"])
+    """North and east as PX4 has them: distance and bearing of the great circle, on a sphere of 6371 km (haversines)."""
+    lat0, lat, dlon = first["lat"], r["lat"], r["lon"] - first["lon"]
+    half = math.sin((lat - lat0) / 2) ** 2 + math.cos(lat0) * math.cos(lat) * math.sin(dlon / 2) ** 2
+    distance = 2 * 6_371_000.0 * math.asin(math.sqrt(half))
+    away = math.cos(lat0) * math.sin(lat) - math.sin(lat0) * math.cos(lat) * math.cos(dlon)
+    bearing = math.atan2(math.sin(dlon) * math.cos(lat), away)
+    return distance * math.cos(bearing), distance * math.sin(bearing)
 
 
 def ulog(messages: Sequence[tuple[str, Sequence[Any]]], path: Path) -> Path:
