@@ -146,8 +146,6 @@ def check(
     from testbed.many import check as checks
     from testbed.many import progress
 
-    if golden is not None and not golden.is_dir() and not update:
-        raise UserError(f"--golden {golden}: no such folder: make it with --update")
     if junit is not None and not junit.parent.is_dir():
         raise UserError(f"--junit {junit}: there is no folder {junit.parent}: make it first")
     if junit is not None and junit.is_dir():
@@ -155,6 +153,8 @@ def check(
     folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
     if folder is None and update:
         raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")
+    if folder is not None and update:
+        checks.make(folder)
     todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
     with (
         output_folder(RUNS / "check"),
@@ -226,7 +226,6 @@ def campaign(
     plan = campaigns.Plan(scenario, runs, folder, parse_vary(vary or []), overrides or (), draw)
     if save:
         expected.require_shipped(plan)
-    require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
     with (
         output_folder(folder),
         held(folder),

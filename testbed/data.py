@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from testbed.errors import UserError
@@ -48,11 +49,23 @@ def make_project(folder: Path) -> list[Path]:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Write a file so that it is there whole or not at all. Raises UserError when it can't be written."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    """Write a file so that it is there whole or not at all; a link stays one, to what is written.
+
+    Raises UserError when it can't be written.
+    """
+    part = None
     try:
+        target = path.resolve()
+        if target.is_dir():
+            raise UserError(f"{path}: is a folder: give the name of a file")
+        if target.exists() and not target.is_file():  # a device, or a pipe, which nothing can be put in the place of
+            target.write_bytes(content)
+            return
+        part = target.with_name(f".{target.name}.{os.getpid()}.part")
         part.write_bytes(content)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UserError(f"{path}: can't be written: {error.strerror}") from None
+        part.replace(target)
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, a name that can be none
+        if part is not None:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+        raise UserError(f"{path}: can't be written: {getattr(error, 'strerror', None) or error}") from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -16,6 +16,9 @@ from testbed.data import write_file
 from testbed.errors import UserError
 
 RECORD, METRICS, REPORT = "run.nc", "metrics.json", "report.html"
+CAMPAIGN, DENIED, PAPERS = "campaign.json", "denied.json", "papers.json"
+# The file by which it is told whose results a folder has.
+WHOSE = {RECORD: "a run", CAMPAIGN: "a campaign", DENIED: "`testbed denied`", PAPERS: "`testbed papers`"}
 MANIFEST = "testbed_manifest.json"  # {"files": [names within the folder]}
 
 
@@ -30,12 +33,15 @@ def write_result(path: Path, content: bytes, force: bool = False) -> None:
     write_file(path, content)
 
 
-def require_own(folder: Path, names: Iterable[str], force: bool = False) -> None:
+def require_own(folder: Path, names: Collection[str], force: bool = False) -> None:
     """See that files of these names in ``folder`` are absent or listed in its manifest; with ``force``, list them.
 
-    Raises UserError that names the others.
+    Raises UserError that names the others; and, of names that tell whose results they are, when those of another
+    command are there, which has them listed: they would be mixed, or lost.
     """
     listed = _listed(folder)
+    if not WHOSE.keys().isdisjoint(names):
+        require_none_but(folder, names)
     foreign = [name for name in names if name not in listed and (folder / name).exists()]
     if foreign and force:
         enter(folder, foreign)
@@ -44,6 +50,13 @@ def require_own(folder: Path, names: Iterable[str], force: bool = False) -> None
             f"{folder}: there is {', '.join(foreign)} already, not made by an earlier command: move it away or choose"
             " another folder (run, report and export take --force to replace it)"
         )
+
+
+def require_none_but(folder: Path, names: Iterable[str] = ()) -> None:
+    """Raise UserError when the results of a command are in a folder, unless the file that tells it is of ``names``."""
+    others = [WHOSE[name] for name in sorted((_listed(folder) & WHOSE.keys()).difference(names))]
+    if others:
+        raise UserError(f"{folder}: has the results of {' and '.join(others)}: choose another folder")
 
 
 def enter(folder: Path, names: Iterable[str]) -> None:
@@ -103,8 +116,9 @@ def held(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{folder}: can't be written: {error.strerror}: choose another place with --out") from None
+    except (OSError, ValueError) as error:  # ValueError: a name that can be none
+        why = getattr(error, "strerror", None) or error
+        raise UserError(f"{folder}: can't be written: {why}: choose another place with --out") from None
     lock = _lock(folder)
     try:
         yield

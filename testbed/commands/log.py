@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -45,8 +46,8 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         if not isinstance(loaded.truth, LogTruth):
             raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
         truth, date = loaded.truth, loaded.date if "date" in loaded.model_fields_set else None
-    if scenario is not None and scenario.exists() and not force:
-        raise UserError(f"{scenario}: is there already: choose another name, or replace it with --force")
+    if scenario is not None:
+        _require_free(scenario, force)
     place = file if truth is None else Path(truth.file)
     if truth is None and formats.known(place).module == "table":
         from testbed.feeds.table import load
@@ -72,3 +73,17 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         print(printable(f"scenario: {scenario}"))
         if (truth is None or truth.start is None) and not draft.is_placed(found.log):
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")
+
+
+def _require_free(scenario: Path, force: bool) -> None:
+    """Raise UserError where what is there may not be replaced: with ``force`` a scenario may be, and no log."""
+    if scenario.is_dir():
+        raise UserError(f"{scenario}: is a folder: give the name of a file")
+    if not scenario.exists():
+        return
+    if not force:
+        raise UserError(f"{scenario}: is there already: choose another name, or replace it with --force")
+    try:
+        tomllib.loads(scenario.read_text("utf-8"))
+    except (OSError, ValueError):
+        raise UserError(f"{scenario}: is no scenario: choose another name") from None

@@ -27,7 +27,7 @@ def content(tree: xarray.DataTree) -> bytes:
     """The file of a record."""
     view = View(tree)
     found = tracks(view)
-    span = f"{utc(view, 0.0)}/{utc(view, max(float(one.t[-1]) for one in found))}"
+    span = f"{utc(view, 0.0)}/{utc(view, max((float(one.t[-1]) for one in found), default=0.0))}"
     clock = {"interval": span, "currentTime": utc(view, 0.0), "multiplier": 10}
     packets: list[dict[str, Any]] = [{"id": "document", "name": view.title, "version": "1.0", "clock": clock}]
     for k, track in enumerate(found):

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING
 from testbed.data import write_file
 from testbed.errors import UserError, unknown
 from testbed.record.reader import load
-from testbed.results import MANIFEST, enter, held, require_own, start_anew, write_result
+from testbed.results import (
+    MANIFEST,
+    METRICS,
+    REPORT,
+    WHOSE,
+    enter,
+    held,
+    require_none_but,
+    require_own,
+    start_anew,
+    write_result,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -126,6 +137,8 @@ def write_one(path: Path, content: bytes, force: bool) -> None:
     """Write one file whole, or not at all. Raises UserError when it can't be, or is somebody else's."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder: give the name of a file")
+    if path.name in (*WHOSE, METRICS, REPORT, MANIFEST):
+        raise UserError(f"{path}: is what a result of another command is called: give another name with --out")
     with held(path.parent):
         require_own(path.parent, [path.name], force)
         if (path.parent / MANIFEST).exists():  # beside the record, or a folder of results
@@ -135,6 +148,7 @@ def write_one(path: Path, content: bytes, force: bool) -> None:
 
 def _write_many(folder: Path, contents: dict[str, bytes], force: bool) -> None:
     with held(folder):
+        require_none_but(folder)
         require_own(folder, contents, force)
         if (folder.parent / MANIFEST).exists():  # beside the record: the next run takes it away
             enter(folder.parent, [folder.name])

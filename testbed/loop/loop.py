@@ -112,6 +112,12 @@ def run(
     """
     if not isinstance(scenario, Scenario):
         raise UserError(f"run: give a Scenario, such as Scenario.load({str(scenario)!r})")
+    if not isinstance(out, str | Path | None):
+        raise UserError(f"run: out: give a folder, not {type(out).__name__}")
+    if not all(callable(getattr(link, "publish", None)) for link in links):
+        raise UserError("run: links: give publishers, such as testbed.mavlink.MavlinkPublisher(addresses, scenario)")
+    if progress is not None and not callable(progress):
+        raise UserError(f"run: progress: give a function that is told how far it is, not {type(progress).__name__}")
     with ExitStack() as ending:
         for link in links:
             ending.callback(link.close)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from numbers import Real
 
 from testbed.errors import UserError
 
@@ -31,7 +32,8 @@ class Pacer:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         """Start at the first `wait`. Raises UserError unless ``factor`` is positive and finite."""
-        if not (math.isfinite(factor) and factor > 0):
+        given: object = factor
+        if not (isinstance(given, Real) and math.isfinite(factor) and factor > 0):
             raise UserError(f"--realtime {factor}: the speed must be above 0; 1 is the speed of the wall clock")
         self.factor = factor
         self._clock = clock

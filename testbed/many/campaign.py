@@ -38,6 +38,7 @@ from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
+from testbed.results import require_own
 from testbed.scenario import Scenario
 from testbed.score import accuracy, metrics
 
@@ -249,10 +250,10 @@ def campaign(
     A run that fails is in ``failures`` and stops no other. Raises UserError when anything given is wrong, when ``out``
     can't be written or holds another campaign, or when the scheduler can't be reached.
     """
-    given.require_path("scenario", scenario, "the file or the name of a scenario")
-    if out is not None:
-        given.require_path("out", out, "a folder")
-    runs, draw, workers = given.whole("runs", runs), given.whole("draw", draw), given.crew(workers)
+    given.require_path("campaign: scenario", scenario, "the file or the name of a scenario")
+    given.require_path("campaign: out", "" if out is None else out, "a folder")
+    runs, draw = given.whole("campaign: runs", runs), given.whole("campaign: draw", draw)
+    workers = given.crew("campaign: workers", workers)
     varied, overrides = given.varied(vary), given.overrides(overrides)
     folder = usual_folder(scenario, draw) if out is None else Path(out)
     from rich.console import Console
@@ -281,6 +282,7 @@ def fly(
     remarks = seeds.remarks([one.scenario for one in combinations], plan.runs, plan.draw)
     total = sum(len(plan.seeds(one.scenario)) for one in combinations)
     folder = plan.out.absolute()
+    require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
     mine = own([one.scenario for one in combinations])
     claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan, mine))
     stored = _load_all(folder, combinations, plan)
@@ -313,8 +315,7 @@ def _combinations(plan: Plan) -> list[Combination]:
     for key, listed in plan.vary.items():
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
-        if not listed or len(set(listed)) < len(listed):
-            raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
+        given.require_once(key, listed)
     made = []
     for values in itertools.product(*plan.vary.values()):
         chosen = dict(zip(plan.vary, values, strict=True))

@@ -28,7 +28,7 @@ from testbed.data import data_dir, write_file
 from testbed.errors import UserError
 from testbed.feeds.closed import NEVER_CLOSED
 from testbed.loop import loop
-from testbed.many import pool, progress
+from testbed.many import given, pool, progress
 from testbed.report import page as report
 from testbed.results import require_own, start_anew
 from testbed.scenario import Bounds, Scenario
@@ -88,7 +88,8 @@ class Task:
 class Outcome:
     """What became of a scenario; wall time [s].
 
-    ``failure`` says why there is nothing, no whole flight or an estimator less to judge.
+    ``failure`` says why there is nothing, no whole flight or an estimator less to judge. Record and report of one that
+    failed are ``kept`` in the folder of its task, if they can be.
     """
 
     task: Task
@@ -96,6 +97,7 @@ class Outcome:
     metrics: Mapping[str, float] = field(default_factory=dict)
     failure: str = ""
     wall_s: float = 0.0
+    kept: bool = False
 
     @property
     def name(self) -> str:
@@ -116,7 +118,7 @@ class Outcome:
         if not self.failure and not any(row.golden for row in self.rows):
             parts.append("no golden metrics to compare with")
         verdict = "FAILED" if self.failed else "passed"
-        kept = f"; kept in {self.task.folder}" if self.failed and self.task.folder.exists() else ""
+        kept = f"; kept in {self.task.folder}" if self.kept else ""
         return f"{self.name}: {verdict} in {self.wall_s:.0f} s: {'; '.join(parts)}{kept}"
 
 
@@ -148,9 +150,15 @@ def check(
     """
     from rich.console import Console
 
-    given = tasks([str(one) for one in scenarios], Path(out), None if golden is None else Path(golden))
+    for one in scenarios:
+        given.require_path("check: scenarios", one, "the file or the name of each")
+    for what, folder in (("golden", golden), ("out", out)):
+        if folder is not None or what == "out":
+            given.require_path(f"check: {what}", folder, "a folder")
+    todo = tasks([str(one) for one in scenarios], Path(out), None if golden is None else Path(golden))
+    count = None if workers is None else given.whole("check: workers", workers)
     with progress.shown(Console(stderr=True), "check") as tell:
-        return Checked(fly_all(given, tell, workers))
+        return Checked(fly_all(todo, tell, count))
 
 
 def shipped() -> list[str]:
@@ -164,14 +172,18 @@ def tasks(names: Sequence[str], out: Path, golden: Path | None, update: bool = F
     To ``update`` golden metrics is to fly without. Raises UserError when a scenario or a golden file is wrong, when
     there are two of one name, or nothing to check.
     """
+    if not names:
+        raise UserError("check: there is nothing to check: name a scenario")
+    if golden is not None and not update and not golden.is_dir():
+        raise UserError(f"--golden {golden}: no such folder: make it with --update")
     made: dict[str, Task] = {}
-    for given in names:
-        scenario, name = Scenario.load(given), Path(given).stem
+    for one in names:
+        scenario, name = Scenario.load(one), Path(one).stem
         if name in made:
-            raise UserError(f"{given}: there is another scenario of that name among these: check one at a time")
+            raise UserError(f"{one}: there is another scenario of that name among these: check one at a time")
         known = read_golden(golden / f"{name}.json") if golden is not None else None
         if not scenario.expect and known is None and not update:
-            raise UserError(f"{given}: has no [expect] and no golden metrics, so there is nothing to check: add some")
+            raise UserError(f"{one}: has no [expect] and no golden metrics, so there is nothing to check: add some")
         made[name] = Task(name, scenario, out / name, None if update else known)
     return list(made.values())
 
@@ -197,7 +209,7 @@ def update(outcomes: Sequence[Outcome], folder: Path) -> list[Outcome]:
     A value that is the same within its tolerance stays: the difference between two versions of a file is what somebody
     should look at, and small steps in one direction add up until they are seen.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make(folder)
     return [outcome if outcome.failed else _update(outcome, folder / f"{outcome.name}.json") for outcome in outcomes]
 
 
@@ -299,16 +311,16 @@ def clear(folder: Path) -> None:
 # --- all of them
 
 
-def fly_all(given: Sequence[Task], tell: Tell | None = None, workers: int | None = None) -> list[Outcome]:
-    """Fly all tasks, as many at a time as there are cores, or ``workers``; their outcomes in the order given.
+def fly_all(todo: Sequence[Task], tell: Tell | None = None, workers: int | None = None) -> list[Outcome]:
+    """Fly all tasks, as many at a time as there are cores, or ``workers``; their outcomes in the order of these.
 
     They are flown in a folder beside theirs that goes at the end, whatever ends it: only what failed comes to its own.
     """
-    parent = given[0].folder.parent
-    parent.mkdir(parents=True, exist_ok=True)
+    parent = todo[0].folder.parent
+    make(parent)
     # The longest first, so that no core has much to do when the others have finished.
-    longest = sorted(given, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator)))
-    total_s = sum(task.scenario.duration_s for task in given)
+    longest = sorted(todo, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator)))
+    total_s = sum(task.scenario.duration_s for task in todo)
     done: dict[str, Outcome] = {}
 
     def say(now: pool.Standing[Task]) -> None:
@@ -316,13 +328,13 @@ def fly_all(given: Sequence[Task], tell: Tell | None = None, workers: int | None
             flown_s = sum(one.task.scenario.duration_s for one in done.values())
             flown_s += sum(share * task.scenario.duration_s for task, share in now.running)
             names = ", ".join(task.name for task, _ in now.running)
-            tell(flown_s / total_s, f"{len(done)} of {len(given)} scenarios  {names}")
+            tell(flown_s / total_s, f"{len(done)} of {len(todo)} scenarios  {names}")
 
     with (
         tempfile.TemporaryDirectory(prefix=".flying_", dir=parent, ignore_cleanup_errors=True) as flying,
-        pool.opened(len(given), workers) as crew,
+        pool.opened(len(todo), workers) as crew,
     ):
-        own = {task.name: task.folder for task in given}
+        own = {task.name: task.folder for task in todo}
         for flown in crew.work(fly, (replace(task, folder=Path(flying, task.name)) for task in longest), say):
             outcome = flown.result or Outcome(flown.task, failure=str(flown.error))
             task = replace(flown.task, folder=own[flown.task.name])
@@ -330,7 +342,7 @@ def fly_all(given: Sequence[Task], tell: Tell | None = None, workers: int | None
             if outcome.failed:
                 outcome = _keep(outcome, flown.task.folder, task.folder)
             done[task.name] = replace(outcome, task=task)
-    return [done[task.name] for task in given]
+    return [done[task.name] for task in todo]
 
 
 def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
@@ -340,12 +352,20 @@ def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
     found = list(flown.iterdir())
     try:
         require_own(folder, [path.name for path in found])
+        make(folder)
     except UserError as error:
-        return replace(outcome, failure="\n".join(filter(None, (outcome.failure, str(error)))))
-    folder.mkdir(parents=True, exist_ok=True)
+        return replace(outcome, failure="\n".join(filter(None, (outcome.failure, f"not kept: {error}"))))
     for path in found:
         path.replace(folder / path.name)
-    return outcome
+    return replace(outcome, kept=True)
+
+
+def make(folder: Path) -> None:
+    """Make a folder for results or golden metrics. Raises UserError when it can't be made."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: a name that can be none
+        raise UserError(f"{folder}: can't be made: {getattr(error, 'strerror', None) or error}") from None
 
 
 # --- telling

@@ -1,4 +1,4 @@
-"""What the caller of `testbed.campaign` gives, looked at before anything is made of it: it may be anything."""
+"""What is given to `testbed.campaign` and `testbed.check`, looked at before anything is made of it: anything may be."""
 
 from __future__ import annotations
 
@@ -14,19 +14,24 @@ from testbed.scenario import keypath
 def require_path(what: str, given: Any, wanted: str) -> None:
     """Raises UserError where something is neither a text nor a path."""
     if not isinstance(given, str | Path):
-        raise UserError(f"campaign: {what}: give {wanted}, not {type(given).__name__}")
+        raise UserError(f"{what}: give {wanted}, not {type(given).__name__}")
 
 
 def whole(what: str, given: Any) -> int:
     """A whole number. Raises UserError where it is none."""
     if not isinstance(given, Integral) or isinstance(given, bool):
-        raise UserError(f"campaign: {what}: give a whole number, not {_told(given)}")
+        raise UserError(f"{what}: give a whole number, not {_told(given)}")
     return int(given)
 
 
-def crew(given: Any) -> int | str | None:
+def crew(what: str, given: Any) -> int | str | None:
     """A number of workers, the address of a scheduler, or none of both. Raises UserError where it is nothing such."""
-    return given if given is None or isinstance(given, str) else whole("workers", given)
+    if given is None or (isinstance(given, str) and not given.isdecimal()):
+        return given
+    count = whole(what, given)
+    if count < 1:
+        raise UserError(f"{what} {count}: give at least 1, or none for one a core")
+    return count
 
 
 def overrides(given: Any) -> Sequence[str]:
@@ -49,6 +54,19 @@ def varied(given: Any) -> dict[str, Sequence[str]]:
         wanted = 'give lists of values by key, such as {"sensors.gnss.latency_s": [0, 0.2]}'
         raise UserError(f"campaign: vary: {wanted}, not {_told(given)}")
     return {_key("vary", key): _listed(key, listed) for key, listed in given.items()}
+
+
+def require_once(key: str, listed: Sequence[str]) -> None:
+    """Raises UserError where there is no value to vary a key by, or one twice: 1 is 1.0."""
+    if not listed or len(set(map(_number, listed))) < len(listed):
+        raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
+
+
+def _number(value: str) -> float | str:
+    try:
+        return float(value)
+    except ValueError:
+        return value
 
 
 def _listed(key: str, given: Any) -> Sequence[str]:

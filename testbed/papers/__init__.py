@@ -18,7 +18,7 @@ from testbed.data import data_dir
 from testbed.errors import UserError
 from testbed.many import pool
 from testbed.papers.draws import Draws
-from testbed.results import write_result
+from testbed.results import PAPERS, write_result
 from testbed.scenario import Scenario
 from testbed.score.claims import Claim, Verdict
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from testbed.many.progress import Tell
 
-RESULTS = "papers.json"
+RESULTS = PAPERS
 RECORDED_DRAW = 710005  # of the table in the documentation, and what is drawn when nobody says
 Records: TypeAlias = Sequence[Mapping[str, Any]]  # claims as `Claim.record` has them
 IDS = ("cheng2020", "cui2022", "jiang2021", "zhou2025", "zhu2020")

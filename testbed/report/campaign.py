@@ -27,7 +27,7 @@ from testbed.report.campaign_figures import figures, nees_bounds, nees_mean
 from testbed.report.campaign_page import contents
 from testbed.report.expected import COLUMNS, Kept, kept
 from testbed.report.page import Shown, png, render, script_of
-from testbed.results import REPORT, write_result
+from testbed.results import CAMPAIGN, REPORT, write_result
 from testbed.score.accuracy import AXES, SETTLING_S
 from testbed.score.claims import HARDLY_ANY, MEDIAN, NEARLY_ALL, student
 from testbed.score.metrics import OUTAGE_MARKS_S
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 UNSCORED = f"Errors over the runs: none is scored, which begins {SETTLING_S:.0f} s after an alignment"
 INTERACTIVE = ("errors", "nees")  # figures that the page has as plots to look around in
-TABLE, SUMMARY = "campaign.csv", "campaign.json"
+TABLE, SUMMARY = "campaign.csv", CAMPAIGN
 
 # The main metrics and how tables call them. All are errors: the worst is the largest, but for `BEST_LARGE`.
 QUANTITIES: Mapping[str, str] = {

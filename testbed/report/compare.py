@@ -11,7 +11,7 @@ from testbed.report.differences import Block, cells, told
 from testbed.report.interactive.contents import events
 from testbed.report.page import render, script_of
 from testbed.report.run import Run
-from testbed.results import REPORT, held, write_result
+from testbed.results import REPORT, held, require_none_but, write_result
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,7 +37,8 @@ def write_comparison(
 ) -> Path:
     """Write ``report.html`` with the plots of these runs, by their names, and the tables of differences.
 
-    Raises UserError when the folder can't be written or, without ``force``, holds a page that no earlier command made.
+    Raises UserError when the folder can't be written, has the results of another command, or, without ``force``, holds
+    a page that no earlier command made.
     """
     several = len(runs) > 1
     shown = [interactive.Shown(name if several else "", run) for name, run in runs.items()]
@@ -55,5 +56,6 @@ def write_comparison(
         "events": [(t, f"{t:.1f} s", how, what) for t, how, what in events(kept[0].run)],
     }
     with held(folder):
+        require_none_but(folder)
         write_result(folder / REPORT, render("compare.html", **values).encode(), force)
     return folder / REPORT

@@ -21,7 +21,7 @@ from nav.samples import Array
 from testbed.report import denied_page, markdown
 from testbed.report.denied_figure import figures
 from testbed.report.page import png
-from testbed.results import REPORT, write_result
+from testbed.results import DENIED, REPORT, write_result
 from testbed.score.claims import MEDIAN, NEARLY_ALL, RMS_OVER_BOUND, SHARE, Claim, Interval, Verdict
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from testbed.denied.benchmark import Result
     from testbed.denied.table import Weather
 
-SUMMARY, DRAWS = "denied.json", "denied.csv"
+SUMMARY, DRAWS = DENIED, "denied.csv"
 ELLIPSE = -2 * math.log(0.05)  # of chi-square with two degrees of freedom, 95 %
 COLUMNS = ("aids", "IMU", "after", "median [m]", "95 % [m]", "in its ellipse", "RMS / bound")
 GOAL_COLUMNS = ("goal", "found, with its 95 % interval", "statistic", "bound", "verdict")

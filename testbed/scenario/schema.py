@@ -13,7 +13,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeAlias
 
@@ -227,6 +227,9 @@ class Scenario(Section):
             overrides = [keypath.override(str(key), value) for key, value in overrides.items()]
         elif isinstance(overrides, str):
             overrides = [overrides]
+        if not isinstance(overrides, Iterable) or not all(isinstance(one, str) for one in overrides):
+            wanted = 'give values by key, such as {"duration_s": 60}, or a list such as ["duration_s=60"]'
+            raise UserError(f"Scenario.load: overrides: {wanted}, not {shown(str(overrides))}")
         return cls._parsed(_read(path), overrides, path, {"options": path.parent})
 
     @classmethod

@@ -42,7 +42,7 @@ def error_series(run: RunResult | xarray.DataTree, estimator: str) -> pandas.Dat
     import xarray
 
     dataset = run if isinstance(run, xarray.DataTree) else getattr(run, "dataset", None)
-    if dataset is None:
+    if not isinstance(dataset, xarray.DataTree):
         told = "give what `testbed.run` gave back, or a record as xarray.open_datatree reads it"
         raise UserError(f"error_series: {shown(str(run))} is no run: {told}")
     known = accuracy.names(dataset)
