@@ -7,6 +7,7 @@ import math
 import os
 import re
 import runpy
+import shutil
 import signal
 import socket
 import subprocess
@@ -16,8 +17,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 from rich.console import Console
+from worlds import synthetic_run
 
 import testbed.__main__ as cli
 from testbed import threads
@@ -228,6 +231,21 @@ def test_user_mistakes(testbed: Testbed, tmp_path: Path, arguments: list[str], s
     assert list(tmp_path.iterdir()) == [], "something was written"
 
 
+def test_a_drafted_scenario_goes_over_a_scenario_and_nothing_else(testbed: Testbed, tmp_path: Path) -> None:
+    """It went over the log that it is of."""
+    log = tmp_path / "mine.bin"
+    shutil.copy(data_dir("scenarios") / "recorded_flight.bin", log)
+    size = log.stat().st_size
+    for target, says in (("mine.bin", "mine.bin: is no scenario"), (".", ".: is a folder: give the name of a file")):
+        ended = testbed("log", "mine.bin", "--scenario", target, "--force")
+        assert (ended.code, says in ended.err) == (2, True)
+    assert log.stat().st_size == size
+    (tmp_path / "mine.toml").write_text("seed = 1\n")
+    assert testbed("log", "mine.bin", "--scenario", "mine.toml").code == 2
+    assert testbed("log", "mine.bin", "--scenario", "mine.toml", "--force").code == 0
+    assert 'source = "log"' in (tmp_path / "mine.toml").read_text()
+
+
 def test_every_mistake_of_a_file_is_a_line(testbed: Testbed, tmp_path: Path) -> None:
     text = (data_dir("scenarios") / "u_turn.toml").read_text("utf-8")
     (tmp_path / "mine.toml").write_text(text.replace("seed = 1", "seed = true").replace("lat_deg = 47", "lat_deg = 91"))
@@ -255,6 +273,15 @@ def test_a_port_in_use_leaves_nothing_behind(testbed: Testbed, tmp_path: Path) -
     assert ended.code == 2
     assert ended.err.startswith(f"testbed: {url}: ")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_record_that_lacks_a_column_is_damaged(testbed: Testbed, tmp_path: Path) -> None:
+    synthetic_run.dataset(100.0, path=tmp_path / "run.nc")
+    with h5py.File(tmp_path / "run.nc", "r+") as file:
+        del file["estimators/ins/covariance"]
+    ended = testbed("report", "run.nc")
+    assert ended.code == 2
+    assert "run.nc: damaged record: estimators/ins/covariance is missing" in ended.err
 
 
 def test_a_damaged_record(testbed: Testbed, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -11,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from testbed import Scenario, run
+from testbed.data import write_file
 from testbed.errors import UserError
-from testbed.results import MANIFEST, enter, held, require_own, start_anew, write_result
+from testbed.results import CAMPAIGN, MANIFEST, RECORD, REPORT, enter, held, require_own, start_anew, write_result
 
 HOLDER = """
 import sys, time
@@ -49,6 +51,37 @@ def test_an_export_goes_with_what_else_was_listed_but_for_foreign_files_in_it(tm
     start_anew(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["kept_csv"]
     assert [path.name for path in (tmp_path / "kept_csv").iterdir()] == ["mine.txt"]
+
+
+def test_results_of_one_command_are_not_replaced_by_anothers(tmp_path: Path) -> None:
+    """A run into a campaign's folder took that away, without a word."""
+    write_result(tmp_path / CAMPAIGN, b"1")
+    write_result(tmp_path / REPORT, b"1")
+    require_own(tmp_path, [CAMPAIGN])
+    for force in (False, True):
+        with pytest.raises(UserError, match="has the results of a campaign: choose another folder"):
+            require_own(tmp_path, [RECORD], force)
+    with pytest.raises(UserError, match="of a campaign"):
+        run(Scenario.load("static_bench", {"duration_s": 1.0}), out=tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {CAMPAIGN, REPORT, MANIFEST}
+
+
+def test_a_file_is_written_through_a_link_and_into_a_device(tmp_path: Path) -> None:
+    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
+    link.symlink_to(target)
+    write_file(link, b"1")
+    assert (link.is_symlink(), target.read_bytes()) == (True, b"1")
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with subprocess.Popen(["cat", pipe], stdout=subprocess.PIPE) as reader:
+        write_file(pipe, b"2")
+        assert reader.communicate(timeout=10)[0] == b"2"
+    assert pipe.is_fifo()
+    link.unlink()
+    link.symlink_to(link)
+    for wrong, says in ((link, "can't be written"), (Path("a\0b"), "can't be written"), (tmp_path, "is a folder")):
+        with pytest.raises(UserError, match=says):
+            write_file(wrong, b"3")
 
 
 def test_foreign_files_are_named_and_left_unless_forced(tmp_path: Path) -> None:

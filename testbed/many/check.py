@@ -283,15 +283,16 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
             rows += against_golden(task.golden, result.metrics)
         outcome = Outcome(task, rows, result.metrics, failure, time.perf_counter() - started)
     except Exception as error:
-        return Outcome(task, failure=_told(error), wall_s=time.perf_counter() - started)
+        wall_s = time.perf_counter() - started
+        return Outcome(task, failure=_told(error), wall_s=wall_s, kept=task.folder.exists())
     if not outcome.failed:
         clear(task.folder)
         return outcome
     try:
         report.write_report(result.dataset, result.metrics, task.folder)
     except Exception as error:
-        return replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
-    return outcome
+        outcome = replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
+    return replace(outcome, kept=True)
 
 
 def _told(error: Exception) -> str:
@@ -347,6 +348,7 @@ def fly_all(todo: Sequence[Task], tell: Tell | None = None, workers: int | None 
 
 def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
     """Bring what is in the folder where it was flown into its own, unless files of somebody else are in the way."""
+    outcome = replace(outcome, kept=False)
     if not flown.exists():
         return outcome
     found = list(flown.iterdir())

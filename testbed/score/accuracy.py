@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from nav import earth
 from nav.samples import Array, Status
+from testbed.errors import UserError
 
 if TYPE_CHECKING:
     import xarray
@@ -82,8 +83,11 @@ def worst_over_3sigma(e: Errors, mask: Mask, key: str) -> dict[str, float]:
 
 
 def column(dataset: xarray.DataTree, path: str) -> npt.NDArray[Any]:
-    """The bare array of one variable, such as ``truth/v_n``."""
-    return np.asarray(cast("xarray.DataArray", dataset[path]).values)
+    """The bare array of one variable, such as ``truth/v_n``. Raises UserError of a record that lacks it."""
+    try:
+        return np.asarray(cast("xarray.DataArray", dataset[path]).values)
+    except KeyError:
+        raise UserError(f"damaged record: {path} is missing") from None
 
 
 def names(dataset: xarray.DataTree) -> list[str]:

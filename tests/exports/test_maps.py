@@ -18,6 +18,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 from worlds import synthetic_run
 
+from testbed import results
 from testbed.errors import UserError
 from testbed.exports import FORMATS, export
 from testbed.exports.track import CONFIDENT, Track, ellipse, outlines
@@ -201,3 +202,26 @@ def test_each_format_says_who_reads_it() -> None:
     assert set(FORMATS) >= {"csv", "mat", "ulg", "bin", "mcap", "kml", "czml", "gpx", "pos", "navego", "psins"}
     assert all(one.holds and one.readers for one in FORMATS.values())
     assert len({one.ending for one in FORMATS.values()}) == len(FORMATS)  # none takes another's place
+
+
+def test_an_export_never_goes_over_results(flown: Path, tmp_path: Path) -> None:
+    """Into a folder of results it took away the record and all beside it."""
+    shutil.copy(flown, tmp_path / "run.nc")
+    results.enter(tmp_path, ["run.nc"])
+    with pytest.raises(UserError, match="has the results of a run: choose another folder"):
+        export(flown, "csv", tmp_path, force=True)
+    for name in ("run.nc", "metrics.json"):
+        with pytest.raises(UserError, match=f"{name}: is what a result of another command is called"):
+            export(flown, "kml", tmp_path / name, force=True)
+    assert {path.name for path in tmp_path.iterdir()} == {"run.nc", results.MANIFEST}
+    assert (tmp_path / "run.nc").read_bytes() == flown.read_bytes()
+
+
+@pytest.mark.parametrize("form", ["kml", "czml", "gpx", "pos"])
+def test_a_record_without_a_place_is_exported(flown: Path, form: str, tmp_path: Path) -> None:
+    """Of a log without positions: one format ended in a traceback."""
+    shutil.copy(flown, tmp_path / "run.nc")
+    with h5py.File(tmp_path / "run.nc", "r+") as file:
+        for group in (file["truth"], *file["estimators"].values()):
+            group["lat"][:] = np.nan
+    assert export(tmp_path / "run.nc", form).exists()

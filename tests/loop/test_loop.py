@@ -433,3 +433,26 @@ def test_late_stamps_and_losses_give_the_same_bits_live_batch_and_as_a_log(
             first = batch.dataset[node.path][name].values
             assert len(variable) >= len(first) - 2
             np.testing.assert_array_equal(variable.values, first[: len(variable)], err_msg=f"{node.path}/{name}")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"out": 3}, "run: out: give a folder, not int"),
+        ({"out": "a\0b"}, "can't be written: "),
+        ({"realtime": "1"}, "the speed must be above 0"),
+        ({"links": ["udpout:127.0.0.1:14550"]}, "run: links: give publishers"),
+        ({"progress": 3}, "run: progress: give a function"),
+    ],
+)
+def test_what_a_caller_gets_wrong_is_told(options: dict[str, Any], says: str) -> None:
+    with pytest.raises(UserError, match=says):
+        run(Scenario.load("static_bench"), **options)
+    with pytest.raises(UserError, match=r"run: give a Scenario, such as Scenario\.load\('u_turn'\)"):
+        run("u_turn", **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("overrides", [3, [("duration_s", 100)], [3]])
+def test_overrides_that_are_none_are_told(overrides: Any) -> None:
+    with pytest.raises(UserError, match=r"Scenario\.load: overrides: give values by key"):
+        Scenario.load("u_turn", overrides)

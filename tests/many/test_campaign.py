@@ -475,8 +475,13 @@ def test_what_is_no_scenario_or_no_number_of_workers_is_told(at_rest: Path, tmp_
         campaign(Scenario.load(at_rest), 1, out=tmp_path / "out")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="workers 0: give at least 1"):
         campaign(at_rest, 1, workers=0, out=tmp_path / "out")
-    with pytest.raises(UserError, match=r"run: give a Scenario, such as Scenario\.load\('u_turn'\)"):
-        run("u_turn")  # type: ignore[arg-type]
+    with pytest.raises(UserError, match='workers: give a whole number, not "2"'):
+        campaign(at_rest, 1, workers="2", out=tmp_path / "out")
+    with pytest.raises(UserError, match=r"--vary truth\.rate_hz: give each value once"):
+        campaign(at_rest, 1, vary={"truth.rate_hz": [50, 50.0]}, out=tmp_path / "out")
+    run(Scenario.load(at_rest), out=tmp_path / "run")
+    with pytest.raises(UserError, match="has the results of a run: choose another folder"):
+        campaign(at_rest, 1, out=tmp_path / "run")
 
 
 @pytest.mark.ci

@@ -183,6 +183,44 @@ def test_nothing_to_check_is_a_mistake(tmp_path: Path) -> None:
     assert check.tasks([str(path)], tmp_path, tmp_path, update=True)
 
 
+def test_what_a_caller_gets_wrong_is_told(tmp_path: Path) -> None:
+    """Some ended in tracebacks, and a folder that is misspelt made every test pass."""
+    path = scenario(tmp_path, "mine")
+    (tmp_path / "file").write_text("")
+    wrong: list[tuple[tuple[Any, ...], dict[str, Any], str]] = [
+        ((), {}, "there is nothing to check: name a scenario"),
+        ((Scenario.load(path),), {}, "check: scenarios: give the file or the name of each, not Scenario"),
+        ((path,), {"golden": tmp_path / "nogolden"}, "nogolden: no such folder: make it with --update"),
+        ((path,), {"golden": tmp_path / "file"}, "file: no such folder"),
+        ((path,), {"golden": 3}, "check: golden: give a folder, not int"),
+        ((path,), {"out": None}, "check: out: give a folder, not NoneType"),
+        ((path,), {"workers": 1.5}, "check: workers: give a whole number"),
+        ((path,), {"out": tmp_path / "file"}, "file: can't be made: File exists"),
+        ((path,), {"out": "a\0b"}, "can't be made"),
+    ]
+    for arguments, options, says in wrong:
+        with pytest.raises(UserError, match=re.escape(says)):
+            check.check(*arguments, **options)
+
+
+def test_what_is_in_the_way_of_a_failure_is_told_and_nothing_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(scenario: Scenario, *, out: Path, **_: Any) -> None:
+        out.mkdir()
+        (out / "run.nc").write_text("")
+        raise UserError("no trim")
+
+    monkeypatch.setattr(loop, "run", fails)
+    (tmp_path / "static_bench").write_text("")
+    (outcome,) = check.fly_all(check.tasks(["static_bench"], tmp_path, None), workers=1)
+    assert "not kept: " in outcome.failure
+    assert "kept in" not in str(outcome)
+    (tmp_path / "static_bench").unlink()
+    (outcome,) = check.fly_all(check.tasks(["static_bench"], tmp_path, None), workers=1)
+    assert f"kept in {tmp_path / 'static_bench'}" in str(outcome)
+
+
 # --- one scenario
 
 
