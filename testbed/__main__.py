@@ -154,7 +154,7 @@ def check(
     if folder is None and update:
         raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")
     if folder is not None and update:
-        checks.make(folder)
+        checks.make_folder(folder)
     todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
     with (
         output_folder(RUNS / "check"),

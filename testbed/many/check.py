@@ -209,7 +209,7 @@ def update(outcomes: Sequence[Outcome], folder: Path) -> list[Outcome]:
     A value that is the same within its tolerance stays: the difference between two versions of a file is what somebody
     should look at, and small steps in one direction add up until they are seen.
     """
-    make(folder)
+    make_folder(folder)
     return [outcome if outcome.failed else _update(outcome, folder / f"{outcome.name}.json") for outcome in outcomes]
 
 
@@ -318,7 +318,7 @@ def fly_all(todo: Sequence[Task], tell: Tell | None = None, workers: int | None 
     They are flown in a folder beside theirs that goes at the end, whatever ends it: only what failed comes to its own.
     """
     parent = todo[0].folder.parent
-    make(parent)
+    make_folder(parent)
     # The longest first, so that no core has much to do when the others have finished.
     longest = sorted(todo, key=lambda task: -task.scenario.duration_s * (1 + len(task.scenario.estimator)))
     total_s = sum(task.scenario.duration_s for task in todo)
@@ -354,7 +354,7 @@ def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
     found = list(flown.iterdir())
     try:
         require_own(folder, [path.name for path in found])
-        make(folder)
+        make_folder(folder)
     except UserError as error:
         return replace(outcome, failure="\n".join(filter(None, (outcome.failure, f"not kept: {error}"))))
     for path in found:
@@ -362,7 +362,7 @@ def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
     return replace(outcome, kept=True)
 
 
-def make(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
     """Make a folder for results or golden metrics. Raises UserError when it can't be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)

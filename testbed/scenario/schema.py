@@ -225,9 +225,10 @@ class Scenario(Section):
         path = _find(path_or_name)
         if isinstance(overrides, Mapping):
             overrides = [keypath.override(str(key), value) for key, value in overrides.items()]
-        elif isinstance(overrides, str):
+        elif isinstance(overrides, str) or not isinstance(overrides, Iterable):
             overrides = [overrides]
-        if not isinstance(overrides, Iterable) or not all(isinstance(one, str) for one in overrides):
+        overrides = [*overrides]
+        if not all(isinstance(one, str) for one in overrides):
             wanted = 'give values by key, such as {"duration_s": 60}, or a list such as ["duration_s=60"]'
             raise UserError(f"Scenario.load: overrides: {wanted}, not {shown(str(overrides))}")
         return cls._parsed(_read(path), overrides, path, {"options": path.parent})

@@ -456,3 +456,7 @@ def test_what_a_caller_gets_wrong_is_told(options: dict[str, Any], says: str) ->
 def test_overrides_that_are_none_are_told(overrides: Any) -> None:
     with pytest.raises(UserError, match=r"Scenario\.load: overrides: give values by key"):
         Scenario.load("u_turn", overrides)
+
+
+def test_overrides_may_be_made_as_they_are_read() -> None:
+    assert Scenario.load("u_turn", (one for one in ["duration_s=3"])).overrides == ("duration_s=3",)  # type: ignore[arg-type]
