@@ -150,6 +150,8 @@ def check(
         raise UserError(f"--junit {junit}: there is no folder {junit.parent}: make it first")
     if junit is not None and junit.is_dir():
         raise UserError(f"--junit {junit}: is a folder: name the file in it")
+    if junit is not None and junit.is_file() and junit.read_bytes()[: len(checks.XML)] not in (b"", checks.XML):
+        raise UserError(f"--junit {junit}: is there already, and is no report: give it another name")
     folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
     if folder is None and update:
         raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")

@@ -231,6 +231,15 @@ def test_user_mistakes(testbed: Testbed, tmp_path: Path, arguments: list[str], s
     assert list(tmp_path.iterdir()) == [], "something was written"
 
 
+def test_a_junit_report_goes_over_a_report_and_nothing_else(testbed: Testbed, tmp_path: Path) -> None:
+    """It went over a scenario."""
+    (tmp_path / "mine.toml").write_text("seed = 1\n")
+    ended = testbed("check", "static_bench", "--junit", "mine.toml")
+    assert ended.code == 2
+    assert "--junit mine.toml: is there already, and is no report: give it another name" in ended.err
+    assert (tmp_path / "mine.toml").read_text() == "seed = 1\n"
+
+
 def test_a_drafted_scenario_goes_over_a_scenario_and_nothing_else(testbed: Testbed, tmp_path: Path) -> None:
     """It went over the log that it is of."""
     log = tmp_path / "mine.bin"

@@ -16,6 +16,7 @@ To the program, fields separated by blanks, SI units and radians, ``nan`` where 
 
 import subprocess
 import weakref
+from contextlib import suppress
 
 import numpy as np
 
@@ -62,7 +63,7 @@ class External:
             t, aligned, *state = map(float, answer.split())
         except ValueError:
             raise RuntimeError(f"the program has answered {answer!r}") from None
-        if not aligned:
+        if aligned != 1:
             return Estimate.of(t)
         lla, v_n, q_nb = (np.array(part) for part in (state[:3], state[3:6], state[6:]))
         return Estimate.of(t, q_nb=q_nb, lla=lla, v_n=v_n, status=Status.ALIGNED)
@@ -70,11 +71,14 @@ class External:
 
 def stop(program):
     """End its input, at which it should end; one that hangs does not outlive the run."""
+    with suppress(BrokenPipeError):
+        program.stdin.close()
+    program.stdout.close()
     try:
-        program.communicate(timeout=5)
+        program.wait(timeout=5)
     except subprocess.TimeoutExpired:
         program.kill()
-        program.communicate()
+        program.wait()
 
 
 def line(*fields):

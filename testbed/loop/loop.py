@@ -145,6 +145,7 @@ def run(
         if realtime is not None and source is None:
             # The first calls load and compile, for which there is no time later.
             _rehearse(scenario, own, Setup(seed, build=build))
+            gc.collect()  # an estimator of the user's lets go of what it holds, such as a port, before it is made again
             if helper is not None:
                 helper.close()
         flown = None

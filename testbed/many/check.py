@@ -394,6 +394,7 @@ def _change(row: Row) -> str:
     return "" if row.now is None or not golden else f"{100 * (row.now / golden - 1):+.1f} %"
 
 
+XML = b"<?xml"  # with which a report begins
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 

@@ -214,7 +214,7 @@ def load(name_or_path: str) -> Envelope:
             todo = f"; rename {other}, as it has the name of its folder" if other else ""
             raise UserError(f"{needed}: is missing: an aircraft's folder has {what} in it{todo}")
     try:
-        return Envelope.model_validate(tomllib.loads(file.read_text("utf-8")), strict=True)
+        return Envelope.model_validate(tomllib.loads(file.read_text("utf-8-sig")), strict=True)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"{file}: can't be read: {error}") from None
     except ValidationError as error:

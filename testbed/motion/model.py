@@ -12,6 +12,7 @@ from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 import jsbsim
 import numpy as np
@@ -141,6 +142,7 @@ class Aircraft:
         """Let JSBSim read the model; one that is not shipped first in another process, as some mistakes abort it."""
         shipped = data_dir("aircraft")
         if self._folder.parent != shipped:
+            _require_silent(self._model)
             _probe(shipped, self._folder)
         if not self.fdm.load_model(self._folder.name):
             raise UserError(f"{self._model}: JSBSim can't read it")
@@ -354,6 +356,17 @@ class Aircraft:
         fdm["ic/vw-mag-fps"] = math.hypot(*wind) / FOOT
         fdm["ic/vw-dir-deg"] = math.degrees(math.atan2(wind[1], wind[0]))
         fdm.run_ic()
+
+
+def _require_silent(model: Path) -> None:
+    """Raise UserError of a model by which JSBSim would open files or ports, which it does as soon as it reads it."""
+    try:
+        found = {part.tag.rpartition("}")[2] for part in ElementTree.parse(model).getroot()}
+    except (OSError, ValueError, ElementTree.ParseError):
+        return  # what is wrong with it JSBSim says
+    if talking := sorted(found & {"output", "input"}):
+        told = f"has <{'> and <'.join(talking)}>, by which JSBSim writes over files or opens ports: take that out"
+        raise UserError(f"{model}: {told}: the testbed records by itself")
 
 
 @functools.cache

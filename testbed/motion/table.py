@@ -218,6 +218,13 @@ class Replay:
         return "replay"
 
 
+def _take_room(file: Path) -> None:
+    """Take the room on the disk that a file is as long as: without any, writing to it as memory ends the process."""
+    if hasattr(os, "posix_fallocate"):
+        with file.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
+
+
 def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
     """Store the first ``ticks`` rows of a motion, one .npy per truth column, for `Replay`.
 
@@ -230,6 +237,8 @@ def save_motion(source: MotionSource, ticks: int, folder: Path) -> None:
             name: open_memmap(part / f"{name}.npy", "w+", float, (ticks, c.width) if c.width > 1 else (ticks,))
             for name, c in COLUMNS.items()
         }
+        for name in columns:
+            _take_room(part / f"{name}.npy")
         rows = 0
         while rows < ticks and len(block := source.advance(min(SAVE_TICKS, ticks - rows))):
             for name, column in columns.items():

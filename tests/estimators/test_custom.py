@@ -1,6 +1,7 @@
 """Anybody's estimator: found, checked, run beside ours, and contained when it fails."""
 
 import json
+import socket
 import sys
 from functools import partial
 from pathlib import Path
@@ -102,6 +103,17 @@ class Open(Mine):
 class Bare:
     def __init__(self, rig):
         pass
+"""
+PORTED = """
+
+class Ported(Mine):
+    def __init__(self, rig, after_s, how):
+        super().__init__(rig, after_s, how)
+        import socket, weakref
+
+        own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        weakref.finalize(self, own.close)
+        own.bind(("127.0.0.1", {port}))
 """
 
 
@@ -342,6 +354,17 @@ def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPa
     monkeypatch.syspath_prepend(str(folder))
     (folder / "filters_installed.py").write_text(MINE)
     assert flown(folder, kind="theirs").dataset["estimators/mine"]["time"].size
+
+
+def test_one_that_holds_a_port_keeps_to_the_clock_too(folder: Path) -> None:
+    """It is made once before, so that all is loaded, and that one held the port until the end of the run."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    (folder / "ported.py").write_text(MINE + PORTED.format(port=port))
+    keys = {"duration_s": 2, "expect": {}, "estimator[1].kind": "./ported.py:Ported"}
+    result = run(Scenario.load(folder / "own.toml", keys), realtime=20.0)
+    assert not result.ended
 
 
 # --- the examples of the manual

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import math
@@ -168,6 +169,20 @@ def test_replay_ends_where_the_motion_ended(tmp_path: Path) -> None:
     replay = Replay(tmp_path / "truth")
     assert (len(replay.advance(30)), replay.failure) == (30, "")
     assert (len(replay.advance(70)), replay.failure) == (0, "control lost")
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="room can't be taken here")
+def test_a_flight_that_there_is_no_room_for_is_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a full disk the process was killed, and left a folder."""
+
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    scenario = Scenario.load("static_bench")
+    with pytest.raises(UserError, match="truth: can't store the flight: No space left on device"):
+        save_motion(motion(scenario, scenario.seed), 100, tmp_path / "truth")
+    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.ci

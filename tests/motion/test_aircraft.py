@@ -324,3 +324,16 @@ def test_an_aircraft_that_cannot_be_flown_is_named(tmp_path: Path, part: str, in
     keys = {"truth.aircraft": str(home), "duration_s": 1, "expect": {}}
     with pytest.raises(UserError, match=re.escape(f"{home / 'broken.xml'}: {says}")):
         run(Scenario.load("u_turn", keys))
+
+
+@pytest.mark.parametrize("part", ['<output name="{}" type="CSV" rate="10"/>', '<input port="1137"/>'])
+def test_a_model_that_opens_files_or_ports_is_refused(part: str, tmp_path: Path) -> None:
+    """JSBSim wrote over a file of the user's as it read the model."""
+    own = tmp_path / "own.csv"
+    own.write_text("mine")
+    shutil.copytree(data_dir("aircraft") / "loiter", tmp_path / "mine")
+    text = (tmp_path / "mine/loiter.xml").read_text("utf-8")
+    (tmp_path / "mine/mine.xml").write_text(text.replace("</fdm_config>", f"{part.format(own)}</fdm_config>"), "utf-8")
+    with pytest.raises(UserError, match=r"mine\.xml: has <(output|input)>, by which JSBSim"):
+        Aircraft(str(tmp_path / "mine"), 200.0)
+    assert own.read_text() == "mine"

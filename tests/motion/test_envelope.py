@@ -42,6 +42,13 @@ def test_shipped_envelopes_are_read() -> None:
         assert 0 < envelope.bank_limit(envelope.usual.airspeed_mps, 300.0) <= envelope.max_bank
 
 
+def test_a_mark_of_the_byte_order_is_no_matter(mine: Path) -> None:
+    """Some editors begin every file with it."""
+    file = mine / "envelope.toml"
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert aircraft.load(str(mine)) == aircraft.load("flying_wing")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
