@@ -86,6 +86,7 @@ VALUE = jsbsim.FGPropertyNode.get_double_value
 ENGINE_SETTLING_S = 3.0
 IDLING_S = 5.0  # before a run that starts on the ground
 TRIMMED_THROTTLE = 0.5  # to which the loops add
+HELD_MPS = 0.5  # airspeed and climb of straight and level flight are found to this, or it is none
 
 
 PROBE = """
@@ -170,6 +171,18 @@ class Aircraft:
             wrong = "does it lack lift, or are wing area, mass or inertia zero or below?"
             raise UserError(f"{self._model}: can't be flown: its state is not finite at the start: {wrong}")
 
+    def _require_level(self, start: Start) -> None:
+        fdm = self.fdm
+        airspeed, climb = FOOT * fdm["velocities/vt-fps"], -FOOT * fdm["velocities/v-down-fps"]
+        off = max(abs(airspeed - start.airspeed_mps), abs(climb))
+        if not math.isfinite(off):
+            return self._require_state()
+        if off > HELD_MPS:
+            asked = f"{start.airspeed_mps:g} m/s true airspeed at {start.alt_m:g} m"
+            came = f"it flies {airspeed:.1f} m/s and climbs {climb:.1f} m/s at {fdm['fcs/throttle-pos-norm']:.0%}"
+            wrong = f"lacks it thrust, fuel or lift, is it too heavy, or does envelope.toml promise too much?"
+            raise UserError(f"{self._model}: can't hold {asked}: {came} throttle: {wrong}")
+
     def read(self) -> list[float]:
         """One row of `STATE`, in JSBSim's units."""
         return list(map(VALUE, self._nodes))
@@ -239,7 +252,8 @@ class Aircraft:
 
         Trim is found by flying: straight and level on the inner loops until everything is steady, engine speed and
         integrators too, which a static trim leaves out. Then attitude, airspeed and angle of attack found are put at
-        the start position and heading. Raises UserError of an aircraft that can't be flown.
+        the start position and heading. Raises UserError of an aircraft that can't be flown, or not at this airspeed and
+        height.
         """
         with self._flying():
             self._start(start, wind)
@@ -258,6 +272,7 @@ class Aircraft:
         self.command(0.0, start.alt_m, 0.0, start.airspeed_mps)
         for _ in range(round(SETTLING_S * self.rate_hz)):
             fdm.run()
+        self._require_level(start)
         euler = (fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], math.radians(start.heading_deg))
         air_b = np.array([fdm[f"velocities/{axis}-aero-fps"] for axis in "uvw"]) * FOOT
         air_n = quat_rotate(quat_from_euler(*euler), air_b)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from functools import reduce
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -84,8 +85,10 @@ def worst_over_3sigma(e: Errors, mask: Mask, key: str) -> dict[str, float]:
 
 def column(dataset: xarray.DataTree, path: str) -> npt.NDArray[Any]:
     """The bare array of one variable, such as ``truth/v_n``. Raises UserError of a record that lacks it."""
+    *groups, name = path.split("/")
     try:
-        return np.asarray(cast("xarray.DataArray", dataset[path]).values)
+        node = reduce(lambda above, group: above.children[group], groups, dataset)
+        return np.asarray(node.variables[name].values)  # `dataset[path]` makes a whole Dataset of the node
     except KeyError:
         raise UserError(f"damaged record: {path} is missing") from None
 

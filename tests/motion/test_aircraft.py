@@ -312,6 +312,8 @@ def test_a_copy_whose_model_was_not_renamed_is_told_so(tmp_path: Path) -> None:
     (r"<aerodynamics>.*</aerodynamics>", "", "JSBSim can't fly it: A proper axis type has NOT been selected"),
     (r"(<wingarea[^>]*>)[^<]*", r"\1 0 ", "can't be flown: its state is not finite at the start"),
     (r"(<ixx[^>]*>)[^<]*", r"\1 -1 ", "can't be flown: its state is not finite at the start"),
+    (r"(<contents[^>]*>)[^<]*", r"\1 0 ", "can't hold 25 m/s true airspeed at"),
+    (r"(<emptywt[^>]*>)[^<]*", r"\1 100 ", "can't hold 25 m/s true airspeed at"),
 ])  # fmt: skip
 def test_an_aircraft_that_cannot_be_flown_is_named(tmp_path: Path, part: str, instead: str, says: str) -> None:
     home = tmp_path / "broken"
@@ -321,7 +323,7 @@ def test_an_aircraft_that_cannot_be_flown_is_named(tmp_path: Path, part: str, in
     (home / "broken.xml").write_text(re.sub(part, instead, text, count=1, flags=re.DOTALL), "utf-8")
     with pytest.raises(UserError, match=re.escape(f"{home / 'broken.xml'}: {says}")):
         trim_and_modes(str(home), 25.0, 300.0)
-    keys = {"truth.aircraft": str(home), "duration_s": 1, "expect": {}}
+    keys = {"truth.aircraft": str(home), "truth.start.airspeed_mps": 25.0, "duration_s": 1, "expect": {}}
     with pytest.raises(UserError, match=re.escape(f"{home / 'broken.xml'}: {says}")):
         run(Scenario.load("u_turn", keys))
 
