@@ -180,7 +180,7 @@ class Aircraft:
         if off > HELD_MPS:
             asked = f"{start.airspeed_mps:g} m/s true airspeed at {start.alt_m:g} m"
             came = f"it flies {airspeed:.1f} m/s and climbs {climb:.1f} m/s at {fdm['fcs/throttle-pos-norm']:.0%}"
-            wrong = f"lacks it thrust, fuel or lift, is it too heavy, or does envelope.toml promise too much?"
+            wrong = "lacks it thrust, fuel or lift, is it too heavy, or does envelope.toml promise too much?"
             raise UserError(f"{self._model}: can't hold {asked}: {came} throttle: {wrong}")
 
     def read(self) -> list[float]:
