@@ -11,9 +11,11 @@ To the program, fields separated by blanks, SI units and radians, ``nan`` where 
 
     t aligned lat lon h v_north v_east v_down q_w q_x q_y q_z
 
-``aligned`` is 0 or 1. Nothing else is answered; the end of its input is the end of the run.
+``aligned`` is 0 or 1. Nothing else is answered; the end of its input is the end of the run. An answer that takes longer
+than `ANSWER_S` is the end of the program.
 """
 
+import select
 import subprocess
 import weakref
 from contextlib import suppress
@@ -21,6 +23,9 @@ from contextlib import suppress
 import numpy as np
 
 from nav.samples import AirspeedSample, BarometerSample, Estimate, GnssSample, MagnetometerSample, Status
+
+ANSWER_S = 10.0
+STATE = 10  # numbers of a state
 
 
 class External:
@@ -31,12 +36,14 @@ class External:
 
     def __init__(self, rig, command):
         pipe = subprocess.PIPE
+        if isinstance(command, str):
+            raise ValueError(f"command is a list: the program and its arguments, such as {command.split()}")
         self.program = subprocess.Popen(command, cwd=rig.folder, stdin=pipe, stdout=pipe, text=True)
         weakref.finalize(self, stop, self.program)  # at the end of the run, or of Python
 
     def propagate(self, imu):
         rows = np.column_stack([imu.t, imu.dt, imu.dtheta, imu.dv]).tolist()
-        self.program.stdin.write(f"imu {len(rows)}\n" + "".join(line(*row) for row in rows))
+        self.send(f"imu {len(rows)}\n" + "".join(line(*row) for row in rows))
 
     def update(self, sample):
         match sample:
@@ -51,20 +58,34 @@ class External:
                 self.tell("airspeed", sample.t, sample.eas)
 
     def tell(self, what, *fields):
-        self.program.stdin.write(f"{what} " + line(*fields))
+        self.send(f"{what} " + line(*fields))
+
+    def send(self, text):
+        try:
+            self.program.stdin.write(text)
+        except BrokenPipeError:
+            raise self.ended() from None
+
+    def ended(self):
+        return RuntimeError(f"the program has ended with exit code {self.program.wait()}")
 
     def estimate(self):
-        self.program.stdin.write("estimate\n")
-        self.program.stdin.flush()
+        self.send("estimate\n")
+        with suppress(BrokenPipeError):
+            self.program.stdin.flush()
+        if not select.select([self.program.stdout], [], [], ANSWER_S)[0]:
+            raise RuntimeError(f"the program has not answered for {ANSWER_S:g} s")
         answer = self.program.stdout.readline()
         if not answer:
-            raise RuntimeError(f"the program has ended with exit code {self.program.wait()}")
+            raise self.ended()
         try:
             t, aligned, *state = map(float, answer.split())
         except ValueError:
             raise RuntimeError(f"the program has answered {answer!r}") from None
         if aligned != 1:
             return Estimate.of(t)
+        if len(state) != STATE:
+            raise RuntimeError(f"the program has answered {len(state)} numbers of its state, not {STATE}: {answer!r}")
         lla, v_n, q_nb = (np.array(part) for part in (state[:3], state[3:6], state[6:]))
         return Estimate.of(t, q_nb=q_nb, lla=lla, v_n=v_n, status=Status.ALIGNED)
 

@@ -1,6 +1,7 @@
 """The program that the example `external.py` runs: gyros and the last GNSS fix. Python here; any language will do."""
 
 import math
+import signal
 import sys
 
 
@@ -31,4 +32,5 @@ def main():
             print(t, int(fix is not None), *state, flush=True)
 
 
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it with the run, without a traceback
 main()

@@ -408,12 +408,41 @@ def test_external() -> None:
     assert not [one for one in result.remarks if "has ended" in one]
 
 
+def answering(answer: str) -> list[str]:
+    return [sys.executable, "-c", f"import sys\nfor line in sys.stdin:\n if line == 'estimate\\n': {answer}"]
+
+
 @pytest.mark.ci
-def test_garbage_of_an_external_program_is_shown() -> None:
-    program = "import sys\nfor line in sys.stdin:\n if line == 'estimate\\n': print('oops', flush=True)"
-    result, _ = example("external.py", "External", command=[sys.executable, "-c", program])
+@pytest.mark.parametrize(("command", "says"), [
+    (answering("print('oops', flush=True)"), "RuntimeError: the program has answered 'oops\\n' (external.py, line "),
+    (answering("print('1 1 0 0', flush=True)"), "the program has answered 2 numbers of its state, not 10: '1 1 0 0\\n'"),
+    (answering("break"), "the program has ended with exit code 0"),
+    ([sys.executable, "-c", "raise SystemExit(3)"], "the program has ended with exit code 3"),
+    (answering("print(end='', flush=True)"), "the program has not answered for 0.5 s"),
+    (["yes"], "the program has answered 'y\\n'"),
+])  # fmt: skip
+def test_what_is_wrong_with_an_external_program_is_said(
+    command: list[str], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = sys.modules[plugins.load("./external.py:External", EXAMPLES, "none").__module__]
+    monkeypatch.setattr(module, "ANSWER_S", 0.5)
+    result, _ = example("external.py", "External", command=command)
     (ended,) = [one for one in result.remarks if "has ended" in one]
-    assert "RuntimeError: the program has answered 'oops\\n' (external.py, line " in ended
+    assert says in ended
+
+
+def test_the_command_of_an_external_program_is_a_list() -> None:
+    with pytest.raises(
+        UserError, match=r"ValueError: command is a list: .*, such as \['python', 'external_filter.py'\]"
+    ):
+        example("external.py", "External", command="python external_filter.py")
+
+
+@pytest.mark.ci
+def test_an_external_program_that_does_not_know_is_not_aligned() -> None:
+    result, _ = example("external.py", "External", command=answering("print(*[float('nan')] * 12, flush=True)"))
+    assert not [one for one in result.remarks if "has ended" in one]
+    assert "own.aligned_s" not in result.metrics
 
 
 @pytest.mark.ci
