@@ -415,7 +415,7 @@ def answering(answer: str) -> list[str]:
 @pytest.mark.ci
 @pytest.mark.parametrize(("command", "says"), [
     (answering("print('oops', flush=True)"), "RuntimeError: the program has answered 'oops\\n' (external.py, line "),
-    (answering("print('1 1 0 0', flush=True)"), "the program has answered 2 numbers of its state, not 10: '1 1 0 0\\n'"),
+    (answering("print('1 1 0 0', flush=True)"), "the program has answered 2 numbers of its state, not 10: '1 1 0 0"),
     (answering("break"), "the program has ended with exit code 0"),
     ([sys.executable, "-c", "raise SystemExit(3)"], "the program has ended with exit code 3"),
     (answering("print(end='', flush=True)"), "the program has not answered for 0.5 s"),
