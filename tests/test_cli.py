@@ -290,7 +290,7 @@ def test_a_record_that_lacks_a_column_is_damaged(testbed: Testbed, tmp_path: Pat
         del file["estimators/ins/covariance"]
     ended = testbed("report", "run.nc")
     assert ended.code == 2
-    assert "run.nc: damaged record: estimators/ins/covariance is missing" in ended.err
+    assert "run.nc: damaged record (estimators/ins/covariance is missing); run the scenario again" in ended.err
 
 
 def test_a_damaged_record(testbed: Testbed, tmp_path: Path) -> None:

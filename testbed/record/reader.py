@@ -11,7 +11,7 @@ import numpy as np
 
 from testbed.errors import UserError
 from testbed.record import format1
-from testbed.record.columns import AXES, FORMAT, REPORT, Variable
+from testbed.record.columns import AXES, ESTIMATE, EVENT, FAULT, FORMAT, IMU, REPORT, TRUTH, Variable
 from testbed.record.tables import Data
 
 if TYPE_CHECKING:
@@ -19,6 +19,22 @@ if TYPE_CHECKING:
     import xarray
 
     from testbed.scenario import Scenario
+
+# What every record says of itself, and what it is; of some, in JSON. Others may say more.
+NUMBERS = ("seed", "record_rate_hz", "duration_s")
+IN_JSON: Mapping[str, type] = {
+    "overrides": list,
+    "versions": dict,
+    "estimated_point_b_m": dict,
+    "estimator_imus": dict,
+    "reference_sigma_n": list,
+}
+SAID = {"scenario", "overrides", "estimated_point_b_m", *NUMBERS}
+# What comes with a column that only samples of one kind have.
+COMES_WITH: Mapping[str, Sequence[str]] = {
+    "fix_type": ("lat", "lon", "h", "v_n", "sigma_position_n", "sigma_velocity_n", "satellites", "hdop", "vdop"),
+    "dtheta": tuple(IMU),
+}
 
 
 def load(path: Path) -> xarray.DataTree:
@@ -44,6 +60,7 @@ def load(path: Path) -> xarray.DataTree:
             attributes = {name: _plain(value) for name, value in file.attrs.items()}
         if written == format1.FORMAT:
             _upgrade(columns)
+        _require_whole(columns, attributes)
         return tree(columns, attributes)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path}: damaged record ({error}); run the scenario again") from error
@@ -55,6 +72,47 @@ def _upgrade(columns: dict[str, dict[str, tuple[Variable, Data]]]) -> None:
         if path.split("/")[2:3] == ["innovations"]:
             reason, nis, weight = (group[name][1] for name in ("reason", "nis", "weight"))
             group["outcome"] = REPORT["outcome"], format1.outcomes(reason, nis, weight)
+
+
+def _require_whole(columns: Mapping[str, Mapping[str, object]], attributes: Mapping[str, Any]) -> None:
+    """Raise ValueError of the first thing that every record has, and this one lacks or has garbage in place of."""
+    for path, group in columns.items():
+        if missing := sorted(_needed(path, group) - group.keys()):
+            raise ValueError(f"{path}/{missing[0]} is missing")
+    if unsaid := sorted(SAID - attributes.keys()):
+        raise ValueError(f"its attribute {unsaid[0]} is missing")
+    for name in NUMBERS:
+        if not isinstance(attributes[name], int | float):
+            raise ValueError(f"its attribute {name} is no number: {attributes[name]!r}")
+    for name, kind in IN_JSON.items():
+        try:
+            whole = name not in attributes or isinstance(json.loads(attributes[name]), kind)
+        except (TypeError, ValueError):
+            whole = False
+        if not whole:
+            raise ValueError(f"its attribute {name} is no {kind.__name__} in JSON: {attributes[name]!r}")
+
+
+def _needed(path: str, group: Mapping[str, object]) -> set[str]:
+    """The columns without which a group, that has these, is none."""
+    match path.split("/"):
+        case ["truth"]:
+            return set(TRUTH)
+        case ["estimators", _]:
+            states = {name for name in group.keys() - ESTIMATE.keys() - {"time"} if not name.startswith("sigma_")}
+            return {*ESTIMATE, *(f"sigma_{name}" for name in states)}
+        case ["estimators", _, "innovations", _]:
+            return {*REPORT, *({"innovation", "S"} if group.keys() & {"innovation", "S"} else ())}
+        case ["sensors", _]:
+            return {"t_arrival" if "dtheta" not in group else "dt"}.union(
+                *(others for one, others in COMES_WITH.items() if one in group)
+            )
+        case ["events"]:
+            return set(EVENT)
+        case ["faults"]:
+            return set(FAULT)
+        case _:
+            return set()
 
 
 def scenario_of(dataset: xarray.DataTree, overrides: Sequence[str] = ()) -> Scenario:
@@ -121,8 +179,11 @@ def _read_column(dataset: h5py.Dataset, rows: int, places: Mapping[int, str]) ->
         for name in ("units", "long_name", "flag_values", "flag_masks", "flag_meanings")
         if name in dataset.attrs
     }
-    scales = [dataset.dims[k][0] for k in range(1, dataset.ndim)]
-    dims = tuple(places.get(h5o.get_info(scale.id).addr) or Path(scale.name).name for scale in scales)
+    try:
+        scales = [dataset.dims[k][0] for k in range(1, dataset.ndim)]
+        dims = tuple(places.get(h5o.get_info(scale.id).addr) or Path(scale.name).name for scale in scales)
+    except (RuntimeError, TypeError):
+        raise ValueError(f"{dataset.name.strip('/')}: what labels its columns is missing") from None
     values = dataset[:rows]
     if values.dtype.kind == "S":
         values = values.view(f"S{values.shape[1]}")[:, 0]

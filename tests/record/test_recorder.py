@@ -706,3 +706,46 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert long < 1.5 * short + 5e6
+
+
+@pytest.mark.parametrize(("gone", "says"), [
+    ("truth/h", "truth/h is missing"),
+    ("truth/ned", "what labels its columns is missing"),
+    ("estimators/ins/v_n", "estimators/ins/v_n is missing"),
+    ("estimators/ins/sigma_wind", "estimators/ins/sigma_wind is missing"),
+    ("estimators/ins/innovations/gnss_position/S", "gnss_position/S is missing"),
+    ("estimators/ins/innovations/gnss_position/nis", "gnss_position/nis is missing"),
+    ("sensors/imu/dt", "sensors/imu/dt is missing"),
+    ("sensors/gnss/hdop", "sensors/gnss/hdop is missing"),
+    ("sensors/gnss/t_arrival", "sensors/gnss/t_arrival is missing"),
+    ("events/text", "events/text is missing"),
+])  # fmt: skip
+def test_a_record_that_lacks_a_column_says_which(gone: str, says: str, tmp_path: Path, run_file: Path) -> None:
+    path = tmp_path / "mine.nc"
+    path.write_bytes(run_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        del file[gone]
+    with pytest.raises(UserError, match=rf"mine\.nc: damaged record \(.*{says}\); run the scenario again"):
+        load(path)
+
+
+@pytest.mark.parametrize(("name", "value", "says"), [
+    ("scenario", None, "its attribute scenario is missing"),
+    ("estimated_point_b_m", None, "its attribute estimated_point_b_m is missing"),
+    ("record_rate_hz", "fast", "its attribute record_rate_hz is no number: 'fast'"),
+    ("estimator_imus", "{", "its attribute estimator_imus is no dict in JSON: '{'"),
+    ("estimated_point_b_m", "[]", r"its attribute estimated_point_b_m is no dict in JSON: '\[\]'"),
+    ("overrides", 5, "its attribute overrides is no list in JSON: 5"),
+])  # fmt: skip
+def test_a_record_that_lacks_an_attribute_says_which(
+    name: str, value: str | int | None, says: str, tmp_path: Path, run_file: Path
+) -> None:
+    path = tmp_path / "mine.nc"
+    path.write_bytes(run_file.read_bytes())
+    with h5py.File(path, "r+") as file:
+        if value is None:
+            del file.attrs[name]
+        else:
+            file.attrs[name] = value
+    with pytest.raises(UserError, match=rf"mine\.nc: damaged record \({says}\); run the scenario again"):
+        load(path)
