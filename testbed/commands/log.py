@@ -5,12 +5,17 @@ from __future__ import annotations
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from testbed.commands.shared import Force, console
 from testbed.errors import UserError, printable
+
+if TYPE_CHECKING:
+    from datetime import date as Date
+
+    from testbed.motion.logged import LogTruth
 
 LogFile = Annotated[
     Path,
@@ -22,30 +27,20 @@ Target = Annotated[
 Simulation = Annotated[
     Path | None,
     typer.Option(
-        "--compare", metavar="RUN.nc", help="Show beside it what a simulation of the flight has. Two records are "
-        "compared by their innovations too.",
+        "--compare", metavar="RUN.nc", help="Show beside it what a simulation of the flight has, or another log, named "
+        "as FILE is. Two records are compared by their innovations too.",
     ),
 ]  # fmt: skip
 
 
 def log(file: LogFile, scenario: Target = None, compare: Simulation = None, force: Force = False) -> None:
     """Show what is in a recorded flight: rates, gaps, phases, noise, vibration, latencies; propose grades."""
-    from testbed.data import data_dir, write_file
+    from testbed.data import write_file
     from testbed.feeds import draft, formats
     from testbed.feeds.survey import survey
-    from testbed.motion.logged import LogTruth
     from testbed.report import log as pages
 
-    truth, date = None, None
-    if not file.exists() and (data_dir("scenarios") / file).is_file():
-        file = data_dir("scenarios") / file  # a shipped log, by its name
-    if file.suffix == ".toml":
-        from testbed.scenario import Scenario
-
-        loaded = Scenario.load(file)
-        if not isinstance(loaded.truth, LogTruth):
-            raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
-        truth, date = loaded.truth, loaded.date if "date" in loaded.model_fields_set else None
+    file, truth, date = _named(file)
     if scenario is not None:
         _require_free(scenario, force)
     place = file if truth is None else Path(truth.file)
@@ -64,7 +59,9 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     if compare is not None:
         from testbed.score import likeness
 
-        console().print(pages.beside(likeness.compare(found, survey(formats.read(compare, {})))))
+        other, columns, _ = _named(compare)
+        simulated = formats.read(other, {}) if columns is None else formats.open_log(columns)
+        console().print(pages.beside(likeness.compare(found, survey(simulated))))
     else:
         for table in pages.tables(found):
             console().print(table)
@@ -73,6 +70,22 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         print(printable(f"scenario: {scenario}"))
         if (truth is None or truth.start is None) and not draft.is_placed(found.log):
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")
+
+
+def _named(file: Path) -> tuple[Path, LogTruth | None, Date | None]:
+    """A log by its path, or shipped; of a scenario, what that says of its log, and the date if it says one."""
+    from testbed.data import data_dir
+    from testbed.motion.logged import LogTruth
+    from testbed.scenario import Scenario
+
+    if not file.exists() and (data_dir("scenarios") / file).is_file():
+        file = data_dir("scenarios") / file
+    if file.suffix != ".toml":
+        return file, None, None
+    loaded = Scenario.load(file)
+    if not isinstance(loaded.truth, LogTruth):
+        raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
+    return file, loaded.truth, loaded.date if "date" in loaded.model_fields_set else None
 
 
 def _require_free(scenario: Path, force: bool) -> None:

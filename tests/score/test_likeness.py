@@ -141,3 +141,6 @@ def test_a_run_and_its_rerun_are_compared_by_their_innovations(
     line = next(one for one in shown.splitlines() if "ins: barometer" in one and "NIS" in one)
     assert line.rstrip().endswith("alike │")
     assert "No such file" in command("log", "flight/run.nc", "--compare", "nowhere.nc")
+    shown = command("log", "recorded_flight.bin", "--compare", "recorded_flight.toml")  # shipped, a scenario of it
+    assert "22 figures, 22 of them alike" in shown
+    assert "is a scenario without a log" in command("log", "flight/run.nc", "--compare", "u_turn.toml")
