@@ -188,6 +188,7 @@ def _array(value: Any, what: str) -> Array:
     if array.dtype.kind not in "fiu" and array.size:
         raise Unfit(f"{what} is {_told(value)}, not an array of real numbers")
     numbers: Array = array.astype(float)
+    numbers[np.ma.getmaskarray(value)] = np.nan
     return numbers
 
 

@@ -169,7 +169,8 @@ def _measured(
     called: str, axes: int, ask: Callable[..., Any], part: str, sample: Any, at: OperatingPoint
 ) -> Measurement | None:
     """What an aid makes of one part of a sample."""
-    given = _asked(called, ask, part, sample, at)
+    own = at._replace(state=at.state.copy(), x=at.x.copy(), P=at.P.copy())  # which it may write into
+    given = _asked(called, ask, part, sample, own)
     if given is None:
         return None
     if wrong := _no_measurement(given, axes, len(at.x)):

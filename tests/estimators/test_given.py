@@ -108,6 +108,12 @@ def test_what_only_has_another_type_is_taken() -> None:
     assert [one.tolist() for one in estimate.extra["b"]] == [[1.0], [2.0]]
 
 
+def test_what_is_masked_is_unknown() -> None:
+    estimate, failure = told(v_n=np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False]))
+    assert failure == ""
+    assert np.array_equal(estimate.v_n, [1.0, np.nan, 3.0], equal_nan=True)
+
+
 def test_unknown_is_no_mistake() -> None:
     for changes in ({"q_nb": np.full(4, np.nan)}, {"lat": np.nan}, {"covariance": np.full((9, 9), np.nan)}):
         assert told(**changes)[1] == ""

@@ -140,6 +140,8 @@ class HeightAid:
                 R = ["wide"]
             case "aid lists":
                 nu, H, R = [0], H.tolist(), [1]
+            case "aid write":
+                at.x[:], at.P[:], at.state.v_n[:], at.state.P[:] = 1.0, 0.0, 50.0, 0.0
         return None if self.how == "aid none" else Measurement(nu, H, R)
 
 
@@ -415,6 +417,17 @@ def test_what_is_a_measurement_is_used(scenario: Path, how: str, looks: int) -> 
     keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
     result = run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how}))
     assert len([one for one in result.dataset.groups if one.endswith("innovations/radar")]) == looks
+
+
+def test_what_an_aid_writes_into_where_a_filter_is_stays_its_own(scenario: Path) -> None:
+    keys = {"sensors.radar.kind": "./radar.py:Aided", "estimator[0].aids": ["gnss", "magnetometer", "radar"]}
+    plain, written = (
+        run(Scenario.load(scenario.with_name("rest.toml"), {**keys, "duration_s": 4, "sensors.radar.how": how})).dataset
+        for how in ("", "aid write")
+    )
+    for name in ("v_n", "q_nb", "covariance"):
+        (path,) = (one for one in plain.groups if one.startswith("/estimators/") and one.count("/") == 2)
+        assert np.array_equal(plain[f"{path}/{name}"], written[f"{path}/{name}"], equal_nan=True)
 
 
 def test_an_aid_made_of_one_of_ours_is_known_as_that() -> None:
