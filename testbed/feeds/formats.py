@@ -45,6 +45,7 @@ OTHERS = (
     ((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf"), "is compressed: unpack it first"),
     ((b"\xff\xfe", b"\xfe\xff"), "is text in UTF-16: save it as UTF-8"),
     ((b"MATLAB 7.3 MAT-file",), "is a MATLAB file of version 7.3: save it with -v7"),
+    ((b"version https://git-lfs",), "is a pointer of Git LFS in place of the log: fetch that with `git lfs pull`"),
 )
 
 

@@ -180,10 +180,15 @@ def matlab_7_3(path: Path) -> None:
     path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(128) + bytes(384) + b"\x89HDF\r\n\x1a\n")
 
 
+def pointer(path: Path) -> None:
+    path.write_text(f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0' * 64}\nsize 4053364\n")
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
         (nothing, "is empty"),
+        (pointer, "is a pointer of Git LFS in place of the log"),
         (matlab_7_3, "is a MATLAB file of version 7.3: save it with -v7"),
         (compressed, "is compressed: unpack it first"),
         (wide_text, "is text in UTF-16: save it as UTF-8"),
