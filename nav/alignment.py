@@ -34,6 +34,7 @@ from nav.rotation import (
     skew,
 )
 from nav.samples import Array, GnssSample, ImuSamples, usable
+from nav.triad import attitude_jacobian, triad
 from nav.velocity_matching import Matched, VelocityMatching
 
 REST_SPEED = 0.5  # slower than this is standing [m/s]
@@ -48,13 +49,13 @@ UNCALIBRATED = 2.5  # times what a magnetometer is told to be wrong by: a sound 
 # Hard iron over the level field, beyond which a magnetometer tells no heading to begin with: beside a course, or alone.
 FIELD_HEADING_LIMIT, ALONE_LIMIT = 0.7, 1.0
 _DV_B, _S_B, _DV_N, _S_N = range(4)  # of the vectors that TRIAD takes
+_GNSS = ("gnss_position_error", "gnss_velocity_error", "gnss_latency")
 _MAGNETOMETER = tuple(f"magnetometer_{error}" for error in ("bias", "anomaly", "error", "soft_iron"))
 PULL = 3.0  # of a receiver that is led away steadily, where nothing else is asked for a heading [m/s^2]
 FEW, CLEARLY = 5, 0.9  # pairs, and the share of pushes that is explained, where nothing else is asked for a heading
 LONGEST_S = 6.0  # beyond which gyros drift too far within a pair of vectors for matching
 NORTH = np.array([1.0, 0.0, 0.0])
 ACCELERATION_ERROR = 0.1  # of such a pair: latency, scale and tilt of what manoeuvres [m/s^2]
-STEP = 1e-6  # of each input, relative, in the differences
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class InitialState:
 @dataclass(frozen=True)
 class AidSigmas:
     """What alignment is told of the aids [1-sigma]: field in T (noise, constant and slow errors, anomaly of the
-    reference) and by soft iron [1], correlated GNSS errors in m, m/s NED; wind in m/s.
+    reference) and by soft iron [1], correlated GNSS errors in m, m/s NED and its latency in s; wind in m/s.
     """
 
     field: float
@@ -90,6 +91,7 @@ class AidSigmas:
     field_anomaly: float = 0.0
     field_error: float = 0.0
     soft_iron: float = 0.0
+    gnss_latency: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -149,11 +151,12 @@ class Alignment:
             soft_iron=magnetometer.soft_iron_sigma,
             gnss_position=np.array(gnss.position_error_sigma),
             gnss_velocity=np.array(gnss.velocity_error_sigma),
+            gnss_latency=gnss.latency_sigma,
             wind=next((aid.wind_sigma for aid in aids if isinstance(aid, AirspeedAid)), AirspeedAid().wind_sigma),
         )
         made = cls(imu, sigmas, gnss.arm, duration_s)
         made.receiver = gnss.sensor
-        made.names = dict(zip(("gnss_position_error", "gnss_velocity_error"), gnss.states, strict=False))
+        made.names = dict(zip(_GNSS, gnss.states, strict=False))
         made.names |= dict(zip(_MAGNETOMETER, magnetometer.states, strict=True))
         return made
 
@@ -235,7 +238,7 @@ class Alignment:
             return None
         # The antenna swings about the IMU: the velocity change of the IMU needs the attitude it serves to find.
         for _ in range(SWING_ROUNDS):
-            C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
+            C_nb = triad(dv_b, heading.s_b, dv_n, heading.s_n)
             dv_n = self._specific_force_n(first, fix, T) - C_nb @ swing_b
         self.problem = ""
         initial = self._state(fix, T, dv_b, dv_n, heading)
@@ -378,10 +381,10 @@ class Alignment:
         return [_Cause(_DV_B, n, gain, prior[slices[n], slices[n]]) for n, gain in gains.items() if n in slices]
 
     def _state(self, fix: GnssSample, T: float, dv_b: Array, dv_n: Array, heading: _Heading) -> InitialState:
-        C_nb = _triad(dv_b, heading.s_b, dv_n, heading.s_n)
+        C_nb = triad(dv_b, heading.s_b, dv_n, heading.s_n)
         # As filters reckon with what is measured: hard iron that makes a field longer turns it by no less for them.
         expected_b = C_nb.T @ heading.s_n
-        J = [_attitude_jacobian(dv_b, expected_b, dv_n, heading.s_n, which) for which in range(4)]
+        J = [attitude_jacobian(dv_b, expected_b, dv_n, heading.s_n, which) for which in range(4)]
 
         variance_v = np.diag(whole(fix.sigma_velocity_n, self.aids.gnss_velocity))
         up = dv_n / np.linalg.norm(dv_n)
@@ -402,9 +405,12 @@ class Alignment:
         P[pos, pos] = np.diag(whole(fix.sigma_position_n, self.aids.gnss_position))
 
         # Every estimated error is zero, so its error is minus what it is: hence the signs.
-        correlated = {name: np.zeros((MOTION, 3)) for name in ("gnss_position_error", "gnss_velocity_error")}
+        correlated = {name: np.zeros((MOTION, size)) for name, size in zip(_GNSS, (3, 3, 2), strict=True)}
         correlated["gnss_position_error"][pos] = -np.diag(self.aids.gnss_position**2)
         correlated["gnss_velocity_error"][vel] = -np.diag(self.aids.gnss_velocity**2)
+        # A fix that is late by an uncertain time is that long ago, on the way that both its parts went since.
+        correlated["gnss_latency"][pos, 0] = self.aids.gnss_latency**2 * fix.v_n
+        P[pos, pos] += self.aids.gnss_latency**2 * np.outer(fix.v_n, fix.v_n)
         for cause in (*self._accelerometers(dv_b, T), *heading.causes):
             turning = J[cause.vector] @ cause.gain
             P[phi, phi] += turning @ cause.known @ turning.T
@@ -444,37 +450,6 @@ def whole(reported: Array, correlated: Array) -> Array:
 def _along_and_across(field: Array, force: Array) -> Array:
     """What of a ``field`` (3,) is along ``force`` (3,), and the size of the rest (2,)."""
     return np.array([field @ force, math.hypot(*cross(field, force).tolist())]) / math.hypot(*force.tolist())
-
-
-def _triad(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array) -> Array:
-    """C_nb (3, 3) that takes the first pair exactly and the second as nearly as that allows."""
-    return _axes(primary_n, second_n) @ _axes(primary_b, second_b).T
-
-
-def _axes(primary: Array, second: Array) -> Array:
-    x = primary / np.linalg.norm(primary)
-    y = np.cross(x, second)
-    y /= np.linalg.norm(y)
-    return np.column_stack([x, y, np.cross(x, y)])
-
-
-def _attitude_jacobian(primary_b: Array, second_b: Array, primary_n: Array, second_n: Array, which: int) -> Array:
-    """D phi / d (one of the four vectors), (3, 3), at the TRIAD attitude, by central differences."""
-    vectors = [primary_b, second_b, primary_n, second_n]
-    C = _triad(*vectors)
-    step = STEP * float(np.linalg.norm(vectors[which]))
-    J = np.empty((3, 3))
-    for axis in range(3):
-        turned = []
-        for sign in (1.0, -1.0):
-            moved = [vector.copy() for vector in vectors]
-            moved[which][axis] += sign * step
-            turned.append(_triad(*moved) @ C.T)
-        skewed = (turned[0] - turned[1]) / (2 * step)  # = -[dphi x]
-        J[:, axis] = -0.5 * np.array(
-            [skewed[2, 1] - skewed[1, 2], skewed[0, 2] - skewed[2, 0], skewed[1, 0] - skewed[0, 1]]
-        )
-    return J
 
 
 @njit

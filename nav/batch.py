@@ -328,7 +328,7 @@ def follow(
     increment may be why a tilt is lost. Into ``reports`` (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2):
     of each of these its time and that of the last bad increment.
     """
-    q_nb, v_n, lla, _, x, P, errors, _, _, rates, _ = parts(whole, common, filters, n)
+    q_nb, v_n, lla, _, x, P, errors, _, _, rates, _, _ = parts(whole, common, filters, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
     S_one, (S_three, inverses, updating) = np.empty((1, 1)), scratch(3, n)
     written = drafted = 0

@@ -127,7 +127,7 @@ def _combined(wholes: Array, common: int, filters: int, n: int, members: Array) 
     """
     masters, m = np.empty((len(wholes), common, common)), len(members)
     for k in range(len(wholes)):
-        q_nb, v_n, lla, imu, x, P, _, _, _, _, _ = parts(wholes[k], common, filters, n)
+        q_nb, v_n, lla, imu, x, P, _, _, _, _, _, _ = parts(wholes[k], common, filters, n)
         x_g, P_g = information(x[:m], P[:m], common, members)
         for i in range(common):
             for j in range(common):

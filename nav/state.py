@@ -20,11 +20,12 @@ from nav.strapdown import step
 from nav.unscented import predict as predict_points
 from nav.unscented import remove
 
-FIXED = 67  # numbers in a `State` of any size
+FIXED = 70  # numbers in a `State` of any size
 SAME = 1e-9  # rates this close, relative, are those of one increment
 BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # by which those before a gap are off in the end [rad/s, m/s^2]
 CHANGE_S = 0.2  # in which they are by half of that
 ANYHOW = math.pi**2 / 3  # variance of an angle of which nothing is known [rad^2]
+ACCELERATION_S = 0.2  # over which acceleration is averaged: about as long as receivers are late
 SHAKEN_S = 1.0  # over which the noise of increments is averaged
 
 
@@ -47,13 +48,14 @@ class State:
     elapsed: Array  # (3,) seconds and samples since the last covariance step; seconds since a sound increment
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
     shaking: Array  # (3, 3) rate and force of the increment before; densities of their noise, and the last one's length
+    acceleration: Array  # (3,) of the IMU over ground, NED, averaged over `ACCELERATION_S` [m/s^2]
 
     def __init__(self, common: int, filters: int, n: int, whole: Array | None = None) -> None:
         self.shape = common, filters, n
         self.whole = np.zeros(FIXED + common + filters * n * (n + 1)) if whole is None else whole
         (
             self.q_nb, self.v_n, self.lla, self.imu, self.x, self.P, self.errors, self.sums, self.elapsed, self.rates,
-            self.shaking,
+            self.shaking, self.acceleration,
         ) = parts(self.whole, common, filters, n)  # fmt: skip
 
     def take(self, other: State) -> None:
@@ -95,14 +97,15 @@ def known(wholes: Array, common: int, filters: int, n: int) -> Known:
 @inlined
 def parts(
     whole: Array, common: int, filters: int, n: int
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]:
     """The parts of the ``whole`` of a `State` as views, in the order of the class; those of fixed size lie first."""
     x = FIXED + common
     P = x + filters * n
     return (
         whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
         whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
-        whole[49:52], whole[52:58].reshape(2, 3), whole[58:FIXED].reshape(3, 3),
+        whole[49:52], whole[52:58].reshape(2, 3), whole[58:67].reshape(3, 3),
+        whole[67:FIXED],
     )  # fmt: skip
 
 
@@ -126,7 +129,7 @@ def absorb(
     With ``close`` what the filter would add to the nominal state is put there at once. See `kalman.update`; ``S``
     (m, m) and what it works in as of `kalman.scratch`.
     """
-    q_nb, v_n, lla, imu, x, P, errors, _, _, _, _ = parts(whole, common, filters, n)
+    q_nb, v_n, lla, imu, x, P, errors, _, _, _, _, _ = parts(whole, common, filters, n)
     nis = update_in(x[row], P[row], H, R, nu, threshold, S, inverses, work)
     if close and nis <= threshold:
         inject(q_nb, v_n, lla, imu, x[row])
@@ -285,11 +288,16 @@ def propagate(
     A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
     since it is long to compile.
     """
-    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates, shaking = parts(whole, common, filters, n)
+    q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates, shaking, acceleration = parts(whole, common, filters, n)
     Phi, FT, decay, half_noise = working(room, common, n)
     bad = -1
     shaken = in_motion[0, 2] > 0.0
-    angle, push, before = FT[0, :3], FT[1, :3], FT[2, :4]  # done with when a covariance step needs the room
+    angle, push, before, old = (
+        FT[0, :3],
+        FT[1, :3],
+        FT[2, :4],
+        FT[3, :3],
+    )  # done with when a covariance step needs the room
     for k in range(len(dt) + 1):
         T = dt[k] if k < len(dt) else 0.0
         if T > 0.0:
@@ -317,7 +325,12 @@ def propagate(
             take_errors(angle, push, rates, T, errors, imu, driven)
             for i in range(4):
                 before[i] = q_nb[i]
+            for i in range(3):
+                old[i] = v_n[i]
             step(q_nb, v_n, lla, angle, push, T)
+            share = min(1.0, T / ACCELERATION_S)
+            for i in range(3):
+                acceleration[i] += share * ((v_n[i] - old[i]) / T - acceleration[i])
             integrate(sums, before, q_nb, angle, push, T)
             elapsed[0] += T
             elapsed[1] += 1.0

@@ -24,7 +24,7 @@ from nav.aids.base import (
     well_within,
 )
 from nav.claims import WIDEST, Following
-from nav.earth import displacement_n, earth_rate_n, gravity, wrap_longitude
+from nav.earth import displacement_n, earth_rate_n, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross, dcm_from_quat, quat_rotate
 from nav.samples import Array, GnssSample, Sample
@@ -59,7 +59,9 @@ class GnssAid:
 
     A velocity older by ``velocity_lag`` than the position of the same sample, as of receivers that smooth it, is held
     against the velocity at that time, to first order. That the acceleration which leads there is itself wrong by tilt
-    and by the accelerometers' biases is left out: 0.03 m/s for a degree and 0.2 s. Where it is known to
+    and by the accelerometers' biases is left out: 0.03 m/s for a degree and 0.2 s. It is that of some time
+    (`nav.state.ACCELERATION_S`): the noise of one increment would seem to tell a latency, and makes it smaller than it
+    is, as any noise of what is regressed upon does. Where it is known to
     ``latency_sigma`` only when a sample was valid, two states say by how much earlier the position was, and by how
     much more the velocity lags. The receiver's own filters make both change with each manoeuvre by as much: velocity
     times that is noise of the position beside its sigma, and acceleration times that of the velocity, where it outlasts
@@ -157,7 +159,7 @@ class GnssAid:
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         R = white(sample.sigma_velocity_n, self._correlated[1])
         if latency >= 0 or self.velocity_lag:
-            acceleration = _acceleration(state)
+            acceleration = state.acceleration
             lag = self.velocity_lag
             if latency >= 0:
                 lag += float(at.x[latency] + at.x[latency + 1])
@@ -168,7 +170,7 @@ class GnssAid:
 
     def manoeuvre(self, state: State) -> Array:
         """The variance (3,) [m^2/s^2] that accelerating now adds to a velocity that is late by an uncertain time."""
-        return (self.latency_sigma * _acceleration(state)) ** 2
+        return (self.latency_sigma * state.acceleration) ** 2
 
     def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
         """See `AidAtPoints`."""
@@ -202,14 +204,6 @@ def white(sigma: Array, correlated_variance: Array) -> Array:
         reported = sigma[i] * sigma[i]
         R[i] = max(reported - correlated_variance[i], WHITE_SHARE * reported)
     return R
-
-
-def _acceleration(state: State) -> Array:
-    """What the vehicle is accelerated by, NED (3,) [m/s^2]; where no increment was felt yet, none."""
-    acceleration = quat_rotate(state.q_nb, state.rates[1] - state.errors[Drive.ACCEL])
-    if state.rates[1].any():
-        acceleration[2] += gravity(float(state.lla[0]), float(state.lla[2]))
-    return acceleration
 
 
 @dataclass

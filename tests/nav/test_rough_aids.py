@@ -41,6 +41,7 @@ def circling(aid, t=0.7, v_n=None):
     state = reference.start(initial)
     force_n = np.array([-SPEED * TURN * math.sin(heading), SPEED * TURN * math.cos(heading), -gravity(LAT, H)])
     state.rates[:] = attitude.inv().apply([[0.0, 0.0, TURN], force_n])
+    state.acceleration[:] = force_n + np.array([0.0, 0.0, gravity(LAT, H)])
     starts = tuple(map(ins.model.start, aid.states))
     return OperatingPoint(reference, state, state.x[0], starts, state.P[0])
 
@@ -91,12 +92,10 @@ def test_a_wake_begins_with_what_it_hears_first_and_hears_each_sample_once():
 def test_velocities_are_taken_for_as_bad_and_judged_by_what_begins():
     """10 m/s^2 of a turn is 1 m/s of 0.1 s; half a second after it has ended 1/e of that variance is left."""
     filter_, at = LocalFilter(CONSUMER, [RECEIVER], ChiSquareGate(1e-3)), circling(RECEIVER)
-    level = np.array([0.0, 0.0, -gravity(LAT, H)])
-    straight = Rotation.from_quat(at.state.q_nb, scalar_first=True).inv().apply(level)
-    turning = at.state.rates[1].copy()
+    turning, straight = at.state.acceleration.copy(), np.zeros(3)
 
-    def told(t, force_b):
-        at.state.rates[1] = force_b
+    def told(t, acceleration):
+        at.state.acceleration[:] = acceleration
         sample = replace(fix(velocity(0.7)), t=t, t_arrival=t)
         R = filter_.measure(at.reference, at.state, RECEIVER, "gnss_velocity", sample).R
         return R - sample.sigma_velocity_n**2, filter_.as_judged("gnss_velocity", sample, np.eye(3)) - np.eye(3)
