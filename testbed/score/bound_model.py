@@ -259,7 +259,11 @@ def add_sensor(model: Model, dataset: xarray.DataTree, name: str, config: Sensor
             across = config.errors().noise_b
 
             def attitude(H: Array, part: slice) -> Array:
-                H[:, :, PHI] = way.C_nb[part].transpose(0, 2, 1)
+                # As against the stars, n itself is turned by an error of the position that it stands at.
+                C_bn, tangent = way.C_nb[part].transpose(0, 2, 1), np.tan(way.lla[part, 0])[:, None]
+                H[:, :, PHI] = -C_bn
+                H[:, :, POS.start] = -C_bn[:, :, 1] / MEAN_RADIUS
+                H[:, :, POS.start + 1] = (C_bn[:, :, 0] - tangent * C_bn[:, :, 2]) / MEAN_RADIUS
                 return across
 
             model.observe(times, rows(3, 1e-6, attitude))
@@ -372,8 +376,6 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
 
     flown = way.airspeed > SLOWEST
     model.observe(times[np.interp(times, way.t, flown) > 0], rows(1, 1e-3, speed))
-    if model.air is None:
-        return
     sigma, correlation_s = slip_statistics(way)
     slipping = model.add(gauss_markov([sigma], correlation_s))
 

@@ -27,6 +27,7 @@ from testbed.sensors.body_velocity import BodyVelocityConfig
 from testbed.sensors.gnss import GnssConfig
 from testbed.sensors.imu import ImuConfig
 from testbed.sensors.magnetometer import FieldMap, MagnetometerConfig
+from testbed.sensors.star_tracker import StarTrackerConfig
 
 DATE = datetime.date(2026, 6, 1)
 ROW_HZ, SECONDS = 50, 3
@@ -230,13 +231,42 @@ def test_measurements_are_those_of_the_sensors(flown: tuple[list[Pose], xarray.D
     ):
         made = model.Model(way)
         assert model.add_sensor(made, record, "one", config, DATE)
-        H = made.measured(slice(0, 1))[0, :, :9] * np.array(sigma)[:, None] / np.sqrt(ROW_HZ * SECONDS)
+        H = made.measured(slice(0, 1))[0, : len(sigma), :9] * np.array(sigma)[:, None] / np.sqrt(ROW_HZ * SECONDS)
         for k in range(9):
             change = np.zeros(9)
             change[k] = 1e-4
             turned = Rotation.from_rotvec(-change[:3]).as_matrix() @ C
             found = (measured(turned, v + change[3:6], change[6:]) - measured(C, v, np.zeros(3))) / 1e-4
             np.testing.assert_allclose(H[:, k], found, rtol=1e-3, atol=1e-3 * np.abs(H).max(), err_msg=str((config, k)))
+
+
+def test_a_star_tracker_sees_how_the_place_turns_the_horizon(flown: tuple[list[Pose], xarray.DataTree]) -> None:
+    """Attitude against the Earth's own axes, which is against the stars, beside errors of the motion."""
+    poses, record = flown
+    config = StarTrackerConfig()
+    made = model.Model(bound_way.way(record, np.eye(3), SECONDS))
+    assert model.add_sensor(made, record, "one", config, DATE)
+    C, _, (lat, lon, h) = poses[-1]
+    sigma = config.errors().noise_b
+    H = made.measured(slice(0, 1))[0, :, :9] * sigma[:, None] / np.sqrt(ROW_HZ * SECONDS)
+    R_M, R_N = radii(lat)
+
+    def from_earth(error: Array) -> Rotation:
+        north, east = lat + error[6] / (R_M + h), lon + error[7] / ((R_N + h) * np.cos(lat))
+        horizon = Rotation.from_euler("ZY", [east, -north - np.pi / 2])
+        return horizon * Rotation.from_rotvec(-error[:3]) * Rotation.from_matrix(C)
+
+    for k, size in [(k, 1e-4) for k in range(3)] + [(6, 1e3), (7, 1e3), (8, 1e3)]:
+        found = (from_earth(np.zeros(9)).inv() * from_earth(size * np.eye(9)[k])).as_rotvec() / size
+        np.testing.assert_allclose(H[:, k], found, atol=0.005 * max(np.abs(found).max(), 1e-9), err_msg=str(k))
+
+
+def test_who_knows_that_there_is_no_wind_knows_that_nothing_slips(flown: tuple[list[Pose], xarray.DataTree]) -> None:
+    _, record = flown
+    made = model.Model(bound_way.way(record, np.eye(3), SECONDS))
+    assert model.add_sensor(made, record, "one", AirspeedConfig(), DATE)
+    across = made.measured(slice(0, 1))[0, 1, 3:6]
+    np.testing.assert_allclose(across / np.linalg.norm(across), made.way.C_nb[0][:, 1], atol=1e-12)
 
 
 def test_gusts_along_their_axes_and_the_mean_wind_carry_the_air(flown: tuple[list[Pose], xarray.DataTree]) -> None:
