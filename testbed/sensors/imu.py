@@ -282,7 +282,9 @@ class Imu:
             turn_on = np.sign(turn_on)
         self._turn_on = turn_on * np.repeat([e.gyro_turn_on, e.accel_turn_on], 3)
         self._temperature_slope = draw("temperature", 6) * np.repeat([e.gyro_temperature, e.accel_temperature], 3)
-        self._asymmetry = draw("scale asymmetry", 6) * np.repeat([e.gyro_scale_asymmetry, e.accel_scale_asymmetry], 3)
+        # One scale is more by half of the difference, the other less.
+        half = 0.5 * np.repeat([e.gyro_scale_asymmetry, e.accel_scale_asymmetry], 3)
+        self._asymmetry = draw("scale asymmetry", 6) * half
         scale = draw("scale", 6) * np.repeat([e.gyro_scale, e.accel_scale], 3)
         misalignment = draw("misalignment", 6) * np.repeat([e.gyro_misalignment, e.accel_misalignment], 3)
         skewness = draw("non-orthogonality", 6) * np.repeat([e.gyro_nonorthogonality, e.accel_nonorthogonality], 3)

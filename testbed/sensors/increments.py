@@ -68,7 +68,8 @@ def accumulate(
     """Deterministic part of the chain: sensed increments of each output interval into ``out`` (n, 6).
 
     They are sums, or, ``sampled``, the filters' output at the end of the interval held over all of it: then vibration
-    has the phase of that moment and the size that filters of this ``bandwidth`` (2,) [Hz] leave of it, and folds.
+    has the phase of that moment, and folds. Of vibration both are given what filters of this ``bandwidth`` (2,) [Hz]
+    leave of its size: it may be faster than ticks, whose mean is another.
     ``rectified`` (6,) is the bias that vibration makes, per fourth power of the engine speed.
     ``state`` (6, 2) of the filters, ``total`` (6,) of the running interval and ``last`` (4,), rate and engine phase at
     the last tick, are carried from call to call.
@@ -108,13 +109,15 @@ def accumulate(
             c2, s2 = c1 * c1 - s1 * s1, 2.0 * c1 * s1
             if not sampled:
                 for i in range(6):
-                    x[i] += one * (vibration[0, i, 0] * c1 - vibration[0, i, 1] * s1)
-                    x[i] += two * (vibration[1, i, 0] * c2 - vibration[1, i, 1] * s2)
+                    share = (engine_rpm[k] / 60.0 / bandwidth[i // 3]) ** 2
+                    tone[i] = one / math.sqrt(1.0 + share**2) * (vibration[0, i, 0] * c1 - vibration[0, i, 1] * s1)
+                    share *= 4.0
+                    tone[i] += two / math.sqrt(1.0 + share**2) * (vibration[1, i, 0] * c2 - vibration[1, i, 1] * s2)
             last[3] = (last[3] + turn) % (2.0 * math.pi)
             for i in range(6):
                 drift[i] = rectified[i] * engine_rpm[k] ** 4 * tick_s
         else:
-            drift[:] = 0.0
+            tone[:] = drift[:] = 0.0
         for i in range(6):
             m = low_pass[i // 3]
             if tick + k == 1:
@@ -123,6 +126,8 @@ def accumulate(
             a = m[0, 0] * state[i, 0] + m[0, 1] * state[i, 1] + m[0, 2] * x[i]
             state[i, 1] = m[1, 0] * state[i, 0] + m[1, 1] * state[i, 1] + m[1, 2] * x[i]
             state[i, 0] = a
+            if not sampled:
+                y[i] += tone[i]
         due = (tick + k) % every == 0
         if sampled:
             if not due:

@@ -208,6 +208,22 @@ def test_scale_factor_asymmetry():
     np.testing.assert_allclose(down.dtheta[0] * RATE_HZ + 1, excess, rtol=1e-9)
 
 
+def test_the_scales_of_both_directions_differ_by_the_asymmetry():
+    """IEEE Std 528: the difference of the scale factors, of either sign, as a fraction; 1 sigma over 1200 axes."""
+    differences = []
+    for seed in range(200):
+        up, down = (
+            sense(
+                perfect(gyro_scale_asymmetry_ppm=1e4, accel_scale_asymmetry_ppm=1e4),
+                constant(3, RATE_HZ, omega=(sign,) * 3, force=(sign,) * 3),
+                seed=seed,
+            )
+            for sign in (1.0, -1.0)
+        )
+        differences += [(up.dtheta[0] + down.dtheta[0]) * RATE_HZ, (up.dv[0] + down.dv[0]) * RATE_HZ]
+    assert np.std(differences) == pytest.approx(1e-2, rel=0.08)
+
+
 def test_g_sensitivity_is_linear_in_specific_force():
     config = perfect(gyro_g_sensitivity_degphpg=100.0)
     one = sense(config, constant(2, RATE_HZ, force=(0, 0, -G))).dtheta

@@ -39,6 +39,21 @@ def test_lines_fold_at_the_sampling_rate_with_the_size_that_the_filter_leaves(rp
             np.testing.assert_allclose(amplitude, expected, rtol=0.02)
 
 
+@pytest.mark.parametrize("rpm", [3300.0, 5000.0, 5900.0])
+@pytest.mark.parametrize("bandwidth_hz", [42.0, 116.0, 300.0, None])
+def test_summed_over_a_tick_a_line_is_behind_one_filter_and_one_mean(rpm, bandwidth_hz):
+    """Of the continuous tone: a Butterworth filter's gain, and the mean over the tick, sinc(f T)."""
+    imu = sense(running(40_001, rpm), rate_hz=200.0, vibration_mg=200.0, accel_bandwidth_hz=bandwidth_hz)
+    square = 0.0
+    for harmonic, share in ((1, 1.0), (2, 0.5)):
+        line_hz = harmonic * rpm / 60
+        b, a = signal.butter(2, 2 * np.pi * (bandwidth_hz or 1e9), analog=True)
+        _, (gain,) = signal.freqs(b, a, [2 * np.pi * line_hz])
+        square += (0.2 * G * (rpm / 6000) ** 2 * share * abs(gain) * np.sinc(line_hz / TICK_HZ)) ** 2 / 2
+    force = imu.dv[1000:] * TICK_HZ
+    np.testing.assert_allclose(np.sqrt((force**2).mean(axis=0)), np.sqrt(square), rtol=0.02)
+
+
 def test_near_the_sampling_rate_a_line_becomes_a_slow_error():
     imu = sense(running(20_001, 5999.4), rate_hz=100.0, output="sampled", vibration_mg=200.0, accel_bandwidth_hz=44.0)
     force = imu.dv[:, 0] * 100.0
