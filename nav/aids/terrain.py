@@ -18,7 +18,8 @@ from functools import cached_property
 import numpy as np
 
 from nav._jit import njit
-from nav.aids.base import Measurement, OperatingPoint, Ruling, range_problem
+from nav.aids.base import NO_RATES, Axes, Measurement, OperatingPoint, Ruling, range_problem
+from nav.aids.gnss import gnss_position, gnss_velocity
 from nav.aids.position_fix import position_fix
 from nav.earth import earth_rate_n, radii
 from nav.error_model import PHI, POS, VEL, Block, markov
@@ -118,6 +119,7 @@ class RangefinderAid:
     local_sigma: float = 0.0
     local_correlation_s: float = 10.0
     search: Search | None = None
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to sensor [m]; a search, which is after tens of metres, leaves it out
 
     @property
     def parts(self) -> tuple[tuple[str, int], ...]:
@@ -150,12 +152,13 @@ class RangefinderAid:
                 return None if self.search.fix is None else _fixed(self.search.fix, at)
             if self.search.lost and not self.search.stuck:
                 return None
-        state, terrain, (raised, local, scale) = at.state, self.terrain, at.starts
+        terrain, (raised, local, scale) = self.terrain, at.starts
+        lla, _, place, _ = there(at, self.arm_b)
         nu, H = range_to_ground(
-            state.q_nb, state.lla, at.x, raised, local, scale, reach(at.P), sample.range, terrain.heights, terrain.grid
+            at.state.q_nb, lla, at.x, raised, local, scale, reach(at.P), sample.range, terrain.heights, terrain.grid
         )
         stuck = STUCK if self.search is not None and self.search.stuck else None
-        return None if math.isnan(nu[0]) else Measurement(nu, H, self._R, stuck)
+        return None if math.isnan(nu[0]) else Measurement(nu, H + H[:, POS : POS + 3] @ place, self._R, stuck)
 
 
 @dataclass(frozen=True)
@@ -175,6 +178,7 @@ class OpticalFlowAid:
     map_sigma: float = 5.0
     local_sigma: float = 0.0
     local_correlation_s: float = 10.0
+    arm_b: Axes = (0.0, 0.0, 0.0)  # IMU to sensor [m]
 
     parts = (("optical_flow", 2),)
 
@@ -195,13 +199,37 @@ class OpticalFlowAid:
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
         assert isinstance(sample, OpticalFlowSample)
-        state, terrain, (raised, local, scale, error) = at.state, self.terrain, at.starts
+        terrain, (raised, local, scale, error) = self.terrain, at.starts
+        lla, v_n, place, swing = there(at, self.arm_b)
         nu, H = optical_flow(
-            state.q_nb, state.v_n, state.lla, at.x, raised, local, scale, error, reach(at.P), sample.flow_b,
+            at.state.q_nb, v_n, lla, at.x, raised, local, scale, error, reach(at.P), sample.flow_b,
             sample.rotation_b, terrain.heights, terrain.grid,
         )  # fmt: skip
+        H += H[:, POS : POS + 3] @ place + H[:, VEL : VEL + 3] @ swing
         R = np.full(2, self.sigma**2 / max(sample.quality, LEAST_QUALITY))
-        return None if math.isnan(nu[0]) else Measurement(nu, H, R)
+        unknown = NO_RATES if any(self.arm_b) and not at.state.rates[0].any() else None
+        return None if math.isnan(nu[0]) else Measurement(nu, H, R, unknown)
+
+
+def there(at: OperatingPoint, arm_b: Axes) -> tuple[Array, Array, Array, Array]:
+    """Where a sensor is that is ``arm_b`` [m] from the IMU, and how fast: lat, lon [rad], h [m] and v_n [m/s], (3,).
+
+    And what all errors but the IMU's own of position and velocity change of both: Jacobians (3, n), to be led on by
+    those of the measurement. See `nav.aids.gnss.gnss_position` and `gnss_velocity`.
+    """
+    state, arm, nothing = at.state, np.array(arm_b, dtype=float), np.zeros((3, len(at.x)))
+    if not arm.any():
+        return state.lla, state.v_n, nothing, nothing
+    lat, lon, h = state.lla.tolist()
+    R_M, R_N = radii(lat)
+    before, place = gnss_position(state.q_nb, state.lla, at.x, arm, -1, lat, lon, h)
+    north, east, down = (-before).tolist()
+    before, swing = gnss_velocity(
+        state.q_nb, state.v_n, state.lla, at.x, state.rates[0], state.errors, at.reference.driven, arm, -1, np.zeros(3)
+    )
+    place[:, POS : POS + 3] = swing[:, VEL : VEL + 3] = 0.0
+    lla = np.array([lat + north / (R_M + h), lon + east / ((R_N + h) * math.cos(lat)), h - down])
+    return lla, -before, place, swing
 
 
 def _fixed(fix: Fix, at: OperatingPoint) -> Measurement:

@@ -152,7 +152,7 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
     from_imu: tuple[float, float, float] = tuple(0.0 - imu.lever_arm_b)
     match section:
         case RangefinderConfig() | OpticalFlowConfig():
-            return _eye(name, section, rig.site, usual)
+            return _eye(name, section, rig.site, usual, from_imu)
         case GnssConfig():
             e = section.errors()
             return GnssAid(
@@ -234,13 +234,17 @@ def _compass(name: str, section: MagnetometerConfig, usual: Usual) -> Aid:
     )  # fmt: skip
 
 
-def _eye(name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, usual: Usual) -> Aid:
+def _eye(
+    name: str, section: RangefinderConfig | OpticalFlowConfig, site: Site, usual: Usual,
+    arm_b: tuple[float, float, float],
+) -> Aid:  # fmt: skip
     """A sensor that looks at the ground, with the map, whose errors pass by as fast as the aircraft usually flies."""
     map_ = site.terrain, site.terrain_sigma, site.local_sigma, site.local_length / usual.airspeed_mps
     if isinstance(section, RangefinderConfig):
         r = section.errors()
         noise = r.noise or BEST_PLACE
         places = PointMass(site.terrain, noise, *map_[2:])
-        return RangefinderAid(name, noise, r.scale, *map_, Search(places) if site.terrain.heights.size > 1 else None)
+        search = Search(places) if site.terrain.heights.size > 1 else None
+        return RangefinderAid(name, noise, r.scale, *map_, search, arm_b)
     f = section.errors()
-    return OpticalFlowAid(name, f.noise or BEST_FLOW, f.scale, f.bias, f.tau, *map_)
+    return OpticalFlowAid(name, f.noise or BEST_FLOW, f.scale, f.bias, f.tau, *map_, arm_b)

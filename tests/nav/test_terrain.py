@@ -9,11 +9,16 @@ import pymap3d
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
+from worlds.ins import CONSUMER
 
-from nav.aids.terrain import optical_flow, range_to_ground
+from nav.aids.base import Measurement, OperatingPoint, aid_blocks
+from nav.aids.terrain import OpticalFlowAid, RangefinderAid, optical_flow, range_to_ground
+from nav.alignment import InitialState
 from nav.earth import OMEGA_IE, radii, wrap_longitude
-from nav.error_model import MOTION, PHI, POS, VEL
+from nav.error_model import MOTION, PHI, POS, VEL, ErrorModel
+from nav.reference import Reference
 from nav.rotation import quat_from_rotvec, quat_multiply
+from nav.samples import OpticalFlowSample, RangeSample
 from nav.terrain import Terrain, ground, slant_range
 
 LAT, LON = math.radians(36.5), math.radians(-84.2)
@@ -149,3 +154,52 @@ def test_signs_of_flow() -> None:
             level, np.array(v_n), lla, x, -1, -1, -1, -1, 0.0, nothing, nothing, FLAT.heights, FLAT.grid
         )  # fmt: skip
         np.testing.assert_allclose(-nu, np.array(expected) - [OMEGA_IE * math.cos(LAT), 0], atol=1e-12)
+
+
+ARM, RATE_B = np.array([0.3, 1.2, -0.4]), np.array([0.05, -0.02, 0.1])
+EYES = (RangefinderAid(arm_b=tuple(ARM), terrain=FLAT), OpticalFlowAid(arm_b=tuple(ARM), terrain=FLAT))
+MODEL = ErrorModel(CONSUMER, aid_blocks(EYES))
+
+
+def banked(error: np.ndarray) -> OperatingPoint:
+    """A turn over flat ground as a filter has it, whose motion is off by an ``error`` (9,)."""
+    reference = Reference([MODEL], [1.0], 10, lambda *_: np.zeros(3))
+    level = Rotation.from_rotvec(-error[PHI : PHI + 3])
+    attitude = level * Rotation.from_euler("ZYX", [0.6, 0.05, 0.4])
+    place = pymap3d.ned2geodetic(*error[POS : POS + 3], LAT, LON, 320.0, deg=False)
+    v_n = np.array([20.0, 9.0, -1.0]) + error[VEL : VEL + 3]
+    state = reference.start(InitialState(0.0, *place, v_n, attitude.as_quat(scalar_first=True), np.eye(9)))
+    state.rates[0] = RATE_B
+    return OperatingPoint(reference, state, state.x[0], (), state.P[0])
+
+
+@pytest.mark.parametrize("aid", EYES, ids=lambda aid: aid.sensor)
+def test_a_sensor_beside_the_imu_sees_from_where_it_is(aid: RangefinderAid | OpticalFlowAid) -> None:
+    """What it measures there is no news to a filter, and what its errors change is as differences say."""
+    at = banked(np.zeros(9))
+    C = Rotation.from_quat(at.state.q_nb, scalar_first=True)
+    earth_b = C.inv().apply(OMEGA_IE * np.array([math.cos(LAT), 0.0, -math.sin(LAT)]))
+    _, _, h = pymap3d.ned2geodetic(*C.apply(ARM), LAT, LON, 320.0, deg=False)
+    distance = (h - 120.0) / C.as_matrix()[2, 2]
+    v_b = C.inv().apply(at.state.v_n) + np.cross(RATE_B - earth_b, ARM)
+    seen = np.array([-v_b[1], v_b[0]]) / distance + RATE_B[:2] - earth_b[:2]
+    sample: RangeSample | OpticalFlowSample = RangeSample(0.0, 0.0, distance)
+    if isinstance(aid, OpticalFlowAid):
+        sample = OpticalFlowSample(0.0, 0.0, seen, RATE_B[:2], 1.0)
+
+    def measured(error: np.ndarray) -> Measurement:
+        here = banked(error)._replace(starts=tuple(map(MODEL.start, aid.states)))
+        found = aid.measure(aid.parts[0][0], sample, here)
+        assert found is not None
+        return found
+
+    nothing = measured(np.zeros(9))
+    np.testing.assert_allclose(nothing.nu, 0.0, atol=1e-3 if isinstance(aid, RangefinderAid) else 1e-6)
+    for k, step in enumerate([1e-5] * 3 + [1e-3] * 3 + [0.1] * 3):
+        off = step * np.eye(9)[k]
+        slope = (measured(-off).nu - measured(off).nu) / (2 * step)
+        np.testing.assert_allclose(nothing.H[:, k], slope, rtol=2e-3, atol=2e-5, err_msg=str(k))
+    gyro = MODEL.start("gyro_bias")
+    swing = np.array([np.cross(-np.eye(3)[k], ARM) for k in range(3)]).T  # of a rate that is known less by its bias
+    expected = {"range": np.zeros((1, 3)), "optical_flow": np.array([-swing[1], swing[0]]) / distance}[aid.parts[0][0]]
+    np.testing.assert_allclose(nothing.H[:, gyro : gyro + 3], expected, atol=1e-9)
