@@ -88,7 +88,11 @@ def _ranks(n: int, p: float) -> tuple[int | None, int | None]:
 
 
 def bootstrapped(name: str, function: Callable[[Array], float]) -> Statistic:
-    """Any ``function`` of the figures of all draws; percentiles of a bootstrap over draws (`scipy.stats.bootstrap`)."""
+    """Any ``function`` of the figures of all draws; percentiles of a bootstrap over draws (`scipy.stats.bootstrap`).
+
+    They are too near each other where draws are few: an RMS of Gaussian figures is between them in 72, 84, 88 and 91 %
+    of cases, not 95 %, with 5, 10, 20 and 40 draws.
+    """
 
     def of(values: Array) -> Interval:
         from scipy.stats import bootstrap

@@ -1,5 +1,7 @@
 """Barometer and airspeed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -7,6 +9,7 @@ from worlds.sensor_truth import RATE_HZ, lively, still
 
 from testbed import Scenario
 from testbed.estimators.datasheet import aid_of
+from testbed.estimators.rig import Air
 from testbed.sensors.airspeed import Airspeed, AirspeedConfig
 from testbed.sensors.barometer import Barometer, BarometerConfig
 
@@ -86,6 +89,20 @@ def test_unsteady_errors_are_gauss_markov_and_filters_know():
     assert (wake.sigma, wake.error_sigma, wake.error_correlation_s) == pytest.approx((3 / 12, 32 / 12, 8.0))
     assert wake.bias_walk == pytest.approx(80 / 12 * np.sqrt(2 / 300))
     assert told["airspeed"].sigma == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
+
+
+@pytest.mark.parametrize("usual_mps", [14.0, 18.0, 25.0, 35.0])
+def test_filters_are_told_the_errors_of_pressure_at_the_usual_airspeed(usual_mps):
+    """What 200 sensors make of that airspeed, beside what a filter of such an aircraft reckons with, gusts left out."""
+    truth = flying(4000, 10.0)
+    truth.airspeed[:] = usual_mps
+    config = AirspeedConfig(rate_hz=10.0, grade="hobby", scale_percent=0.0, sideslip_percent=0.0, gust_mps=0.0)
+    off = np.array([speeds(config, truth, seed, 10.0) - usual_mps for seed in range(200)])
+    rig = Scenario.load("u_turn").rig(1)
+    rig = replace(rig, sensors={"airspeed": config}, usual=rig.usual.model_copy(update={"airspeed_mps": usual_mps}))
+    told = aid_of("airspeed", rig, Scenario.load("u_turn").rig(1).imu("imu").errors(), Air(gust=0.0, wind_walk=0.0))
+    assert told.sigma == pytest.approx((off - off.mean(axis=1, keepdims=True)).std(), rel=0.03)
+    assert told.scale_sigma * usual_mps == pytest.approx(off.mean(axis=1).std(), rel=0.12)
 
 
 @pytest.mark.parametrize("beta_deg", [0.0, 10.0, -20.0])
