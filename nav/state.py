@@ -292,12 +292,7 @@ def propagate(
     Phi, FT, decay, half_noise = working(room, common, n)
     bad = -1
     shaken = in_motion[0, 2] > 0.0
-    angle, push, before, old = (
-        FT[0, :3],
-        FT[1, :3],
-        FT[2, :4],
-        FT[3, :3],
-    )  # done with when a covariance step needs the room
+    angle, push, before, old = FT[0, :3], FT[1, :3], FT[2, :4], FT[3, :3]  # until a covariance step needs the room
     for k in range(len(dt) + 1):
         T = dt[k] if k < len(dt) else 0.0
         if T > 0.0:

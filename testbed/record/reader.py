@@ -30,7 +30,7 @@ IN_JSON: Mapping[str, type] = {
     "reference_sigma_n": list,
 }
 SAID = {"scenario", "overrides", "estimated_point_b_m", *NUMBERS}
-# What comes with a column that only samples of one kind have.
+# What comes with a column that samples of ours have. Where more than one is not there, they are the user's.
 COMES_WITH: Mapping[str, Sequence[str]] = {
     "fix_type": ("lat", "lon", "h", "v_n", "sigma_position_n", "sigma_velocity_n", "satellites", "hdop", "vdop"),
     "dtheta": tuple(IMU),
@@ -104,9 +104,11 @@ def _needed(path: str, group: Mapping[str, object]) -> set[str]:
         case ["estimators", _, "innovations", _]:
             return {*REPORT, *({"innovation", "S"} if group.keys() & {"innovation", "S"} else ())}
         case ["sensors", _]:
-            return {"t_arrival" if "dtheta" not in group else "dt"}.union(
-                *(others for one, others in COMES_WITH.items() if one in group)
-            )
+            needed = set() if "dtheta" in group else {"t_arrival"}
+            for one, others in COMES_WITH.items():
+                if one in group and len(set(others) - group.keys()) == 1:
+                    needed.update(others)
+            return needed
         case ["events"]:
             return set(EVENT)
         case ["faults"]:
