@@ -70,6 +70,9 @@ def ordered(
             t, rows = t[kept], rows[kept]
 
     keep(np.isfinite(t), "times are no numbers, and left out")
+    if len(t) > 1 and np.median(np.diff(t)) < 0:  # as tables are that begin with the newest row
+        notes.append(f"{name}: its times go back from row to row, and are taken from the last row on")
+        t, rows = t[::-1], rows[::-1]
     keep(~_astray(t), "times are far off those before and after, and left out")
     t = _unwrapped(name, t, notes)
     t, rows = _longest_part(name, t, rows, notes)

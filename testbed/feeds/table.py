@@ -325,6 +325,8 @@ def quantities(
     for keys in NEEDED[kind]:
         if not any(key in given for key in keys):
             raise UserError(f"{where}.{keys[0]}: is missing: a sensor of kind {kind} needs {' or '.join(keys)}")
+        if len(keys) > 1 and all(key in given for key in keys):
+            raise UserError(f"{where}.{keys[1]}: is given beside {keys[0]}: say one of {' and '.join(keys)} only")
     values = {}
     for key, column in (given | {"time": stream.time}).items():
         table = tables[Path(column.file or stream.file or main)]

@@ -12,13 +12,14 @@ misleads nobody.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from nav.detection import chi_square_threshold
-from nav.samples import Status
+from nav.samples import Outcome, Status
 from testbed.errors import UserError
 from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
@@ -33,6 +34,7 @@ LOST = ".nonfinite_samples"
 CONFIDENCE = 0.999  # of the bound
 WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
 FEW, MOST = 10, 0.5  # looks, and the share of them that nobody refuses who is right
+USELESS = Outcome.OUT_OF_RANGE, Outcome.UNSOUND
 FAR = 1.5  # mean NIS per degree of freedom: sigmas are a fifth too small
 
 
@@ -47,6 +49,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *not_finite(metrics),
         *_silent(dataset),
         *_refusing(dataset),
+        *_useless(dataset),
         *_uncounted(dataset),
         *unfinished_leg(dataset),
         *_impossible(dataset),
@@ -83,6 +86,21 @@ def _refusing(dataset: xarray.DataTree) -> Iterator[str]:
             gated = looks.gated[looks.t >= aligned_s]
             if len(gated) >= FEW and gated.mean() > MOST:
                 yield f"{name} refused {gated.mean():.0%} of {aid} since its alignment: it is wrong, or the sensor is"
+
+
+def _useless(dataset: xarray.DataTree) -> Iterator[str]:
+    """Which aids are of no use to an estimator, as one in a wrong unit: no statistic of innovations tells of that."""
+    for name in accuracy.names(dataset):
+        _, aligned_s = accuracy.alignment(dataset, name)
+        for aid in accuracy.aids(dataset, name) if aligned_s is not None else ():
+            t, outcome, reason = (
+                accuracy.column(dataset, f"estimators/{name}/innovations/{aid}/{what}")
+                for what in ("sample_time", "outcome", "reason")
+            )
+            since = t >= aligned_s
+            if since.sum() >= FEW and np.isin(outcome[since], USELESS).all():
+                ((why, _),) = Counter(reason[since].tolist()).most_common(1)
+                yield f"{name} could use none of {since.sum()} samples of {aid} since its alignment, such as: {why}"
 
 
 def _uncounted(dataset: xarray.DataTree) -> Iterator[str]:

@@ -196,3 +196,15 @@ def test_a_spare_unit_is_given_at_the_times_of_the_first() -> None:
     assert np.allclose(ready.dtheta[known], first.dtheta[known])
     assert known[5:-25].all()
     assert not known[-10:].any()
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_a_table_that_begins_with_its_newest_row_is_read_from_its_end(wrong: int) -> None:
+    notes: list[str] = []
+    t = T[::-1].copy()
+    t[100 : 100 + wrong] = np.nan
+    kept, rows = ordered("imu", t, notes)
+    expected = np.flatnonzero(np.isfinite(t))[::-1]
+    np.testing.assert_array_equal(rows, expected)
+    np.testing.assert_array_equal(kept, t[expected])
+    assert "imu: its times go back from row to row, and are taken from the last row on" in notes

@@ -236,6 +236,17 @@ def test_what_is_wrong_with_a_sensors_file_is_told(tmp_path: Path) -> None:
         formats.open_log(truth)
 
 
+def test_one_quantity_in_two_columns_is_refused(tmp_path: Path) -> None:
+    """One of them would be left unread without a word."""
+    path = write(tmp_path)
+    more = '[truth.columns.barometer]\nfile = "fixes.txt"\ntime = "0"\npressure = "1"\nheight = "3"\n[sensors.imu]'
+    path.write_text(SCENARIO.replace("[sensors.imu]", more))
+    truth = Scenario.load(path).truth
+    assert isinstance(truth, LogTruth)
+    with pytest.raises(UserError, match=r"truth\.columns\.barometer\.height: is given beside pressure: say one of"):
+        formats.open_log(truth)
+
+
 def test_dates_are_times(tmp_path: Path) -> None:
     """As ISO 8601 has them, of any zone: UTC where they say none."""
     start = dt.datetime(2024, 6, 1, 12, tzinfo=dt.UTC)

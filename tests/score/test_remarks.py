@@ -187,3 +187,13 @@ def test_who_refuses_most_in_a_run_too_short_to_be_scored_is_told() -> None:
     told = run(Scenario.load("u_turn", aided)).remarks
     assert [one for one in told if one.startswith("ins refused") and "of gnss_position since its alignment" in one]
     assert not [one for one in run(Scenario.load("u_turn", aided | {"fault": []})).remarks if " refused " in one]
+
+
+def test_an_aid_of_which_nothing_can_be_used_is_told() -> None:
+    """As of one in a wrong unit: all its samples are out of range, and no innovation is formed."""
+    wrong = {"sensor": "barometer", "channel": "pressure", "kind": "step", "size": 9e6, "window": [0, 90]}
+    told = run(Scenario.load("u_turn", {"duration_s": 90, "expect": {}, "fault": [wrong]})).remarks
+    (said,) = [one for one in told if " could use none of " in one]
+    assert said.startswith("ins could use none of ")
+    assert "samples of barometer since its alignment, such as: pressure 9.0" in said
+    assert said.endswith("e+06 is out of range")
