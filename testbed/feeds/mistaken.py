@@ -44,8 +44,11 @@ def mistaken(log: Log) -> list[str]:
 
 
 def _receiver(own: Sequence[Any]) -> Iterator[str]:
-    """Where its positions go otherwise than its velocities say."""
-    t, v_n, place = fixes(own)
+    return gone_otherwise(*fixes(own))
+
+
+def gone_otherwise(t: Array, v_n: Array, place: Array) -> Iterator[str]:
+    """Where positions (N, 3), latitude, longitude [rad] and height, go otherwise than velocities (N, 3) say."""
     usable = np.isfinite(v_n).all(axis=1) & np.isfinite(place).all(axis=1)
     t, v_n, place = t[usable], v_n[usable], place[usable]
     ways = list(_stretches(t, v_n, place))

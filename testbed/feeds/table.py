@@ -18,10 +18,12 @@ from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
 from testbed.feeds.formats import known
 from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
+from testbed.feeds.mistaken import gone_otherwise
 from testbed.feeds.reference import doubt, elsewhere_in_height, silence, usual_sigma
 from testbed.feeds.rest import tilted
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, left_out, ordered, spaced, with_holes
+from testbed.feeds.turning import turns_otherwise
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
@@ -178,6 +180,13 @@ def contradicted(
         said.append(f"{apart} of {name}")
     if lies := tilted(reference, imus, samples):
         said.append(f"{lies}: unit, order or frame of its attitude, or axes of accel, are not as truth.columns says")
+    elif turns := turns_otherwise(reference, imus):
+        said.append(f"{turns}: unit, order or frame of its attitude, or axes of gyro, are not as truth.columns says")
+    own = reference.columns
+    if {"lat", "lon", "h", "v_n"} <= own.keys():
+        place = np.column_stack([own[axis] for axis in ("lat", "lon", "h")])
+        ways = gone_otherwise(reference.t, own["v_n"], place)
+        said += [f"{reference.name}: {way}: are units, columns and axes right?" for way in ways]
     return "; ".join(one for one in said if one)
 
 
