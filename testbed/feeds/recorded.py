@@ -32,6 +32,7 @@ from testbed.sensors.timing import InterruptedTiming, outside
 
 EDGE_S = 1e-6  # a sample this close to a row comes with it
 DIGITS = 3  # of a rate that is found
+FASTEST_HZ = 10_000.0  # of any sensor
 SLOWEST_IMU_HZ = 5.0
 NOBODY = Reference("none: nothing is judged", np.empty(0), {})
 
@@ -79,6 +80,8 @@ def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
         if kind == "imu" and rate(log, name) < SLOWEST_IMU_HZ:
             slow = f"reports {rate(log, name):g} times a second: at least {SLOWEST_IMU_HZ:g} are needed"
             raise UserError(f"sensors.{name}: the IMU of {log.path} {slow}")
+        if "rate_hz" not in section.model_fields_set and (often := rate(log, name)) > FASTEST_HZ:
+            raise UserError(f"sensors.{name}: {log.path} has {often:g} samples a second: is the unit of its time so?")
 
 
 def _require_near(log: Log, name: str, imu: ImuSamples, start_s: float) -> None:

@@ -247,6 +247,15 @@ def test_one_quantity_in_two_columns_is_refused(tmp_path: Path) -> None:
         formats.open_log(truth)
 
 
+def test_a_unit_of_time_that_can_not_be_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    path.write_text(SCENARIO.replace('time = "0"\nform', 'time = { column = "0", unit = "us" }\nform'))
+    with pytest.raises(
+        UserError, match=r"sensors\.imu: .*imu\.txt has 5e\+07 samples a second: is the unit of its time"
+    ):
+        run(Scenario.load(path))
+
+
 def test_dates_are_times(tmp_path: Path) -> None:
     """As ISO 8601 has them, of any zone: UTC where they say none."""
     start = dt.datetime(2024, 6, 1, 12, tzinfo=dt.UTC)
