@@ -151,7 +151,7 @@ class Realignment:
         nothing that a linear correction could use.
         """
         aids, arm = self._beginning.aids, math.hypot(*self._beginning.arm_b)
-        variance_p = whole(fix.sigma_position_n, aids.gnss_position) + arm**2
+        variance_p = whole(fix.sigma_position_n, aids.gnss_position) + arm**2 + (aids.gnss_latency * fix.v_n) ** 2
         variance_v = whole(fix.sigma_velocity_n, aids.gnss_velocity) + (SWING * arm) ** 2
         if not fix.has_fix or not has_velocity(fix) or _is_elsewhere(fix, variance_p, state, filters):
             return

@@ -15,8 +15,8 @@ To the program, fields separated by blanks, SI units and radians, ``nan`` where 
 than `ANSWER_S` is the end of the program.
 """
 
-import select
 import subprocess
+import threading
 import weakref
 from contextlib import suppress
 
@@ -39,6 +39,7 @@ class External:
         if isinstance(command, str):
             raise ValueError(f"command is a list: the program and its arguments, such as {command.split()}")
         self.program = subprocess.Popen(command, cwd=rig.folder, stdin=pipe, stdout=pipe, text=True)
+        self.too_late = False
         weakref.finalize(self, stop, self.program)  # at the end of the run, or of Python
 
     def propagate(self, imu):
@@ -67,15 +68,25 @@ class External:
             raise self.ended() from None
 
     def ended(self):
-        return RuntimeError(f"the program has ended with exit code {self.program.wait()}")
+        stop(self.program)
+        return RuntimeError(f"the program has ended with exit code {self.program.returncode}")
+
+    def give_up(self):
+        self.too_late = True
+        self.program.kill()  # which ends whatever waits for it
 
     def estimate(self):
-        self.send("estimate\n")
-        with suppress(BrokenPipeError):
-            self.program.stdin.flush()
-        if not select.select([self.program.stdout], [], [], ANSWER_S)[0]:
+        late = threading.Timer(ANSWER_S, self.give_up)
+        late.start()
+        try:
+            self.send("estimate\n")
+            with suppress(BrokenPipeError):
+                self.program.stdin.flush()
+            answer = self.program.stdout.readline()
+        finally:
+            late.cancel()
+        if self.too_late:
             raise RuntimeError(f"the program has not answered for {ANSWER_S:g} s")
-        answer = self.program.stdout.readline()
         if not answer:
             raise self.ended()
         try:

@@ -40,7 +40,7 @@ def circle(
     """Horizontal errors (n, 2) [m] and NEES (n,) of them."""
     rng = np.random.default_rng(seed)
     aid = RangefinderAid("r", SIGMA_R, 0.0, known, raised, sigma, length / SPEED)
-    state = SimpleNamespace(q_nb=np.array([1.0, 0.0, 0.0, 0.0]), lla=np.zeros(3))
+    state = SimpleNamespace(q_nb=np.array([1.0, 0.0, 0.0, 0.0]), lla=np.zeros(3), v_n=np.zeros(3))
     P = np.zeros((MOTION + 2, MOTION + 2))
     P[[POS, POS + 1], [POS, POS + 1]], P[[VEL, VEL + 1], [VEL, VEL + 1]] = 25.0, SIGMA_V**2
     P[TERRAIN, TERRAIN], P[LOCAL, LOCAL] = raised**2, sigma**2

@@ -419,6 +419,8 @@ def answering(answer: str) -> list[str]:
     (answering("break"), "the program has ended with exit code 0"),
     ([sys.executable, "-c", "raise SystemExit(3)"], "the program has ended with exit code 3"),
     (answering("print(end='', flush=True)"), "the program has not answered for 0.5 s"),
+    (answering("print('0.0 0 nan', end='', flush=True)"), "the program has not answered for 0.5 s"),
+    ([sys.executable, "-c", "import os, time; os.close(1); time.sleep(99)"], "the program has ended with exit code -9"),
     (["yes"], "the program has answered 'y\\n'"),
 ])  # fmt: skip
 def test_what_is_wrong_with_an_external_program_is_said(
