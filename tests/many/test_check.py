@@ -17,6 +17,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import xarray
 
 import testbed
 import testbed.__main__ as cli
@@ -260,7 +261,7 @@ def test_an_error_is_a_failure_of_the_scenario(
 
 
 def test_a_lost_flight_fails_though_all_bounds_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = {"truth/time": SimpleNamespace(values=[0.0, 12.0])}
+    truth = xarray.DataTree.from_dict({"/truth": xarray.Dataset(coords={"time": [0.0, 12.0]})})
     lost = SimpleNamespace(metrics={}, failure="control lost: bank 80 deg", dataset=truth, remarks=(), ended={})
     monkeypatch.setattr(loop, "run", lambda *_, **__: lost)
     monkeypatch.setattr(report, "write_report", lambda *_: None)
