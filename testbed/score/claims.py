@@ -90,8 +90,7 @@ def _ranks(n: int, p: float) -> tuple[int | None, int | None]:
 def bootstrapped(name: str, function: Callable[[Array], float]) -> Statistic:
     """Any ``function`` of the figures of all draws; percentiles of a bootstrap over draws (`scipy.stats.bootstrap`).
 
-    They are too near each other where draws are few: an RMS of Gaussian figures is between them in 72, 84, 88 and 91 %
-    of cases, not 95 %, with 5, 10, 20 and 40 draws.
+    For what neither order statistics nor Student's interval tell; its ends are too near each other where draws are few.
     """
 
     def of(values: Array) -> Interval:
@@ -133,15 +132,6 @@ def _share(values: Array) -> Interval:
     return Interval(float(hits / trials), low, high)
 
 
-def _ratio_of_means(values: Array) -> float:
-    return float(values[:, 0].mean() / values[:, 1].mean())
-
-
-def _ratio_of_rms(values: Array) -> float:
-    square = np.mean(values**2, axis=0)
-    return float(np.sqrt(square[0] / square[1]))
-
-
 def student(values: Array) -> Interval:
     """The mean of some values, with the ends of Student's interval: infinite ones where there is one value only."""
     from scipy.special import stdtrit  # as scipy.stats, which takes half a second to import
@@ -155,19 +145,29 @@ def student(values: Array) -> Interval:
     return Interval(mean, mean - half, mean + half)
 
 
-def _rms_over_bound(values: Array) -> Interval:
-    """Of (draws, 2), errors and their bounds: the ratio of root mean squares, by Student's interval of the squares."""
-    error, bound = (values**2).T
-    return Interval(*(math.sqrt(max(end, 0.0)) for end in student(error / bound.mean())))
+def _product(values: Array, exponents: tuple[float, ...]) -> Interval:
+    """Of (draws, n): the product of the n means, each to its power, and Student's interval of its logarithm.
+
+    An RMS of Gaussian figures is in it in 91, 91, 93 and 94 % of cases with 5, 10, 20 and 100 draws; in a bootstrap's
+    interval it is in 72, 84, 88 and 94 %.
+    """
+    means = values.mean(axis=0)
+    value = float(np.prod(means**exponents))
+    if not 0 < value < math.inf:
+        return Interval(value, value, value)
+    mean, _, high = student((values / means) @ exponents)
+    return Interval(value, value * math.exp(mean - high), value * math.exp(high - mean))
 
 
+RATIO = (1.0, -1.0)  # of (draws, 2): the first over the second
+ROOT, RATIO_OF_ROOTS = (0.5,), (0.5, -0.5)
 MEDIAN = quantile(0.5)
 NEARLY_ALL, HARDLY_ANY = quantile(0.95), quantile(0.05)  # what is said of "any" draw: 100 draws can show no more
-MEAN = bootstrapped("mean", lambda values: float(np.mean(values)))
-RMS = bootstrapped("RMS", lambda values: float(np.sqrt(np.mean(values**2))))
-RATIO_OF_RMS = bootstrapped("ratio of RMS", _ratio_of_rms)  # of (draws, 2): the first over the second
-RATIO_OF_MEANS = bootstrapped("ratio of means", _ratio_of_means)  # likewise
-RMS_OVER_BOUND = Statistic("RMS / bound", _rms_over_bound)
+MEAN = Statistic("mean", student)
+RMS = Statistic("RMS", lambda values: _product(values[:, None] ** 2, ROOT))
+RATIO_OF_RMS = Statistic("ratio of RMS", lambda values: _product(values**2, RATIO_OF_ROOTS))
+RATIO_OF_MEANS = Statistic("ratio of means", lambda values: _product(values, RATIO))
+RMS_OVER_BOUND = Statistic("RMS / bound", RATIO_OF_RMS.of)  # of (draws, 2): errors and their bounds
 SHARE = Statistic("share", _share)
 EXACT = Statistic("exact", _exact)  # of a figure that nothing is drawn for
 
