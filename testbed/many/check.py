@@ -181,7 +181,7 @@ def tasks(names: Sequence[str], out: Path, golden: Path | None, update: bool = F
         scenario, name = Scenario.load(one), Path(one).stem
         if name in made:
             raise UserError(f"{one}: there is another scenario of that name among these: check one at a time")
-        known = read_golden(golden / f"{name}.json") if golden is not None else None
+        known = read_golden(golden / f"{name}.json") if golden is not None and scenario.golden else None
         if not scenario.expect and known is None and not update:
             raise UserError(f"{one}: has no [expect] and no golden metrics, so there is nothing to check: add some")
         made[name] = Task(name, scenario, out / name, None if update else known)
@@ -210,7 +210,12 @@ def update(outcomes: Sequence[Outcome], folder: Path) -> list[Outcome]:
     should look at, and small steps in one direction add up until they are seen.
     """
     make_folder(folder)
-    return [outcome if outcome.failed else _update(outcome, folder / f"{outcome.name}.json") for outcome in outcomes]
+    return [
+        _update(outcome, folder / f"{outcome.name}.json")
+        if outcome.task.scenario.golden and not outcome.failed
+        else outcome
+        for outcome in outcomes
+    ]
 
 
 def _update(outcome: Outcome, path: Path) -> Outcome:

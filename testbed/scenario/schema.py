@@ -192,6 +192,9 @@ class Scenario(Section):
         default_factory=dict,
         description="bounds on metrics by their names, for `testbed check`; a plain number is a maximum",
     )
+    golden: bool = Field(
+        default=True, description="compare metrics with golden ones in `testbed check`; not where rounding decides them"
+    )
 
     _text: str = PrivateAttr("")
     _path: Path | None = PrivateAttr(None)

@@ -168,6 +168,18 @@ def test_an_update_leaves_out_what_failed(tmp_path: Path) -> None:
     assert list((tmp_path / "golden").iterdir()) == []
 
 
+def test_where_rounding_decides_expect_alone_is_checked(tmp_path: Path) -> None:
+    path = scenario(tmp_path, "mine", BENCH.replace("seed =", "golden = false\nseed ="))
+    (tmp_path / "golden").mkdir()
+    (tmp_path / "golden" / "mine.json").write_text('{"ins.aligned_s": 1.0}')
+    (task,) = check.tasks([str(path)], tmp_path, tmp_path / "golden")
+    assert task.scenario.expect
+    assert task.golden is None
+    (one,) = check.update([Outcome(task, metrics={"ins.aligned_s": 3.0})], tmp_path / "golden")
+    assert not one.rows
+    assert json.loads((tmp_path / "golden" / "mine.json").read_text()) == {"ins.aligned_s": 1.0}
+
+
 @pytest.mark.parametrize("text", ["", "[1]", '{"a": "b"}', '{"a": NaN}', '{"a": 1e999}', '{"a": true}'])
 def test_a_damaged_golden_file_is_a_mistake(tmp_path: Path, text: str) -> None:
     (tmp_path / "static_bench.json").write_text(text)
