@@ -174,10 +174,10 @@ def aid_of(name: str, rig: Rig, imu: ImuErrors, air: Air, slip_mps: float | None
         case AirspeedConfig():
             a = section.errors()
             gust = max(air.gust, section.gust_mps)
-            slower = REFERENCE_EAS / usual.airspeed_mps  # of errors of pressure, at the airspeed that is usual
+            slower = REFERENCE_EAS / usual.airspeed_mps  # of constant errors of pressure, at the airspeed that is usual
             return AirspeedAid(
                 name,
-                sigma=math.hypot(slower * math.hypot(a.noise, a.unsteady), SHORT_GUSTS * gust) or BEST_SPEED,
+                sigma=math.hypot(slower * a.noise, a.unsteady, SHORT_GUSTS * gust) or BEST_SPEED,
                 scale_sigma=math.hypot(a.scale, slower * a.bias / usual.airspeed_mps),
                 minimum=section.slowest_mps,
                 sideslip_sigma=None if section.slips else math.hypot(SIDESLIP, SHORT_GUSTS * gust),

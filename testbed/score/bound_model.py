@@ -355,9 +355,7 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
     """Speed along the tube, and that the aircraft slips as it does: sideways it is a coordinated flight's."""
     way = model.way
     bias, scale = model.add(constant([config.bias_pa])), model.add(constant([config.scale_percent * PERCENT]))
-    off = [bias]
-    if config.unsteady_pa:
-        off.append(model.add(gauss_markov([config.unsteady_pa], config.unsteady_time_s)))
+    wake = model.add(gauss_markov([config.errors().unsteady], config.unsteady_time_s)) if config.unsteady_pa else None
     air_n = way.v_n - way.wind_n
     ahead_n, side_n = way.C_nb[:, :, 0], way.C_nb[:, :, 1]
     along = np.maximum(np.einsum("ki,ki->k", ahead_n, air_n), SLOWEST)
@@ -368,8 +366,9 @@ def _add_airspeed(model: Model, times: Array, config: AirspeedConfig) -> None:
     def speed(H: Array, part: slice) -> Array:
         _through_air(H[:, 0], model, thinness[part, None] * ahead_n[part], air_n[part], part)
         H[:, 0, POS.start + 2] = 0.5 * eas[part] / SCALE_HEIGHT
-        for error in off:
-            H[:, 0, error] = per_pascal[part, None]
+        H[:, 0, bias] = per_pascal[part, None]
+        if wake is not None:
+            H[:, 0, wake] = 1.0
         H[:, 0, scale] = 0.5 * eas[part, None]
         noise: Array = config.noise_pa * per_pascal[part, None]
         return noise

@@ -26,9 +26,9 @@ GRADES: dict[str, dict[str, Any]] = {
     # ground. What is left after that zero, and the calibration of the tube on the airframe, assumed.
     "mems": {"scale_percent": 1.0, "bias_pa": 3.0, "noise_pa": 2.0},
     # The same kind of part on a hobby airframe, its tube not calibrated and in the propeller's wake: assumed, at the
-    # size that innovations on recorded flights have, nine tenths of which are the same after 0.1 s; in sideslip the
-    # static port is off as the barometer is. On the ground 5 to 18 Pa are blown into the tubes of two recorded
-    # aeroplanes, alike for some 3 s.
+    # size that innovations on recorded flights have, alike from 8 to 20 m/s, nine tenths of which are the same after
+    # 0.1 s; in sideslip the static port is off as the barometer is. On the ground 5 to 18 Pa are blown into the tubes
+    # of two recorded aeroplanes, alike for some 3 s.
     # Near the ground the wind itself walks by 2 m/s in minutes, and gusts turn these small aircraft sideways by degrees
     # for seconds: 1.8 m/s against a constant wind, so that no sideslip is no constraint.
     "hobby": {
@@ -51,9 +51,8 @@ GRADES: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class AirspeedErrors:
-    """The sensor's datasheet in SI, 1 sigma, as errors of speed: ``scale`` [1]; ``bias``, ``noise``,
-    ``unsteady`` [m/s] at
-    `REFERENCE_EAS`, from where they grow as 1/EAS; ``latency`` [s].
+    """The sensor's datasheet in SI, 1 sigma, as errors of speed: ``scale`` [1]; ``bias``, ``noise`` [m/s] at
+    `REFERENCE_EAS`, from where they grow as 1/EAS; ``unsteady`` [m/s] at any airspeed; ``latency`` [s].
     """
 
     scale: float
@@ -77,7 +76,11 @@ class AirspeedConfig(AidingTiming):
     bias_pa: float = Field(0.0, ge=0, le=1e4, description="constant offset of the differential pressure")
     noise_pa: float = Field(0.0, ge=0, le=1e4, description="white noise of the differential pressure")
     unsteady_pa: float = Field(
-        0.0, ge=0, le=1e4, description="Gauss-Markov error of the airframe's wake; told to filters as white noise"
+        0.0,
+        ge=0,
+        le=1e4,
+        description="Gauss-Markov error of the airframe's wake at 25 m/s, from where it grows as EAS; "
+        "told to filters as white noise",
     )
     unsteady_time_s: float = Field(1.0, gt=0, le=1e4, description="correlation time of that")
     sideslip_percent: float = Field(
@@ -115,10 +118,11 @@ class AirspeedConfig(AidingTiming):
 
 
 class Airspeed:
-    """One pitot on one run: q = rho/2 (V cos(alpha) cos(beta))^2, measured q' = (1 + scale) q + bias + noise,
-    EAS = sqrt(2 q'/rho0), zero when q' is negative. The static port's error in sideslip is that of a barometer
-    (`testbed.sensors.barometer`), with the other sign; what is blown into a standing tube is the size of a Gauss-Markov
-    process of `BLOWN_S`.
+    """One pitot on one run: q = rho/2 (V cos(alpha) cos(beta))^2, measured q' = (1 + scale) q + bias + noise + wake,
+    EAS = sqrt(2 q'/rho0), zero when q' is negative. The wake is the same error of speed at any airspeed, as innovations
+    on recorded flights are, so one of pressure that grows as EAS. The static port's error in sideslip is that of a
+    barometer (`testbed.sensors.barometer`), with the other sign; what is blown into a standing tube is the size of a
+    Gauss-Markov process of `BLOWN_S`.
     """
 
     def __init__(self, name: str, config: AirspeedConfig, tick_rate_hz: float, seed: int) -> None:
@@ -144,8 +148,8 @@ class Airspeed:
         due = slice(rows.start, None, rows.step)
         along = np.maximum(truth.airspeed[due] * np.cos(truth.alpha[due]) * np.cos(truth.beta[due]), 0.0)
         q = 0.5 * truth.density[due] * along**2
-        q = (1 + self._scale) * q + self._bias + self._white.take(n)[:, 0]
-        q += self._unsteady.take(n)[:, 0]
+        wake = self._unsteady.take(n)[:, 0] * np.sqrt(2 * q / SEA_LEVEL_DENSITY) / REFERENCE_EAS
+        q = (1 + self._scale) * q + self._bias + self._white.take(n)[:, 0] + wake
         if self._position.any():
             q -= self._position @ exposure(truth, due)
         standing = (truth.airspeed[due] < FLYING_MPS) & (np.linalg.norm(truth.v_n[due], axis=1) < FLYING_MPS)

@@ -52,9 +52,9 @@ def test_perfect_airspeed_is_equivalent_airspeed_along_the_tube():
     np.testing.assert_allclose(speeds(AirspeedConfig(grade="perfect", rate_hz=20.0), truth), expected[::10], rtol=1e-14)
 
 
-def flying(n, rate_hz=RATE_HZ):
+def flying(n, rate_hz=RATE_HZ, airspeed=25.0):
     truth = still(n, rate_hz)
-    truth.airspeed[:] = 25.0
+    truth.airspeed[:] = airspeed
     return truth
 
 
@@ -83,6 +83,8 @@ def test_unsteady_errors_are_gauss_markov_and_filters_know():
     off = 0.5 * 1.225 * (speeds(tube, flying(40_000, 10.0), rate_hz=10.0) ** 2 - 25.0**2)
     assert off.std() == pytest.approx(14, rel=0.05)
     assert np.corrcoef(off[20:], off[:-20])[0, 1] == pytest.approx(np.exp(-1), abs=0.1)
+    slow = speeds(tube, flying(40_000, 10.0, airspeed=10.0), rate_hz=10.0) - 10.0
+    assert slow.std() == pytest.approx(14 / (1.225 * 25), rel=0.05)
     rig = Scenario.load("u_turn", {"sensors.barometer.grade": "hobby", "sensors.airspeed.grade": "hobby"}).rig(1)
     told = {name: aid_of(name, rig, rig.imu("imu").errors(), rig.air(0.0)) for name in ("barometer", "airspeed")}
     wake = told["barometer"]
