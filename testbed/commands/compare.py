@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from testbed.commands.shared import RUNS, Force, console, output_folder, remark
+from testbed.commands.shared import RUNS, Force, console, output_folder
 from testbed.errors import UserError, printable
 from testbed.results import METRICS, RECORD
 
@@ -37,10 +37,10 @@ def compare(runs: Compared, out: Folder = RUNS / "compare", force: Force = False
     found = [_case(path, name) for path, name in zip(runs, _names(runs), strict=True)]
     cases = [case for case, _ in found]
     blocks = differences.blocks(cases)
+    if not blocks:
+        raise UserError("there is nothing to compare: no two estimators have a metric in common")
     for block in blocks:
         console().print(pages.console_table(block))
-    if not blocks:
-        remark("there is nothing to compare: no two estimators have a metric in common")
     with output_folder(out):
         title = " and ".join(case.name for case in cases)
         page = pages.write_comparison(blocks, {case.name: run for case, run in found}, out, title, force)

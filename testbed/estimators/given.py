@@ -79,7 +79,8 @@ class Given:
         for name, limit in LIMITS.items():
             angle = getattr(fit, name)
             if limit < abs(angle) < math.inf:  # what is not finite is counted
-                raise Unfit(f"{method}: {name} is {angle:.6g}: latitude and longitude are in radians")
+                within = f"within {limit:.4g} either way"
+                raise Unfit(f"{method}: {name} is {angle:.6g}: latitude and longitude are in radians, {within}")
         if not _is_symmetric(fit.covariance):
             raise Unfit(f"{method}: covariance is not symmetric: give 0.5 * (P + P.T)")
         return fit

@@ -26,6 +26,7 @@ MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
 LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
 LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, as the median
 MOST_STEP, STEP_SHARE = math.radians(5), 0.95  # from one sample to the next; no more in this share of them
+NEARLY_ALL = 0.99  # of the steps, beyond which all are taken to be as large
 ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
 
 
@@ -89,7 +90,8 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
         yield f"it feels {usual:.3g} m/s² mostly, where gravity is 9.8: is the unit of its accelerometers right?"
     elif _lies_on_its_back(log, imu):
         yield "at rest it lies on its back: are its axes forward, right and down?"
-    often = float(np.quantile(np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1), STEP_SHARE))
+    turned = np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1)
+    often = float(np.quantile(turned, STEP_SHARE))
     if often > MOST_STEP:
         how = f"it turns by {math.degrees(often):.0f} deg from one sample to the next ({1 - STEP_SHARE:.0%} turn more)"
         yield f"{how}: told so seldom, rates lead no attitude on for long: log it faster, if you can"
@@ -97,7 +99,8 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
         return
     t, v_n, _ = fixes(log.samples[log.receiver])
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
-    felt = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1))])
+    turned = np.minimum(turned, np.quantile(turned, NEARLY_ALL))  # a row that is wrong is no wrong unit
+    felt = np.concatenate([[0.0], np.cumsum(turned)])
     fast = np.hypot(v_n[:, 0], v_n[:, 1]) > LEAST_WAY / STRETCH_S
     step = np.diff(t)
     both = fast[1:] & fast[:-1] & (step < 0.5 * STRETCH_S) & (t[:-1] > at[0]) & (t[1:] < at[-1])

@@ -32,6 +32,8 @@ PARQUET = b"PAR1"
 DATE = re.compile(r"\s*\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d")
 DAY, CLOCK = re.compile(r"\d{4}[-/]\d\d[-/]\d\d"), re.compile(r"\d\d:\d\d:\d\d(\.\d+)?")  # in columns of their own
 LONGEST_SHOWN = 20  # of what is no number
+FASTEST, HARDEST = 1e3, 1e4  # [rad/s], [m/s^2]: three times what gyros of missiles measure, and a thousand g
+WILD_SHARE = 0.01  # of the rows, that may be beyond these by damage
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": 1e-7 * DEG}
@@ -152,13 +154,22 @@ def _date(tables: Mapping[Path, Table], main: Path, streams: Iterable[Stream], s
 def _whole(
     name: str, t: Array, values: dict[str, Array], stream: Stream, notes: list[str]
 ) -> tuple[Array, dict[str, Array]]:
-    """Rates and forces without the rows that lack one of them; a lost increment is missing, and stays so."""
-    known = np.isfinite(values["gyro"]).all(axis=1) & np.isfinite(values["accel"]).all(axis=1)
-    lacking = len(t) - int(known.sum())
-    if not lacking or stream.form == "increments":
+    """Rates and forces without the rows that lack one of them, or have one that nothing turns or is pushed by.
+
+    A lost increment is missing, and stays so.
+    """
+    if stream.form == "increments":
         return t, values
-    told = f"{lacking} of {len(t)} rows have no rate or no specific force: left out"
-    notes.append(left_out(name, told, lacking, len(t)))
+    known = np.isfinite(values["gyro"]).all(axis=1) & np.isfinite(values["accel"]).all(axis=1)
+    felt = np.abs(np.hstack([values["gyro"] / FASTEST, values["accel"] / HARDEST]))
+    wild = known & np.asarray((felt > 1).any(axis=1))
+    if wild.sum() > WILD_SHARE * len(t):  # it is the unit that is wrong
+        wild = np.zeros(len(t), bool)
+    for rows, what in ((~known, "have no rate or no specific force"), (wild, "turn or push harder than anything does")):
+        if lacking := int(rows.sum()):
+            told = f"{lacking} of {len(t)} rows {what}: left out"
+            notes.append(left_out(name, told, lacking, len(t)))
+    known &= ~wild
     return t[known], {key: one[known] for key, one in values.items()}
 
 

@@ -52,6 +52,13 @@ class Column(Section):
     scale: float = Field(default=1.0, description="what it is multiplied by, before the unit")
     offset: float = Field(default=0.0, description="what is added then, in the unit")
 
+    @field_validator("scale")
+    @classmethod
+    def _says_something(cls, scale: float) -> float:
+        if scale == 0:
+            raise ValueError("must not be 0, which makes all values alike")
+        return scale
+
     @model_validator(mode="before")
     @classmethod
     def _name_alone(cls, value: Any) -> Any:
@@ -129,6 +136,12 @@ class Stream(Section):
         for name, column in self.columns.items():
             if name != "attitude" and column.frame != "frd-ned":
                 raise ValueError(f"{name}.frame: is nothing but an attitude's: say it with axes")
+        return self
+
+    @model_validator(mode="after")
+    def _form_is_of_increments(self) -> Stream:
+        if self.form != "averaged" and self.gyro is None and self.accel is None:
+            raise ValueError("form: is of gyro and accel, and there are none here: leave it out")
         return self
 
     @model_validator(mode="after")

@@ -76,6 +76,9 @@ def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         yield from complaints
         return
     envelope = aircraft.load(named)
+    if wind.front is not None and wind.front.time_s - wind.front.width_s / 2 >= scenario.duration_s:
+        after = f"it comes after the end of the run: duration_s is {scenario.duration_s:g}"
+        yield ("truth", "wind", "front", "time_s"), after
     try:
         foreseen = strongest(wind)
     except UserError as error:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 VARIANCES = tuple(f"{axis} {what}" for what in ("position", "velocity", "attitude") for axis in accuracy.AXES)
 LOST = ".nonfinite_samples"
+ESTIMATED = {"position": ("lat", "lon", "h"), "velocity": ("v_n",), "attitude": ("q_nb",)}  # each in three rows of P
 CONFIDENCE = 0.999  # of the bound
 WORSE = 2.0  # times the largest error over claimed sigma before a fault: that is its doing
 FEW, MOST = 10, 0.5  # looks, and the share of them that nobody refuses who is right
@@ -144,7 +145,7 @@ def _unjudged(dataset: xarray.DataTree) -> Iterator[str]:
         status, covariance = (accuracy.column(dataset, f"{own}/{what}") for what in ("status", "covariance"))
         aligned = (status & Status.ALIGNED) != 0
         positive = (np.diagonal(covariance, axis1=1, axis2=2) > 0) & aligned[:, None]
-        for k, what in enumerate(("position", "velocity", "attitude")):
+        for k, what in enumerate(ESTIMATED):
             block = slice(3 * k, 3 * k + 3)
             known = positive[:, block].all(axis=1)
             unformed = np.isnan(accuracy.nees(np.zeros((len(known), 3)), covariance[:, block, block])) & known
@@ -153,12 +154,14 @@ def _unjudged(dataset: xarray.DataTree) -> Iterator[str]:
                     f"{name} claims a covariance of {what} that is not positive definite in {unformed.sum()} of "
                     f"{aligned.sum()} estimates: no NEES there"
                 )
-        told = np.isfinite(accuracy.column(dataset, f"{own}/q_nb")).all(axis=1) & aligned
-        silent = told & ~np.isfinite(covariance[:, 6:, 6:]).all(axis=(1, 2))
-        if silent.any() and (told & ~silent).any():
-            yield (
-                f"{name} claims no covariance in {silent.sum()} of {aligned.sum()} estimates: no NEES and no 3 σ there"
-            )
+            said = np.column_stack([accuracy.column(dataset, f"{own}/{one}") for one in ESTIMATED[what]])
+            told = np.isfinite(said).all(axis=1) & aligned
+            silent = told & ~np.isfinite(covariance[:, block, block]).all(axis=(1, 2))
+            if silent.any() and (told & ~silent).any():
+                yield (
+                    f"{name} claims no covariance of {what} in {silent.sum()} of {aligned.sum()} estimates: no NEES "
+                    f"and no 3 σ there"
+                )
 
 
 def _astray(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> Iterator[tuple[str, str]]:

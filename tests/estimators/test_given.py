@@ -68,7 +68,7 @@ def pair(k: int) -> tuple[np.ndarray, np.ndarray]:
         ({"v_n": np.ones((3, 1))}, "estimate: v_n has shape (3, 1), not (3,)"),
         ({"covariance": np.eye(6)}, "estimate: covariance has shape (6, 6), not (9, 9)"),
         ({"lat": 47.0}, "estimate: lat is 47: latitude and longitude are in radians"),
-        ({"lon": -8.0}, "estimate: lon is -8: latitude and longitude are in radians"),
+        ({"lon": -8.0}, "estimate: lon is -8: latitude and longitude are in radians, within 6.283 either way"),
         ({"covariance": np.triu(np.ones((9, 9)))}, "estimate: covariance is not symmetric: give 0.5 * (P + P.T)"),
         ({"q_nb": np.zeros(4)}, "estimate: q_nb has length 0, not 1"),
         ({"q_nb": 2 * SOUND.q_nb}, "estimate: q_nb has length 2, not 1"),

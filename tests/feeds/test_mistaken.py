@@ -92,6 +92,12 @@ def test_gyros_in_another_unit(wrong):
     assert ("where the course of gnss turns by 5.7" in said) == (wrong < 1)
 
 
+def test_one_row_that_is_wrong_is_no_wrong_unit():
+    dtheta = IMU.dtheta.copy()
+    dtheta[len(dtheta) // 2] = 1e5
+    assert mistaken(log(replace(IMU, dtheta=dtheta))) == []
+
+
 @pytest.mark.parametrize("wrong", [9.8, 1 / 9.8, 0.5])
 def test_accelerometers_in_another_unit(wrong):
     (said,) = mistaken(log(replace(IMU, dv=wrong * IMU.dv)))

@@ -142,6 +142,17 @@ def test_a_quaternion_of_no_length_is_unknown(tmp_path: Path) -> None:
 # --- inertial units
 
 
+@pytest.mark.parametrize(("quantity", "size"), [("w", 1e5), ("f", -1e6)])
+def test_a_row_that_nothing_can_feel_is_left_out(tmp_path: Path, quantity: str, size: float) -> None:
+    table = standing()
+    table[quantity][700, 1] = size
+    log = read(tmp_path, table)
+    assert f"imu: 1 of {len(table['t'])} rows turn or push harder than anything does: left out" in log.notes
+    assert len(log.imus["imu"]) == len(table["t"]) - 1
+    table[quantity][:] = size  # all of them are no damage
+    assert len(read(tmp_path, table).imus["imu"]) == len(table["t"])
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -167,6 +178,11 @@ def test_a_quaternion_of_no_length_is_unknown(tmp_path: Path) -> None:
         (
             {"accel": {"column": "f", "axes": ["y", "x", "z"], "offset": 0.5}},
             'scale = -1, offset = -0.5 and axes = ["-y", "-x", "-z"]',
+        ),
+        ({"gyro": {"column": "w", "scale": 0.0}}, "must not be 0, which makes all values alike"),
+        (
+            {"gyro": None, "accel": None, "form": "instantaneous"},
+            "form: is of gyro and accel, and there are none here: leave it out",
         ),
     ],
 )

@@ -86,7 +86,7 @@ def test_the_estimators_of_one_run(runs: Path, tmp_path: Path) -> None:
     assert [one["name"] for one in shown["subjects"]] == ["ins", "dead_reckoning"]
 
 
-def test_mistakes_are_told(tmp_path: Path) -> None:
+def test_mistakes_are_told(runs: Path, tmp_path: Path) -> None:
     def told(*arguments: Path) -> str:
         with pytest.raises(UserError) as raised:
             compare(*arguments, "--out", tmp_path / "page")
@@ -97,6 +97,9 @@ def test_mistakes_are_told(tmp_path: Path) -> None:
     assert "there is no run.nc in this folder" in told(tmp_path / "empty")
     assert "no such file" in told(tmp_path / "missing/run.nc")
     assert "named twice" in told(tmp_path / "empty", tmp_path / "empty")
+    shutil.copytree(runs / "before/1", tmp_path / "one")
+    metrics.save({f"ins.{METRIC}": 1.0}, tmp_path / "one" / METRICS)
+    assert "nothing to compare" in told(tmp_path / "one")
 
 
 def test_view_opens_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

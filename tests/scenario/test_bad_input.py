@@ -212,6 +212,13 @@ def test_windows(windows: str, says: str) -> None:
     assert message.startswith(f"mine.toml:{line_of(U_TURN, '[sensors.gnss]') + 1}: sensors.gnss.{says}")
 
 
+def test_a_front_that_never_comes() -> None:
+    front = "front = { time_s = 230, width_s = 20, from_deg = 300, speed_mps = 9 }"
+    text = U_TURN.replace("wind = {", "wind = { " + front + ",")
+    assert "truth.wind.front.time_s: it comes after the end of the run: duration_s is 200" in complaint(text)
+    assert Scenario.parse(text.replace("width_s = 20", "width_s = 80"))
+
+
 STEP = {"sensor": "gnss", "channel": "north", "kind": "step", "window": [50, 60], "size": 5.0}
 
 

@@ -141,8 +141,18 @@ def test_covariances_that_give_no_nees_are_told() -> None:
     assert doubts(run, metrics.compute(run)) == [f"{text}: no NEES there"]
     covariance[-50:] = np.nan
     assert doubts(run, metrics.compute(run))[1:] == [
-        f"other claims no covariance in 50 of {len(covariance)} estimates: no NEES and no 3 σ there"
+        f"other claims no covariance of {what} in 50 of {len(covariance)} estimates: no NEES and no 3 σ there"
+        for what in ("position", "velocity", "attitude")
     ]
+
+
+def test_a_number_that_is_none_in_a_covariance_is_told() -> None:
+    """The NEES of what it is in ended without a word."""
+    run = flown()
+    covariance = accuracy.column(run, "estimators/other/covariance")
+    covariance[-50:, 3, 4] = np.nan
+    (said,) = doubts(run, metrics.compute(run))
+    assert said.startswith(f"other claims no covariance of velocity in 50 of {len(covariance)} estimates")
 
 
 @pytest.mark.ci
@@ -156,8 +166,11 @@ def test_variances_that_there_cant_be_are_told(variance: float, told: bool) -> N
         f"other claims a variance of 0 or below in 100 of {len(covariance)} estimates (north position, down attitude): "
         "no NEES and no 3 σ there"
     )
-    silent = f"other claims no covariance in 100 of {len(covariance)} estimates: no NEES and no 3 σ there"
-    assert doubts(run, metrics.compute(run)) == ([silent] * bool(np.isnan(variance)) + [text] * told)
+    silent = [
+        f"other claims no covariance of {what} in 100 of {len(covariance)} estimates: no NEES and no 3 σ there"
+        for what in ("position", "attitude")
+    ]
+    assert doubts(run, metrics.compute(run)) == (silent if np.isnan(variance) else [text] * told)
 
 
 def test_an_estimator_of_attitude_alone_claims_no_position() -> None:
