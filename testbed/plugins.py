@@ -31,6 +31,14 @@ def installed(group: str) -> Mapping[str, str]:
     return {point.name: point.value for point in entry_points(group=group)}
 
 
+def _called(kind: str, group: str) -> str:
+    """A kind, and the package that offers it where one does."""
+    for point in entry_points(group=group, name=kind):
+        if point.dist is not None:
+            return f"kind {shown(kind)} of the package {shown(point.dist.name)}"
+    return f"kind {shown(kind)}"
+
+
 def load(kind: str, folder: Path, group: str) -> Any:
     """The class that ``kind`` names: ``module:Class``, ``./file.py:Class`` seen from ``folder``, or an entry point.
 
@@ -39,7 +47,7 @@ def load(kind: str, folder: Path, group: str) -> Any:
     module, where, name = _named(kind, folder, group)
     if not hasattr(module, name):
         classes = [key for key, value in vars(module).items() if _is_of(value, module) and not key.startswith("_")]
-        raise UserError(f"kind {shown(kind)}: {unknown(f'class in {where}', name, classes)}")
+        raise UserError(f"{_called(kind, group)}: {unknown(f'class in {where}', name, classes)}")
     _looked_at(module)
     return getattr(module, name)
 
@@ -54,19 +62,19 @@ def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:
     where, _, name = installed(group).get(kind, kind).rpartition(":")
     wrong = _misnamed(where, name)
     if wrong:
-        raise UserError(f"kind {shown(kind)}: {wrong}")
+        raise UserError(f"{_called(kind, group)}: {wrong}")
     try:
         module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
     except UserError as error:
-        raise UserError(f"kind {shown(kind)}: {error}") from None
+        raise UserError(f"{_called(kind, group)}: {error}") from None
     except ModuleNotFoundError as error:
         if error.name is not None and where.split(".")[0] != error.name.split(".")[0]:
             todo = _beside(folder / where, error.name) if where.endswith(".py") else ""
-            raise UserError(f"kind {shown(kind)}: {where} can't be imported: {error.msg}{todo}") from error
+            raise UserError(f"{_called(kind, group)}: {where} can't be imported: {error.msg}{todo}") from error
         todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
-        raise UserError(f"kind {shown(kind)}: there is no module {where}: {todo}") from None
+        raise UserError(f"{_called(kind, group)}: there is no module {where}: {todo}") from None
     except (Exception, SystemExit) as error:
-        raise UserError(f"kind {shown(kind)}: {where} can't be imported: {raised(error)}") from error
+        raise UserError(f"{_called(kind, group)}: {where} can't be imported: {raised(error)}") from error
     return module, where, name
 
 

@@ -43,6 +43,22 @@ def test_a_name_that_is_none_is_told_with_what_to_do(kind: str, says: str, tmp_p
     assert says in str(told.value)
 
 
+def test_the_package_of_a_broken_kind_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    info = tmp_path / "theirs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[{GROUP}]\nbroken = their_filters:Gone\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    plugins.installed.cache_clear()
+    try:
+        with pytest.raises(
+            UserError, match=r'^kind "broken" of the package "theirs": there is no module their_filters'
+        ):
+            plugins.load("broken", tmp_path, GROUP)
+    finally:
+        plugins.installed.cache_clear()
+
+
 FILTER = """
 from helper import OFFSET
 

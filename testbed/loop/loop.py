@@ -112,8 +112,8 @@ def run(
     """
     if not isinstance(scenario, Scenario):
         raise UserError(f"run: give a Scenario, such as Scenario.load({str(scenario)!r})")
-    if not isinstance(out, str | Path | None):
-        raise UserError(f"run: out: give a folder, not {type(out).__name__}")
+    if not isinstance(out, str | Path | None) or out == "":
+        raise UserError(f"run: out: give a folder, not {repr(out) if isinstance(out, str) else type(out).__name__}")
     if not all(callable(getattr(link, "publish", None)) for link in links):
         raise UserError("run: links: give publishers, such as testbed.mavlink.MavlinkPublisher(addresses, scenario)")
     if progress is not None and not callable(progress):

@@ -251,7 +251,7 @@ def campaign(
     can't be written or holds another campaign, or when the scheduler can't be reached.
     """
     given.require_path("campaign: scenario", scenario, "the file or the name of a scenario")
-    given.require_path("campaign: out", "" if out is None else out, "a folder")
+    given.require_path("campaign: out", Path() if out is None else out, "a folder")
     runs, draw = given.whole("campaign: runs", runs), given.whole("campaign: draw", draw)
     workers = given.crew("campaign: workers", workers)
     varied, overrides = given.varied(vary), given.overrides(overrides)

@@ -12,9 +12,9 @@ from testbed.scenario import keypath
 
 
 def require_path(what: str, given: Any, wanted: str) -> None:
-    """Raises UserError where something is neither a text nor a path."""
-    if not isinstance(given, str | Path):
-        raise UserError(f"{what}: give {wanted}, not {type(given).__name__}")
+    """Raises UserError where something is neither a path nor a text that may be one."""
+    if not isinstance(given, str | Path) or given == "":
+        raise UserError(f"{what}: give {wanted}, not {repr(given) if isinstance(given, str) else type(given).__name__}")
 
 
 def whole(what: str, given: Any) -> int:

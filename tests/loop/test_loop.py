@@ -439,6 +439,7 @@ def test_late_stamps_and_losses_give_the_same_bits_live_batch_and_as_a_log(
     ("options", "says"),
     [
         ({"out": 3}, "run: out: give a folder, not int"),
+        ({"out": ""}, "run: out: give a folder, not ''"),
         ({"out": "a\0b"}, "can't be written: "),
         ({"realtime": "1"}, "the speed must be above 0"),
         ({"links": ["udpout:127.0.0.1:14550"]}, "run: links: give publishers"),

@@ -673,6 +673,7 @@ def test_folder_that_cannot_be(at_rest: Path, tmp_path: Path) -> None:
         ({"draw": None}, "draw: give a whole number, not NoneType"),
         ({"workers": 1.5}, r"workers: give a whole number, not 1\.5"),
         ({"out": 3}, "out: give a folder, not int"),
+        ({"out": ""}, "out: give a folder, not ''"),
     ],
 )
 def test_what_is_of_no_such_type_is_told(at_rest: Path, tmp_path: Path, wrong: dict[str, Any], says: str) -> None:

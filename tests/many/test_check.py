@@ -207,6 +207,7 @@ def test_what_a_caller_gets_wrong_is_told(tmp_path: Path) -> None:
         ((path,), {"golden": tmp_path / "file"}, "file: no such folder"),
         ((path,), {"golden": 3}, "check: golden: give a folder, not int"),
         ((path,), {"out": None}, "check: out: give a folder, not NoneType"),
+        ((path,), {"out": ""}, "check: out: give a folder, not ''"),
         ((path,), {"workers": 1.5}, "check: workers: give a whole number"),
         ((path,), {"out": tmp_path / "file"}, "file: can't be made: File exists"),
         ((path,), {"out": "a\0b"}, "can't be made"),
