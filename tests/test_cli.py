@@ -313,6 +313,19 @@ def test_a_full_disk_is_a_message(testbed: Testbed, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.ci
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_what_ends_a_run_leaves_its_record_and_says_so(testbed: Testbed) -> None:
+    ended = testbed(
+        "run", "static_bench", *QUICK, "--set", "duration_s=20", "--mavlink", "tlog:/dev/full", "--out", "a"
+    )
+    assert ended.code == 2
+    told = ended.err.splitlines()[-2:]
+    assert told[0].startswith("testbed: tlog:/dev/full: the log can't be written any further")
+    assert told[1] == "testbed: the record so far is a/run.nc: `testbed report a/run.nc` shows it"
+    assert testbed("report", "a/run.nc").code == 0
+
+
+@pytest.mark.ci
 def test_no_traceback_reaches_the_shell(tmp_path: Path) -> None:
     ended = python("-m", "testbed", "run", "uturn", cwd=tmp_path)
     assert (ended.returncode, ended.stdout) == (2, "")

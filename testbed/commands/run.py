@@ -288,14 +288,17 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
     ):
         if keys is not None:
             print(keyboard.HELP, file=sys.stderr)
-        result = loop.run(
-            scenario,
-            out=folder,
-            realtime=realtime,
-            progress=lambda now: tell(*progress.of_run(now)),
-            controls=[keys.requests] if keys is not None else (),
-            **options,
-        )
+        try:
+            result = loop.run(
+                scenario,
+                out=folder,
+                realtime=realtime,
+                progress=lambda now: tell(*progress.of_run(now)),
+                controls=[keys.requests] if keys is not None else (),
+                **options,
+            )
+        except UserError as error:
+            raise UserError(f"{error}\n{_kept(record)}" if _stamp(record) != before else str(error)) from None
     for text in result.remarks:
         remark(text)
     return result
