@@ -62,7 +62,8 @@ class GnssMonitor:
     _previous: tuple[GnssSample, Array] | None = None
     _begun: GnssSample | None = None  # the first of the streak, or the last fused
     _moved: Array = field(default_factory=lambda: np.zeros(3))  # since then, by velocities [m]
-    _strayed: float = -math.inf  # when one last did not agree with its first, or two in a row with none
+    _jumped: Array | None = None  # by how much the latest one is off the one before (3,), if they don't agree [m]
+    _strayed: float = -math.inf  # when one last did not agree with its first, or two in a row jumped alike
     _turned: float = 0.0  # and what turns may add to that, over `TURN_ERROR`: the sum of dt^3 [s^3]
 
     def heard(self, t: float) -> None:
@@ -81,13 +82,16 @@ class GnssMonitor:
         """
         self.heard(fix.t)
         if not self._continues(fix, v_n, sigma_v):
-            again = self._previous is not None and self._streak_start == self._previous[0].t
-            self._strayed = fix.t if again else -math.inf  # a receiver that jumps may have come to itself
+            before, self._jumped = self._jumped, self._off(fix, v_n)
+            # One that stands still falls behind time and again. One that jumps, or jumps back, may be sound again.
+            self._strayed = fix.t if before is not None and before @ self._jumped > 0 else -math.inf
             self._begin(fix)
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
-        elif self._strays(fix, sigma_v):
-            self._begin(fix)
-            self._strayed = fix.t
+        else:
+            self._jumped = None
+            if self._strays(fix, sigma_v):
+                self._begin(fix)
+                self._strayed = fix.t
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         wait = self._wait(odds, both)
@@ -150,6 +154,14 @@ class GnssMonitor:
         self._moved += moved
         self._turned += dt**3
         return jump(before, fix, moved, dt * sigma_v, dt**3) <= self.consistency_gate
+
+    def _off(self, fix: GnssSample, v_n: Array) -> Array:
+        """Where ``fix`` is, seen from where the one before it and the mean of both velocities say (3,) [m]."""
+        if self._previous is None:
+            return np.zeros(3)
+        before, v0_n = self._previous
+        way = displacement_n(fix.lat, fix.lon, fix.h, before.lat, before.lon, before.h)
+        return np.array(way) - 0.5 * (fix.t - before.t) * (v0_n + v_n)
 
     def _strays(self, fix: GnssSample, sigma_v: Array) -> bool:
         """Whether the receiver's own velocities lead elsewhere from the first of the streak.

@@ -585,6 +585,19 @@ def test_a_position_that_stands_still_while_its_velocity_does_not_is_never_belie
     assert not monitor.astray(t + 11.0)
 
 
+def test_a_position_that_was_dragged_away_is_sound_as_soon_as_it_is_let_go():
+    """Ever faster, so that each fix is off the one before up to the last: a federation readmitted it 10 s late."""
+    monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
+    monitor.last_fused = 0.0
+    sigma, v_n = np.full(3, 1.5), np.array([25.0, 0.0, 0.0])
+    for k in range(1, 60):
+        dragged = 1.5 * max(k - 10.0, 0.0) ** 2 if k < 50 else 0.0
+        lat = 0.8 + (25.0 * k + dragged) / 6.37e6
+        fix = GnssSample(k, k, lat, 0.1, 100.0, v_n, sigma, 0.05 * sigma, FixType.FIX_3D, 10, 1.0, 1.0)
+        monitor.judge(fix, v_n, 0.05 * sigma, dragged == 0.0)
+        assert monitor.astray(k) == (30 < k < 50) or k <= 30
+
+
 def test_who_comes_by_a_position_that_stands_still_does_not_use_it():
     monitor = GnssMonitor(outage_s=10.0, probation_s=1.0, recovery_s=4.0, patience_s=30.0, consistency_gate=16.3)
     monitor.last_fused = 0.0
