@@ -29,6 +29,7 @@ from nav.strapdown import step
 
 NOTHING = 1e-6  # two times this close are the same [s]
 PIECE = 25  # increments that are taken in at once
+LEAST = 1e-3  # of a variance, that is left by what comes later
 NODE_S = 1.0  # between nodes; within it the noise of any IMU moves the state by far less than its smoothed sigma
 
 
@@ -140,23 +141,28 @@ class Smoother:
             if node != own:
                 own, at = node, nodes[node]
                 now = Smoothed(at.t, at.state.copy())
-            now = self._carried(now, t, imu)
-            yield Smoothed(t, now.state)
+            now, state = self._carried(now, t, imu)
+            yield Smoothed(t, state)
 
-    def _carried(self, now: Smoothed, t: float, imu: ImuSamples) -> Smoothed:
-        """A smoothed state taken on by the increments up to ``t``, the part of the last one that is needed."""
-        state = now.state.copy()
-        first = int(np.searchsorted(imu.t, now.t + NOTHING))
-        last = min(int(np.searchsorted(imu.t, t - NOTHING)) + 1, len(imu))
-        begun = now.t
+    def _carried(self, now: Smoothed, t: float, imu: ImuSamples) -> tuple[Smoothed, State]:
+        """A smoothed state taken on by the whole increments up to ``t``, and by the part of the next that is needed.
+
+        So it makes no difference at which other times one looks.
+        """
+        state, begun = now.state.copy(), now.t
+        first, last = (int(np.searchsorted(imu.t, at + NOTHING)) for at in (now.t, t))
         for k in range(first, last):
-            until = min(float(imu.t[k]), t)
-            rates = np.array([imu.dtheta[k], imu.dv[k]]) / imu.dt[k]
-            _advance(
-                state.q_nb, state.v_n, state.lla, state.errors, state.imu, self._model.driven, rates, until - begun
-            )
-            begun = until
-        return Smoothed(t, state)
+            self._advance(state, imu, k, float(imu.t[k]) - begun)
+            begun = float(imu.t[k])
+        whole = Smoothed(begun, state)
+        if last < len(imu) and t - begun > NOTHING:
+            state = state.copy()
+            self._advance(state, imu, last, t - begun)
+        return whole, state
+
+    def _advance(self, state: State, imu: ImuSamples, k: int, dt: float) -> None:
+        rates = np.array([imu.dtheta[k], imu.dv[k]]) / imu.dt[k]
+        _advance(state.q_nb, state.v_n, state.lla, state.errors, state.imu, self._model.driven, rates, dt)
 
     def _look_back(self) -> list[Smoothed]:
         """The smoothed nodes, in their order."""
@@ -173,10 +179,31 @@ class Smoother:
             common = len(state.imu)
             smoothed.x[0, common:] += correction[common:]
             sensor_errors(smoothed.errors, smoothed.imu, self._model.driven)
-            spread = P - P @ information @ P
-            smoothed.P[0] = 0.5 * (spread + spread.T)
+            smoothed.P[0] = _spread(P, information)
             found.append(Smoothed(t, smoothed))
         return found[::-1]
+
+
+def _spread(P: Array, information: Array) -> Array:
+    """P - P Lambda P (n, n), of which no direction is better known than by `LEAST` of its variance in P.
+
+    In P^1/2 (1 - P^1/2' Lambda P^1/2) P^1/2' what is in brackets has eigenvalues from 0 to 1. Where next to nothing is
+    left of them, it is what the maps of time, taken in pieces of their own, are off those of the filter.
+    """
+    spread = P - P @ information @ P
+    spread = 0.5 * (spread + spread.T)
+    driven = np.flatnonzero(P.diagonal() > 0)
+    sigma = np.sqrt(P.diagonal()[driven])
+    block = np.ix_(driven, driven)
+    scaled = spread[block] / np.outer(sigma, sigma)
+    if scaled.diagonal().min(initial=1.0) >= LEAST and np.linalg.eigvalsh(scaled)[0] >= 0:
+        return spread
+    own, axes = np.linalg.eigh(P[block] / np.outer(sigma, sigma))
+    half = sigma[:, None] * axes * np.sqrt(np.maximum(own, 0.0))
+    known, turn = np.linalg.eigh(half.T @ information[block] @ half)
+    left = half @ (turn * np.sqrt(np.clip(1.0 - known, LEAST, 1.0)))
+    spread[block] = left @ left.T
+    return spread
 
 
 def _joined(blocks: Sequence[ImuSamples]) -> ImuSamples:

@@ -27,6 +27,7 @@ REMEMBERED_S = 30.0  # over which these are averaged, as biases drift
 NOISES = 3.0  # by this many sigmas of white noise more, of what is told of it
 AT_REST, MOVING = 0.5, 4.0  # a receiver's speed [m/s], and times its sigma beyond that
 RECENT_S = 2.0  # for how long a fix speaks
+STOPPED_S = 4.0  # after a motion until one does: what gains 0.125 m/s a second is no longer at rest by then
 
 
 class Standing:
@@ -43,6 +44,7 @@ class Standing:
         self._fixes: list[GnssSample] = []  # that no window has heard of
         self._usual: Array | None = None  # (2, 3) what is felt at rest, None while it is not known to stand
         self._stood_at = -math.inf  # when a receiver said so last
+        self._moved_at = -math.inf  # when motion was felt last
 
     def heard(self, imu: ImuSamples, samples: Sequence[Sample]) -> list[BodyVelocitySample]:
         """A velocity of zero at the end of each window that ends in these increments, if the vehicle stands then.
@@ -69,8 +71,7 @@ class Standing:
         self._listen()
         covered = float(window.dt.sum())
         if len(window) < LEAST_ROWS or covered < LEAST_SHARE * WINDOW_S:
-            self._usual = None
-            return False
+            return self._moves()
         felt = np.stack([window.dtheta, window.dv])  # (2, N, 3)
         mean = felt.sum(axis=1) / covered
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # what is not usable is not quiet
@@ -79,18 +80,21 @@ class Standing:
         white = math.sqrt(3) * self._noise
         quiet = np.all(changes <= np.hypot(QUIET, NOISES * white * math.sqrt(len(window) / covered)))
         if not quiet:
-            self._usual = None
-            return False
+            return self._moves()
         if self._usual is None and self._end - self._stood_at <= RECENT_S:
             self._usual = mean
         if self._usual is None:
             return False
         off = np.linalg.norm(mean - self._usual, axis=1)
         if not np.all(off <= np.hypot(STEADY, NOISES * white / math.sqrt(covered))):
-            self._usual = None
-            return False
+            return self._moves()
         self._usual = self._usual + (mean - self._usual) * WINDOW_S / REMEMBERED_S
         return True
+
+    def _moves(self) -> bool:
+        """It moves, or nothing is known: what receivers said before counts no more."""
+        self._usual, self._stood_at, self._moved_at = None, -math.inf, self._end
+        return False
 
     def _listen(self) -> None:
         """To the fixes that have arrived by the end of the window."""
@@ -98,7 +102,7 @@ class Standing:
         self._fixes = [fix for fix in self._fixes if fix.t_arrival > self._end + COINCIDENT]
         for fix in arrived:
             speed = float(np.linalg.norm(fix.v_n))
-            if speed <= AT_REST:
+            if speed <= AT_REST and fix.t >= self._moved_at + STOPPED_S:
                 self._stood_at = max(self._stood_at, fix.t)
             elif speed > AT_REST + MOVING * float(np.linalg.norm(np.nan_to_num(fix.sigma_velocity_n))):
                 self._stood_at, self._usual = -math.inf, None

@@ -149,7 +149,7 @@ def build(section: AhrsSection, rig: Rig) -> Lane:
 
 def configuration(section: AhrsSection, rig: Rig) -> AhrsConfig:
     """What the filter is told: its area of operation too, and its heading where no magnetometer finds it."""
-    errors, site = rig.imu(section.imu).errors(), rig.site
+    errors, site = rig.imu_errors(section.imu, *section.spare_imus), rig.site
     aids = {rig.sensors[name].kind: rig.sensors[name] for name in section.aids}
     config = AhrsConfig(
         imu_model(errors, rig.turn_rate(section.turn_degps), usual=rig.usual),

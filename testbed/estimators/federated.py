@@ -217,7 +217,7 @@ def build(section: FederatedSection, rig: Rig) -> Lane:
 
 def configuration(section: FederatedSection, rig: Rig) -> Config:
     """What the federation is told."""
-    errors = rig.imu(section.imu).errors()
+    errors = rig.imu_errors(section.imu, *section.spare_imus)
     air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid | None:

@@ -120,7 +120,7 @@ class InsSection(EstimatorSection):
 
 def build(section: InsSection, rig: Rig) -> Lane:
     """The INS that a section asks for, not yet aligned."""
-    sensors, errors = rig.sensors, rig.imu(section.imu).errors()
+    sensors, errors = rig.sensors, rig.imu_errors(section.imu, *section.spare_imus)
     air = rig.air(section.gust_mps, section.wind_walk_mps_per_sqrt_s)
 
     def aid(name: str) -> Aid | None:

@@ -158,11 +158,10 @@ class Lane:
 
 def mountings(section: EstimatorSection, rig: Rig) -> tuple[dict[str, Array], Voter | None]:
     """How the IMUs of an estimator are mounted, C_sb by name, and who votes where there are several."""
-    errors = {name: rig.imu(name).errors() for name in (section.imu, *section.spare_imus)}
-    mounted = {name: e.C_sb for name, e in errors.items()}
+    mounted = {name: rig.imu(name).errors().C_sb for name in (section.imu, *section.spare_imus)}
     if not section.spare_imus:
         return mounted, None
-    e = errors[section.imu]
+    e = rig.imu_errors(section.imu, *section.spare_imus)
     turn = math.hypot(e.gyro_misalignment, e.gyro_nonorthogonality, e.gyro_scale)
     level = math.hypot(e.accel_misalignment, e.accel_nonorthogonality, e.accel_scale)
     return mounted, Voter(imu_model(e), turn, level)

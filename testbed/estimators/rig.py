@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 from testbed.motion.aircraft import UNKNOWN_BODY, Usual
 from testbed.motion.gusts import UNKNOWN_AIR
 from testbed.motion.weather import UNKNOWN_WALK
 from testbed.sensors import SensorConfig, Site
-from testbed.sensors.imu import ImuConfig
+from testbed.sensors.imu import ImuConfig, ImuErrors
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +46,12 @@ class Rig:
         if not isinstance(section, ImuConfig):
             raise ValueError(f"{name!r} is a sensor of kind {section.kind!r}, not an IMU")
         return section
+
+    def imu_errors(self, main: str, *spare: str) -> ImuErrors:
+        """What is told of the average of several units: the largest of each error, all else as of the ``main`` one."""
+        errors = [self.imu(name).errors() for name in (main, *spare)]
+        sizes = [one.name for one in fields(ImuErrors) if one.type == "float" and not one.name.endswith("_tau")]
+        return replace(errors[0], **{name: max(getattr(one, name) for one in errors) for name in sizes})
 
     def turn_rate(self, told_degps: float | None) -> float:
         """The rate of turn [rad/s] that an estimator is told, or else the usual one."""

@@ -16,6 +16,10 @@ MARKS = (";", "\t", ",")  # that part fields, the first that a row has; else spa
 SPACES = " "
 QUOTED = re.compile(r'"[^"]*"')
 DECIMAL_COMMA, DECIMAL_POINT = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?\d*\.\d+(e[-+]?\d+)?", re.IGNORECASE)
+MOMENT = re.compile(r"\d{4}([-/])\d\d\1\d\d([T ]\d\d:\d\d\S*)?|\d\d:\d\d:\d\d(\.\d+)?")
+UNITS = re.compile(
+    r"[kmcuµn]?(s|g|m|Pa|T|G|bar)|(rad|deg|k?m|cm|mm|ft|kn)(/(s|h|min)|/s/s|/s\^?2|/s²)?|[hm](Pa|bar)|min|%|-|1"
+)
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole
 MISSING = ("", "NA", "N/A", "null")  # in place of numbers
@@ -25,7 +29,7 @@ class Layout(NamedTuple):
     """How a text is a table: the mark between its fields, or `SPACES`, and what its numbers have for a point.
 
     ``above`` lines come before that of the ``names``, or without these before the first row, which has ``width``
-    fields. Names behind the mark of a comment, a field of its own, are ``hidden``.
+    fields. Names behind the mark of a comment, a field of its own, or with a line of units below, are ``hidden``.
     """
 
     mark: str
@@ -41,44 +45,53 @@ def layout(lines: Iterable[str]) -> Layout:
 
     ``lines`` are at least those up to the second that is no comment; of numbers up to `SHOWN` are looked at.
     """
-    comment = 0, ""  # the last one before the first other line, with its number
+    comments: list[tuple[int, str]] = [(0, "")]  # those before the first other line, with their numbers
     plain: list[tuple[int, str]] = []  # the first of these
     for number, raw in enumerate(lines):
         line = raw.strip("\ufeff\r\n")
         if SAID.fullmatch(line) and not plain:
             continue
         if line.startswith(COMMENTS) and not plain:
-            comment = number, line
+            comments.append((number, line))
         elif line.strip():
             plain.append((number, line))
         if len(plain) == SHOWN:
             break
     if not plain:
-        return Layout(",", ".", comment[0], _fields(comment[1], ","), 0)
-    (number, first), (_, row) = plain[0], plain[:2][-1]
+        return Layout(",", ".", comments[-1][0], _fields(comments[-1][1], ","), 0)
+    (number, first), (second, row) = plain[0], plain[:2][-1]
     mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES if " " in row.strip() else ",")
     fields = _fields(row, mark)
     shown = [one for _, line in plain[1:] or plain for one in _fields(line, mark)] if mark == ";" else []
     pointed = any(map(DECIMAL_POINT.fullmatch, shown))
     decimal = "," if not pointed and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
     width, top = len(fields), _fields(first, mark)
+    if _are_units(fields) and len(top) == width and not _are_numbers(top, decimal):
+        return Layout(mark, decimal, second, top, width, hidden=True)
     first_names = not _are_numbers(top, decimal) and _are_numbers(fields, decimal)
-    for names, hidden in ((_fields(comment[1], mark), False), (_fields(comment[1][1:], mark), True)):
-        if comment[1] and len(names) == len(top) > 1 and not first_names:
-            return Layout(mark, decimal, comment[0], names, width, hidden)
+    last, comment = comments[-1]
+    units = len(comments) > 2 and _are_units(_fields(comment[1:], mark))
+    comment = comments[-2][1] if units else comment
+    for names, hidden in ((_fields(comment, mark), units), (_fields(comment[1:], mark), True)):
+        if comment and len(names) == len(top) > 1 and not first_names:
+            return Layout(mark, decimal, last, names, width, hidden)
     if _are_numbers(top, decimal):
         return Layout(mark, decimal, number, [], width)
     return Layout(mark, decimal, number, top, width)
 
 
 def is_table(head: bytes) -> bool:
-    """Whether a file begins as a text of columns does: with commas, or with numbers."""
+    """Whether a file begins as a text of columns does: with commas, with other marks in two rows alike, or numbers."""
     if any(byte < ord(" ") and byte not in b"\t\r\n" for byte in head):
         return False
     said = [line for line in head.decode(errors="replace").splitlines() if line.strip() and line[0] not in COMMENTS]
     lines = said[1:] if said and SAID.fullmatch(said[0].strip("\ufeff")) else said
     found = layout(lines)
-    return b"," in head or (found.width > 0 and _are_numbers(_fields(lines[:2][-1], found.mark), found.decimal))
+    if b"," in head or not found.width:
+        return b"," in head
+    rows = [_fields(line, found.mark) for line in lines[:2]]
+    marked = found.mark != SPACES and len(rows[0]) == len(rows[-1]) > 1 and any(map(_is_number, rows[-1]))
+    return marked or _are_numbers(rows[-1], found.decimal)
 
 
 def columns(path: Path) -> Iterator[tuple[str, Any]]:
@@ -130,10 +143,19 @@ def _fields(line: str, mark: str) -> list[str]:
 
 
 def _are_numbers(fields: list[str], decimal: str) -> bool:
-    """Whether fields are a row of numbers: no names, as the numbers of columns counted from 0 are."""
+    """Whether fields are a row of numbers, or times: no names, as the numbers of columns counted from 0 are."""
     given = [one for one in fields if one not in MISSING]
     counted = [str(k) for k in range(len(given))]
-    return bool(given) and given != counted and all(_is_number(one.replace(decimal, ".")) for one in given)
+    return (
+        bool(given)
+        and given != counted
+        and all(_is_number(one.replace(decimal, ".")) or MOMENT.fullmatch(one) for one in given)
+    )
+
+
+def _are_units(fields: list[str]) -> bool:
+    given = [one.strip("[]()") for one in fields]
+    return len(given) > 1 and all(map(UNITS.fullmatch, given)) and not all(map(_is_number, given))
 
 
 def _is_number(text: str) -> bool:

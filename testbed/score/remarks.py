@@ -69,11 +69,12 @@ def not_finite(metrics: Mapping[str, float]) -> list[str]:
 def _silent(dataset: xarray.DataTree) -> list[str]:
     """Which sensors of the scenario gave nothing at all, such as one that never saw the ground."""
     try:
-        sensors = scenario_of(dataset).sensors
+        scenario = scenario_of(dataset)
     except UserError:  # `unscored` says so
         return []
     heard = dataset["sensors"].children if "sensors" in dataset.children else ()
-    return [f"{name}: gave no sample in the whole run" for name in sensors if name not in heard]
+    kept = [name for name, config in scenario.sensors.items() if scenario.record.imu or config.kind != "imu"]
+    return [f"{name}: gave no sample in the whole run" for name in kept if name not in heard]
 
 
 def _refusing(dataset: xarray.DataTree) -> Iterator[str]:

@@ -225,6 +225,18 @@ def test_a_failed_unit_of_three_is_voted_out_and_comes_back() -> None:
     assert any("imu_parity refused" in text for text in dataset["events/text"].values.astype(str))
 
 
+def test_of_units_that_differ_a_filter_is_told_the_worst() -> None:
+    """It was told the errors of the first, and averaged both: 30 times what it claimed."""
+    grades = ["sensors.imu.grade='navigation'", "sensors.spare={kind='imu', grade='mems-consumer'}"]
+    rig = Scenario.load("u_turn", [*grades, "estimator=[{name='ins', aids=['gnss']}]"]).rig(1)
+    best, worst, told = rig.imu("imu").errors(), rig.imu("spare").errors(), rig.imu_errors("imu", "spare")
+    assert (told.gyro_noise, told.accel_turn_on) == (worst.gyro_noise, worst.accel_turn_on)
+    assert told.gyro_in_run_tau == best.gyro_in_run_tau
+    voted = "{name='ins', spare_imus=['spare'], aids=['gnss', 'magnetometer']}"
+    found = run(Scenario.load("u_turn", [*grades, f"estimator=[{voted}]", "duration_s=90", "fault=[]", "expect={}"]))
+    assert found.metrics["ins.attitude_nees_mean"] < 3
+
+
 def heading_error_deg(dataset: Any, name: str, since: float) -> Any:
     """Difference of headings from a time on, by scipy."""
     late = dataset["truth/time"].values > since

@@ -341,10 +341,6 @@ def dashed(rows: list[str]) -> None:
     rows[10] = rows[10].replace("0.1", "-")
 
 
-def with_units(rows: list[str]) -> None:
-    rows.insert(0, "s,rad/s,rad/s,rad/s,m/s^2,m/s^2,m/s^2")
-
-
 def named_again(rows: list[str]) -> None:
     rows.insert(15, HEADER)
 
@@ -358,7 +354,6 @@ def filled_up(rows: list[str]) -> None:
     ("mangle", "said"),
     [
         (dashed, r'imu\.gyro: gx of .*flight\.csv holds text, first "-" in row 11$'),
-        (with_units, r'imu\.gyro: gx of .* holds text, first "rad/s" in row 1$'),
         (named_again, r'imu\.gyro: gx of .* holds text, first "gx" in row 16$'),
         (filled_up, r"imu\.time: t of .* holds text, first .* in row 201$"),
     ],

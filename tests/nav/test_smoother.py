@@ -106,7 +106,7 @@ def test_what_axes_feel_of_each_other_is_taken_off_between_nodes():
         smoother.pause(truth.t[5000], state)
         smoother.carry(state, measured)
         maps.append(smoother._nodes[0].M[:, :MOTION])
-        last = smoother._carried(Smoothed(truth.t[5000], state), float(clean.t[-1]), measured).state
+        _, last = smoother._carried(Smoothed(truth.t[5000], state), float(clean.t[-1]), measured)
         np.testing.assert_allclose(last.v_n, truth.v_n[5090], atol=0.02)  # to the second order in 17 mrad
     np.testing.assert_allclose(maps[1], maps[0], rtol=2e-3, atol=0.01)
 

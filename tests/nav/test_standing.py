@@ -92,6 +92,15 @@ def test_set_in_motion_gently_it_is_known_to_move_before_it_is_fast(acceleration
     assert speed[round(told[-1] * RATE_HZ) - 1] < 0.3
 
 
+@pytest.mark.parametrize("acceleration", [0.15, 0.25, 1.0])
+@pytest.mark.parametrize("told_until", [10.3, 60.0])
+def test_who_moves_off_steadily_does_not_stand_by_a_fix_of_before(acceleration: float, told_until: float) -> None:
+    """What was felt a window later was taken for what is felt at rest, and told for the rest of an outage."""
+    push = np.where(np.arange(60 * RATE_HZ) < 10 * RATE_HZ, 0.0, acceleration)
+    fixes = [fix(t, acceleration * max(t - 10.0, 0.0)) for t in np.arange(1.0, told_until, 0.2).tolist()]
+    assert times(Standing((0.0, 0.0)).heard(felt(60, push), fixes)) == list(range(2, 11))
+
+
 def test_a_running_engine_a_missing_and_a_broken_increment_are_no_rest() -> None:
     assert Standing((0.0, 0.0)).heard(felt(30, shaken=(0.05, 0.3)), [fix(2.0)]) == []
     broken = felt(30)
@@ -104,8 +113,8 @@ def test_a_running_engine_a_missing_and_a_broken_increment_are_no_rest() -> None
     short = (imu.t < 20.01) | (imu.t > 20.3)  # of one window a third is missing
     cut = ImuSamples(imu.t[short], imu.dt[short], imu.dtheta[short], imu.dv[short])
     assert times(Standing((0.0, 0.0)).heard(cut, [fix(2.0)])) == list(range(3, 21))
-    again = times(Standing((0.0, 0.0)).heard(gap, [fix(2.0), fix(25.1)]))
-    assert again == [*range(3, 21), *range(26, 31)]
+    again = times(Standing((0.0, 0.0)).heard(gap, [fix(2.0), fix(25.1), fix(27.1)]))
+    assert again == [*range(3, 21), *range(28, 31)]
 
 
 def test_a_noisy_imu_stands_when_its_noise_is_told() -> None:

@@ -193,6 +193,11 @@ def test_a_sensor_that_never_says_anything_is_told() -> None:
     assert not [one for one in result.remarks if one.startswith(("imu", "gnss"))]
 
 
+def test_a_unit_that_is_not_recorded_has_given_samples() -> None:
+    found = run(Scenario.load("static_bench", {"duration_s": 1, "expect": {}, "record.imu": False}))
+    assert not [one for one in found.remarks if "gave no sample" in one]
+
+
 def test_who_refuses_most_in_a_run_too_short_to_be_scored_is_told() -> None:
     """Nothing else said so."""
     jump = {"sensor": "gnss", "channel": "north", "kind": "step", "size": 500.0, "window": [4, 20]}
