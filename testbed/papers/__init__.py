@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from testbed.many.progress import Tell
 
 RESULTS = PAPERS
-RECORDED_DRAW = 710005  # of the table in the documentation, and what is drawn when nobody says
+RECORDED_DRAW = 770201  # of the table in the documentation, and what is drawn when nobody says
 Records: TypeAlias = Sequence[Mapping[str, Any]]  # claims as `Claim.record` has them
 IDS = ("cheng2020", "cui2022", "jiang2021", "zhou2025", "zhu2020")
 
