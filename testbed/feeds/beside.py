@@ -7,9 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from testbed.errors import UserError
+from testbed.feeds.doubted import contradicted
 from testbed.feeds.log import Log
 from testbed.feeds.samples import newly
-from testbed.feeds.table import contradicted, known_motion, load, quantities
+from testbed.feeds.table import known_motion, load, quantities
 from testbed.motion.logged import Stream
 
 

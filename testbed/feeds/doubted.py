@@ -1,4 +1,4 @@
-"""What whoever is judged by an autopilot's own solution should know: where it is not how its receiver says."""
+"""What whoever is judged by an autopilot's solution, or by a reference, should know: where sensors say otherwise."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ from nav._jit import njit
 from nav.rotation import quat_rotate_components
 from nav.samples import Array, GnssSample, ImuSamples
 from testbed.feeds.log import Reference, Samples
-from testbed.feeds.reference import LONGEST_STEP_S, ReferenceMotion, doubt, elsewhere_in_height
+from testbed.feeds.mistaken import gone_otherwise
+from testbed.feeds.reference import LONGEST_STEP_S, ReferenceMotion, doubt, elsewhere_in_height, silence
+from testbed.feeds.rest import tilted
 from testbed.feeds.survey import fixes
+from testbed.feeds.turning import turns_otherwise
 
 STRETCH_S, STEP_S = 20.0, 1.0  # over which changes of velocity are compared, and of which length they are
 KNOWN_SHARE = 0.95  # of a stretch, in which increments and attitude are known
@@ -29,6 +32,36 @@ def remark(solution: Reference | None, imus: Mapping[str, ImuSamples], samples: 
     if not elsewhere and (off := elsewhere_in_height(solution, samples)):
         elsewhere = f'{off}: truth.reference = "gnss" judges by the receiver'
     return "; ".join(one for one in (elsewhere, turned(solution, imus, samples)) if one)
+
+
+def contradicted(
+    reference: Reference | None, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]
+) -> str:  # fmt: skip
+    """What speaks against the reference of a table.
+
+    It is judged by all the same, unlike an autopilot's own: the user named it, and it may be the truth, and what is
+    said of the axes of the inertial unit or of the receiver's clock wrong.
+    """
+    if reference is None:
+        return ""
+    said = [doubt(reference, samples)]
+    if said[0]:
+        said.append("are columns, units and times of both as truth.columns says?")
+    if apart := elsewhere_in_height(reference, samples):
+        said.append(f"{apart}: is one of heights above the sea?")
+    name, main = next((name, imu) for name, imu in imus.items() if len(imu))
+    if not said[0] and (apart := silence(reference, float(main.t[0]), float(main.t[-1]))):
+        said.append(f"{apart} of {name}")
+    if lies := tilted(reference, imus, samples):
+        said.append(f"{lies}: unit, order or frame of its attitude, or axes of accel, are not as truth.columns says")
+    elif turns := turns_otherwise(reference, imus):
+        said.append(f"{turns}: unit, order or frame of its attitude, or axes of gyro, are not as truth.columns says")
+    own = reference.columns
+    if {"lat", "lon", "h", "v_n"} <= own.keys():
+        place = np.column_stack([own[axis] for axis in ("lat", "lon", "h")])
+        ways = gone_otherwise(reference.t, own["v_n"], place)
+        said += [f"{reference.name}: {way}: are units, columns and axes right?" for way in ways]
+    return "; ".join(one for one in said if one)
 
 
 def turned(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> str:

@@ -16,9 +16,10 @@ from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.errors import UserError
 from testbed.feeds.axes import unlike
-from testbed.feeds.log import Log
-from testbed.feeds.recorded import first_place, rate
-from testbed.feeds.reference import doubt, elsewhere_in_height
+from testbed.feeds.log import TABLE, Log
+from testbed.feeds.recorded import first_place, rate, references
+from testbed.feeds.reference import doubt, elsewhere_in_height, silence
+from testbed.feeds.scatter import otherwise
 from testbed.feeds.survey import Noise, Sphere, Survey
 from testbed.feeds.unsound import magnetometers
 from testbed.motion.logged import LogTruth
@@ -34,6 +35,7 @@ WORST = "mems-hobby"
 NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its noise, and biases within so many sigmas
 DIGITS = 3
 MOST_RTK_CLAIM = 0.05  # level [m]
+UNSURE = {"latency_sigma_s": RECEIVERS["u-blox-m8"]["latency_sigma_s"]}
 AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
 ROWS_HZ, RECORD_HZ = 100.0, 10.0
 SHORTEST_S = 0.1  # of a run; one that begins after the log's end is refused when it is run
@@ -59,6 +61,8 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
                 keys = {"kind": "gnss", **_receiver_keys(own, receiver), **keys}
                 if name in found.latency_s and not log.valid_times:
                     keys |= _lateness(found.latency_s[name], found.velocity_lag_s.get(name, 0.0))
+                elif log.format == TABLE and not log.valid_times:
+                    keys |= {"latency_s": 0.0, **UNSURE}  # mostly times of fixes, in a table that tools have written
             case MagnetometerSample():
                 keys = {"kind": "magnetometer", "grade": grade, **keys}
                 iron = _iron(found.spheres.get(name)) / MICROTESLA
@@ -81,8 +85,8 @@ def _receiver_keys(own: Sequence[Any], grade: str) -> dict[str, Any]:
     """The grade of a receiver, and how well its latency is known: `rtk` of one that claims what only that can have."""
     claims = [float(np.max(one.sigma_position_n[:2])) for one in own if one.has_fix]
     if not claims or not np.median(claims) <= MOST_RTK_CLAIM:  # nor where it claims nothing
-        return {"grade": grade}
-    return {"grade": "rtk", "latency_sigma_s": RECEIVERS["u-blox-m8"]["latency_sigma_s"]}
+        return {"grade": grade, **otherwise(own, RECEIVERS[grade])}
+    return {"grade": "rtk", **otherwise(own, RECEIVERS["rtk"]), **UNSURE}
 
 
 def _lateness(latency: float, lag: float) -> dict[str, float]:
@@ -160,7 +164,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     lines += [f"{key} = {_inline(value)}" for key, value in ({"rate_hz": ROWS_HZ} | kept).items()]
     if truth is not None and "reference" in truth.model_fields_set:
         lines.append(f"reference = {_inline(truth.reference)}")
-    elif doubt(log.solution, log.samples) or (log.solution and elsewhere_in_height(log.solution, log.samples)):
+    elif _is_elsewhere(log, named=truth is not None and bool(references(truth))):
         lines.append('reference = "gnss"  # its own solution is elsewhere')
     if truth is not None and truth.start is not None:
         lines.append(f"start = {_inline(truth.start.model_dump())}")
@@ -181,6 +185,16 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
                 lines.append(_heading(log))
     lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
     return "\n".join(lines)
+
+
+def _is_elsewhere(log: Log, named: bool) -> bool:
+    """Whether a log's solution can't judge it; one that the user ``named`` judges unless it is of another time."""
+    if log.solution is None:
+        return False
+    imu = next(iter(log.imus.values()))
+    if named and not silence(log.solution, float(imu.t[0]), float(imu.t[-1])):
+        return False
+    return bool(doubt(log.solution, log.samples) or elsewhere_in_height(log.solution, log.samples))
 
 
 def is_placed(log: Log) -> bool:

@@ -45,6 +45,7 @@ SAMPLES: Mapping[str, type[Sample]] = {
     "wind_report": WindSample,
 }
 
+TABLE = "table"  # the format of what has columns, which a scenario names
 LONGEST_WAIT_S = 600.0  # for an inertial unit, of a log whose other sensors are heard before it
 
 Samples: TypeAlias = Sequence[Sample]

@@ -19,6 +19,7 @@ from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.samples import Fixes
+from testbed.feeds.scatter import misjudged
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
 from testbed.feeds.survey import latency, usual_step, velocity_lag
 from testbed.motion.logged import LogTruth, Place
@@ -149,7 +150,9 @@ class Recorded:
         doubt = log.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
-        told = [doubt, *mistaken(_as_used(log, sections)), *_losses(log, [*scenario.sensors, *_references(truth)])]
+        scattered = [misjudged(one, log.samples[one], sections[one]) for one in self.receptions if one in log.samples]
+        lost = _losses(log, [*scenario.sensors, *references(truth)])
+        told = [doubt, *mistaken(_as_used(log, sections)), *scattered, *lost]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
@@ -245,7 +248,7 @@ def _in_it_already(scenario: Scenario, log: Log) -> list[str]:
     return told
 
 
-def _references(truth: LogTruth) -> list[str]:
+def references(truth: LogTruth) -> list[str]:
     """The streams of a table that are known of the motion, where the run makes use of them."""
     used = [name for name, stream in truth.columns.items() if (stream.kind or name) == "reference"]
     return used if truth.reference == "solution" else []

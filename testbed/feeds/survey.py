@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nav._jit import njit
-from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, radii
+from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, position_difference_n, radii
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.errors import UserError
@@ -25,6 +25,7 @@ from testbed.feeds.stamps import GAP_PERIODS, GAP_S
 from testbed.sensors.gnss import GRADES
 
 MOVING = ("moving", "flying")  # the phases in which it does
+ABOUT_S = 10.0  # over which positions tell a speed: by two of 3 m it is less than that at rest
 FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
@@ -191,6 +192,7 @@ def phases(log: Log) -> list[Phase]:
     receiver = log.receiver
     t, v_n, place = fixes(log.samples[receiver]) if receiver else (np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     speed = np.hypot(v_n[:, 0], v_n[:, 1])
+    speed = np.where(np.isfinite(speed), speed, _speed_by_places(t, place))
     for k in range(count):
         still = bool(resting[k])
         near = slice(*np.searchsorted(t, edges[k : k + 2]))
@@ -204,6 +206,16 @@ def phases(log: Log) -> list[Phase]:
             names.append("rest" if still and fast < REST_SPEED else "moving")
     changes = [0, *[k for k in range(1, count) if names[k] != names[k - 1]], count]
     return [Phase(names[a], a * WINDOW_S, b * WINDOW_S) for a, b in itertools.pairwise(changes)]
+
+
+def _speed_by_places(t: Array, place: Array) -> Array:
+    """How fast a receiver without velocities went about each of its fixes (N,), over `ABOUT_S` [m/s]."""
+    if len(t) < 2:
+        return np.zeros(len(t))
+    first, last = np.searchsorted(t, t - ABOUT_S / 2), np.searchsorted(t, t + ABOUT_S / 2, side="right") - 1
+    way = position_difference_n(*place[last].T, *place[first].T)
+    speed: Array = np.hypot(way[:, 0], way[:, 1]) / np.maximum(t[last] - t[first], ABOUT_S / 2)
+    return speed
 
 
 def _speeds(speed: Array, near: slice) -> tuple[float, float]:

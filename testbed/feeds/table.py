@@ -16,14 +16,12 @@ from nav.earth import isa_pressure
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
+from testbed.feeds.doubted import contradicted
 from testbed.feeds.formats import known
-from testbed.feeds.log import Log, Reference, Samples, beginning, require_imu, require_one_clock
-from testbed.feeds.mistaken import gone_otherwise
-from testbed.feeds.reference import doubt, elsewhere_in_height, silence, usual_sigma
-from testbed.feeds.rest import tilted
+from testbed.feeds.log import TABLE, Log, Reference, Samples, beginning, require_imu, require_one_clock
+from testbed.feeds.reference import usual_sigma
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, left_out, ordered, spaced, with_holes
-from testbed.feeds.turning import turns_otherwise
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
@@ -139,7 +137,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     start = beginning(imus, samples, reference, notes)
     remark = contradicted(reference, imus, samples)
     date = _date(of_files, path, columns.values(), start)
-    return Log(path, "table", imus, samples, reference, start, found, notes, date=date, remark=remark)
+    return Log(path, TABLE, imus, samples, reference, start, found, notes, date=date, remark=remark)
 
 
 def _date(tables: Mapping[Path, Table], main: Path, streams: Iterable[Stream], start: float) -> dt.date | None:
@@ -171,34 +169,6 @@ def _whole(
             notes.append(left_out(name, told, lacking, len(t)))
     known &= ~wild
     return t[known], {key: one[known] for key, one in values.items()}
-
-
-def contradicted(
-    reference: Reference | None, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]
-) -> str:  # fmt: skip
-    """What speaks against the reference of a table.
-
-    It is judged by all the same, unlike an autopilot's own: the user named it, and it may be the truth, and what is
-    said of the axes of the inertial unit or of the receiver's clock wrong.
-    """
-    if reference is None:
-        return ""
-    said = [doubt(reference, samples)]
-    if apart := elsewhere_in_height(reference, samples):
-        said.append(f"{apart}: is one of heights above the sea?")
-    name, main = next((name, imu) for name, imu in imus.items() if len(imu))
-    if not said[0] and (apart := silence(reference, float(main.t[0]), float(main.t[-1]))):
-        said.append(f"{apart} of {name}")
-    if lies := tilted(reference, imus, samples):
-        said.append(f"{lies}: unit, order or frame of its attitude, or axes of accel, are not as truth.columns says")
-    elif turns := turns_otherwise(reference, imus):
-        said.append(f"{turns}: unit, order or frame of its attitude, or axes of gyro, are not as truth.columns says")
-    own = reference.columns
-    if {"lat", "lon", "h", "v_n"} <= own.keys():
-        place = np.column_stack([own[axis] for axis in ("lat", "lon", "h")])
-        ways = gone_otherwise(reference.t, own["v_n"], place)
-        said += [f"{reference.name}: {way}: are units, columns and axes right?" for way in ways]
-    return "; ".join(one for one in said if one)
 
 
 def load(path: Path) -> Table:
@@ -376,6 +346,8 @@ def _quantity(table: Table, where: str, key: str, column: Column, notes: list[st
         raise UserError(f"{where}: its columns differ in length")
     values = parts[0] if len(parts) == 1 else np.column_stack(parts)
     width = 1 if values.ndim == 1 else values.shape[1]
+    if key == "time" and width == 2 and column.unit is None:  # of ROS: seconds, and nanoseconds beside them
+        values, width = values[:, 0] + 1e-9 * values[:, 1], 1
     wanted = (3, 4) if key == "attitude" else (3,) if key in VECTORS else (1,)
     if width not in wanted:
         raise UserError(f"{where}: has {width} columns: {' or '.join(map(str, wanted))} are needed")

@@ -89,9 +89,9 @@ def is_table(head: bytes) -> bool:
     found = layout(lines)
     if b"," in head or not found.width:
         return b"," in head
-    rows = [_fields(line, found.mark) for line in lines[:2]]
-    marked = found.mark != SPACES and len(rows[0]) == len(rows[-1]) > 1 and any(map(_is_number, rows[-1]))
-    return marked or _are_numbers(rows[-1], found.decimal)
+    first, *rows = [_fields(line, found.mark) for line in lines[:3]]  # of which the second may have units
+    alike = found.mark != SPACES and any(len(row) == len(first) > 1 and any(map(_is_number, row)) for row in rows)
+    return alike or _are_numbers([first, *rows][:2][-1], found.decimal)
 
 
 def columns(path: Path) -> Iterator[tuple[str, Any]]:

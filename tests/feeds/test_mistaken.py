@@ -147,6 +147,16 @@ def test_a_steady_flight_without_its_receiver_is_no_rest():
     assert [phase.name for phase in phases(log(fixes=late))] == ["rest", "flying"]
 
 
+def test_without_velocities_places_say_that_it_flies():
+    """Circles that shake nothing were taken for rest, and their turns for a bias of the gyros."""
+    silent = [replace(one, v_n=np.full(3, math.nan)) for one in FIXES]
+    smooth = np.where(IMU.t > STANDS, SPEED / RADIUS, 0.0)[:, None] * [0.0, 0.0, 0.01]
+    pushed = np.where((IMU.t > STANDS)[:, None], [0.0, SPEED**2 / RADIUS, -9.8], [0.0, 0.0, -9.8]) * 0.01
+    found = phases(log(ImuSamples(IMU.t, IMU.dt, smooth, pushed), silent))
+    assert [phase.name for phase in found][:: len(found) - 1] == ["rest", "flying"]
+    assert found[0].end < STANDS + 6
+
+
 def table(folder, lies=(1, 1, 1), says=1.0, sensors=""):
     """The scenario of a table with both, and a receiver that nobody uses unless ``sensors`` has it."""
     flat = {"imu_t": IMU.t, "gyro": IMU.dtheta / 0.01 * lies, "accel": IMU.dv / 0.01 * lies}
@@ -158,6 +168,7 @@ def table(folder, lies=(1, 1, 1), says=1.0, sensors=""):
         '[truth.columns.imu]\ntime = "imu_t"\ngyro = "gyro"\naccel = "accel"\n'
         f'[truth.columns.gnss]\n{place}velocity = "v_n"\n[truth.columns.second]\nkind = "gnss"\n{place}velocity = "v"\n'
         f'[sensors.imu]\ngrade = "mems-hobby"\n{sensors}[sensors.gnss]\ngrade = "u-blox-m8"\n'
+        "horizontal_white_m = 1.0\nvertical_white_m = 1.0\n"
         '[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
     )
     return Scenario.load(folder / "a.toml")

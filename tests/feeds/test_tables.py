@@ -337,6 +337,55 @@ def test_commas_in_quotes_are_none(tmp_path: Path) -> None:
     assert len(of_text(tmp_path, ['"t",gx,gy,gz,ax,ay,az,"phase, mode"', *rows]).imus["imu"]) == 20
 
 
+STAMPS = ["2024-05-03T09:00:00.010000", "2024-05-03T09:00:00.020000", "2024-05-03T09:00:00.030000"]
+
+
+@pytest.mark.parametrize(
+    ("above", "mark", "names"),
+    [
+        ([], ",", ["0", "1", "2"]),
+        ([], " ", ["0", "1", "2"]),
+        (["time;gx;gy"], ";", ["time", "gx", "gy"]),
+        (["time\tgx\tgy"], "\t", ["time", "gx", "gy"]),
+        (["time,gx,gy", "s,rad/s,rad/s"], ",", ["time", "gx", "gy"]),
+        (["time\tgx\tgy", "[s]\t[rad/s]\t[rad/s]"], "\t", ["time", "gx", "gy"]),
+        (["% time gx gy", "% s rad/s rad/s"], " ", ["time", "gx", "gy"]),
+        (["# anything at all", "# time gx gy", "# (s) (rad/s) (deg/s)"], " ", ["time", "gx", "gy"]),
+    ],
+)
+@pytest.mark.parametrize("stamps", [STAMPS, ["0.01", "0.02", "0.03"]], ids=["dates", "seconds"])
+def test_texts_as_tools_write_them(
+    above: list[str], mark: str, names: list[str], stamps: list[str], tmp_path: Path
+) -> None:
+    """Dates were no numbers, so that the first row had the names, or there was no table; a line of units had them."""
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join([*above, *(mark.join([stamp, "0.5", "-0.25"]) for stamp in stamps)]) + "\n")
+    numbers = load(path).numbers
+    assert list(numbers) == names
+    np.testing.assert_allclose(np.diff(numbers[names[0]]), 0.01, atol=1e-6)
+    assert [numbers[name].tolist() for name in names[1:]] == [[0.5] * 3, [-0.25] * 3]
+
+
+def test_a_date_and_a_time_of_day_alone_are_a_table(tmp_path: Path) -> None:
+    """KITTI's timestamps.txt, and rows of RTKLIB without their head."""
+    (tmp_path / "stamps.txt").write_text("2011-09-26 13:02:25.010000000\n2011-09-26 13:02:25.020000000\n")
+    np.testing.assert_allclose(np.diff(load(tmp_path / "stamps.txt").numbers["1"]), 0.01, atol=1e-6)
+
+
+def test_text_that_is_no_table_is_none(tmp_path: Path) -> None:
+    for text in ("int main() {\n  return 0;\n}\n", "Hello; this is\na text; of words\n"):
+        (tmp_path / "a.txt").write_text(text)
+        with pytest.raises(UserError, match="is no log of a known format"):
+            load(tmp_path / "a.txt")
+
+
+def test_seconds_and_nanoseconds_are_one_time(tmp_path: Path) -> None:
+    table = standing()
+    table["sec"], table["nanosec"] = np.floor(table["t"]), np.round(table["t"] % 1 * 1e9)
+    apart = read(tmp_path, table, imu={**IMU, "time": ["sec", "nanosec"]}).imus["imu"]
+    np.testing.assert_allclose(apart.t, table["t"], atol=1e-9)
+
+
 def dashed(rows: list[str]) -> None:
     rows[10] = rows[10].replace("0.1", "-")
 
