@@ -185,10 +185,10 @@ class Smoother:
 
 
 def _spread(P: Array, information: Array) -> Array:
-    """P - P Lambda P (n, n), of which no direction is better known than by `LEAST` of its variance in P.
+    """P - P Lambda P (n, n), kept positive: in directions in which it is not, `LEAST` of P is left.
 
-    In P^1/2 (1 - P^1/2' Lambda P^1/2) P^1/2' what is in brackets has eigenvalues from 0 to 1. Where next to nothing is
-    left of them, it is what the maps of time, taken in pieces of their own, are off those of the filter.
+    In P^1/2 (1 - P^1/2' Lambda P^1/2) P^1/2' what is in brackets has eigenvalues from 0 to 1. Below zero it is by what
+    the maps of time, taken in pieces of their own, are off those of the filter.
     """
     spread = P - P @ information @ P
     spread = 0.5 * (spread + spread.T)
@@ -196,12 +196,12 @@ def _spread(P: Array, information: Array) -> Array:
     sigma = np.sqrt(P.diagonal()[driven])
     block = np.ix_(driven, driven)
     scaled = spread[block] / np.outer(sigma, sigma)
-    if scaled.diagonal().min(initial=1.0) >= LEAST and np.linalg.eigvalsh(scaled)[0] >= 0:
+    if not len(driven) or np.linalg.eigvalsh(scaled)[0] > 0:
         return spread
     own, axes = np.linalg.eigh(P[block] / np.outer(sigma, sigma))
     half = sigma[:, None] * axes * np.sqrt(np.maximum(own, 0.0))
     known, turn = np.linalg.eigh(half.T @ information[block] @ half)
-    left = half @ (turn * np.sqrt(np.clip(1.0 - known, LEAST, 1.0)))
+    left = half @ (turn * np.sqrt(np.where(known < 1.0, 1.0 - known, LEAST)))
     spread[block] = left @ left.T
     return spread
 

@@ -26,7 +26,7 @@ MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
 LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
 LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, as the median
 MOST_STEP, STEP_SHARE = math.radians(5), 0.95  # from one sample to the next; no more in this share of them
-NEARLY_ALL = 0.99  # of the steps, beyond which all are taken to be as large
+FASTEST = 100.0  # of one step [rad/s]
 ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
 
 
@@ -99,7 +99,7 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
         return
     t, v_n, _ = fixes(log.samples[log.receiver])
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
-    turned = np.minimum(turned, np.quantile(turned, NEARLY_ALL))  # a row that is wrong is no wrong unit
+    turned = np.minimum(turned, FASTEST * imu.dt)  # a row that is wrong is no wrong unit
     felt = np.concatenate([[0.0], np.cumsum(turned)])
     fast = np.hypot(v_n[:, 0], v_n[:, 1]) > LEAST_WAY / STRETCH_S
     step = np.diff(t)

@@ -19,6 +19,7 @@ LEAST_FIXES = 40
 EVEN = 0.1  # of the usual step, by which others may differ
 MOSTLY = 0.7  # of the claim, from which on most of its square is white
 MORE, LESS = 1.5, 0.8  # times what is told
+LEAST_NOISE = 0.005  # [m]
 NORMAL = 1.4826  # sigma of normal errors over their median size
 AXES = {"horizontal": [0, 1], "vertical": [2]}
 
@@ -32,13 +33,17 @@ def scatter(own: Sequence[Any]) -> Array | None:
     taken: what else is in them adds to it.
     """
     t, v_n, place = fixes(own)
+    new: Mask = np.asarray(np.isfinite(place).all(axis=1))
+    new[1:] &= (np.diff(place, axis=0) != 0).any(axis=1)  # what is told again is no scatter
+    t, v_n, place = t[new], v_n[new], place[new]
     if len(t) < LEAST_FIXES:
         return None
     place[:, 1] = np.unwrap(place[:, 1])
     step = usual_step(t)
     even: Mask = np.abs(np.diff(t) - step) < EVEN * step
-    north, east = radii(float(place[0, 0]))
-    metres = np.array([north, east * math.cos(place[0, 0]), -1.0])
+    lat = float(np.median(place[:, 0]))
+    north, east = radii(lat)
+    metres = np.array([north, east * math.cos(lat), -1.0])
     p = (place - place[0]) * metres
     four: Mask = np.convolve(even, np.ones(4), "valid") == 4
     found = [_sigma(np.diff(p, 4, axis=0), four, 70)]
@@ -72,7 +77,7 @@ def otherwise(own: Sequence[Any], told: Any) -> dict[str, float]:
             lasting = math.sqrt(max(said**2 - noise**2, 0.0))
             if lasting < LESS * told[f"{axis}_correlated_m"]:
                 keys[f"{axis}_correlated_m"] = lasting
-        elif math.isnan(said) and noise > MORE * told[f"{axis}_white_m"]:
+        elif math.isnan(said) and noise > max(MORE * told[f"{axis}_white_m"], LEAST_NOISE):
             keys[f"{axis}_white_m"] = noise
     return {key: float(f"{value:.2g}") for key, value in keys.items()}
 

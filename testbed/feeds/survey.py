@@ -25,7 +25,7 @@ from testbed.feeds.stamps import GAP_PERIODS, GAP_S
 from testbed.sensors.gnss import GRADES
 
 MOVING = ("moving", "flying")  # the phases in which it does
-ABOUT_S = 10.0  # over which positions tell a speed: by two of 3 m it is less than that at rest
+ABOUT_S = 20.0  # over which positions tell a speed
 FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
@@ -212,9 +212,11 @@ def _speed_by_places(t: Array, place: Array) -> Array:
     """How fast a receiver without velocities went about each of its fixes (N,), over `ABOUT_S` [m/s]."""
     if len(t) < 2:
         return np.zeros(len(t))
-    first, last = np.searchsorted(t, t - ABOUT_S / 2), np.searchsorted(t, t + ABOUT_S / 2, side="right") - 1
+    k = np.arange(len(t))
+    first = np.minimum(np.searchsorted(t, t - ABOUT_S / 2), np.maximum(k - 1, 0))
+    last = np.maximum(np.searchsorted(t, t + ABOUT_S / 2, side="right") - 1, np.minimum(k + 1, len(t) - 1))
     way = position_difference_n(*place[last].T, *place[first].T)
-    speed: Array = np.hypot(way[:, 0], way[:, 1]) / np.maximum(t[last] - t[first], ABOUT_S / 2)
+    speed: Array = np.hypot(way[:, 0], way[:, 1]) / np.maximum(t[last] - t[first], ROUNDING_S)
     return speed
 
 

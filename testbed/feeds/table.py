@@ -346,7 +346,7 @@ def _quantity(table: Table, where: str, key: str, column: Column, notes: list[st
         raise UserError(f"{where}: its columns differ in length")
     values = parts[0] if len(parts) == 1 else np.column_stack(parts)
     width = 1 if values.ndim == 1 else values.shape[1]
-    if key == "time" and width == 2 and column.unit is None:  # of ROS: seconds, and nanoseconds beside them
+    if key == "time" and width == 2 and column.unit in (None, "s") and _are_seconds_and_nanoseconds(values):
         values, width = values[:, 0] + 1e-9 * values[:, 1], 1
     wanted = (3, 4) if key == "attitude" else (3,) if key in VECTORS else (1,)
     if width not in wanted:
@@ -361,6 +361,13 @@ def _quantity(table: Table, where: str, key: str, column: Column, notes: list[st
     if key in LARGEST:
         _require_unit(where, values / units[unit], unit, LARGEST[key])
     return values
+
+
+def _are_seconds_and_nanoseconds(values: Array) -> bool:
+    """Whether two columns (N, 2) are a time as ROS has it."""
+    seconds, nanoseconds = values.T
+    whole = np.all(np.mod(values, 1) == 0) and np.all((nanoseconds >= 0) & (nanoseconds < 1e9))
+    return bool(whole and nanoseconds.max(initial=0.0) > 1e6 and np.all(np.diff(seconds) >= 0))
 
 
 def _require_unit(where: str, values: Array, unit: str, largest: float) -> None:

@@ -18,7 +18,7 @@ QUOTED = re.compile(r'"[^"]*"')
 DECIMAL_COMMA, DECIMAL_POINT = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?\d*\.\d+(e[-+]?\d+)?", re.IGNORECASE)
 MOMENT = re.compile(r"\d{4}([-/])\d\d\1\d\d([T ]\d\d:\d\d\S*)?|\d\d:\d\d:\d\d(\.\d+)?")
 UNITS = re.compile(
-    r"[kmcuµn]?(s|g|m|Pa|T|G|bar)|(rad|deg|k?m|cm|mm|ft|kn)(/(s|h|min)|/s/s|/s\^?2|/s²)?|[hm](Pa|bar)|min|%|-|1"
+    r"[kmcuµn]?(s|g|m|Pa|T|G|bar)|(rad|deg|k?m|cm|mm|ft|kn)(/(s|h|min)|/s/s|/s\^?2|/s²)?|[hm](Pa|bar)|min|%|-"
 )
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole
@@ -67,14 +67,15 @@ def layout(lines: Iterable[str]) -> Layout:
     decimal = "," if not pointed and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
     width, top = len(fields), _fields(first, mark)
     if _are_units(fields) and len(top) == width and not _are_numbers(top, decimal):
-        return Layout(mark, decimal, second, top, width, hidden=True)
+        return Layout(mark, decimal, second, _each_once(top), width, hidden=True)
     first_names = not _are_numbers(top, decimal) and _are_numbers(fields, decimal)
     last, comment = comments[-1]
-    units = len(comments) > 2 and _are_units(_fields(comment[1:], mark))
+    above = _fields(comments[-2][1][1:], mark) if len(comments) > 2 else []
+    units = _are_units(_fields(comment[1:], mark)) and len(above) == len(top) and not any(map(_is_number, above))
     comment = comments[-2][1] if units else comment
     for names, hidden in ((_fields(comment, mark), units), (_fields(comment[1:], mark), True)):
         if comment and len(names) == len(top) > 1 and not first_names:
-            return Layout(mark, decimal, last, names, width, hidden)
+            return Layout(mark, decimal, last, _each_once(names) if hidden else names, width, hidden)
     if _are_numbers(top, decimal):
         return Layout(mark, decimal, number, [], width)
     return Layout(mark, decimal, number, top, width)
@@ -90,8 +91,9 @@ def is_table(head: bytes) -> bool:
     if b"," in head or not found.width:
         return b"," in head
     first, *rows = [_fields(line, found.mark) for line in lines[:3]]  # of which the second may have units
-    alike = found.mark != SPACES and any(len(row) == len(first) > 1 and any(map(_is_number, row)) for row in rows)
-    return alike or _are_numbers([first, *rows][:2][-1], found.decimal)
+    marked = found.mark != SPACES or (rows and _are_units(rows[0]))
+    alike = marked and any(len(row) == len(first) > 1 and any(map(_is_number, row)) for row in rows)
+    return bool(alike) or _are_numbers([first, *rows][:2][-1], found.decimal)
 
 
 def columns(path: Path) -> Iterator[tuple[str, Any]]:
@@ -155,7 +157,12 @@ def _are_numbers(fields: list[str], decimal: str) -> bool:
 
 def _are_units(fields: list[str]) -> bool:
     given = [one.strip("[]()") for one in fields]
-    return len(given) > 1 and all(map(UNITS.fullmatch, given)) and not all(map(_is_number, given))
+    return len(given) > 1 and all(map(UNITS.fullmatch, given)) and any(one != "-" for one in given)
+
+
+def _each_once(names: list[str]) -> list[str]:
+    """Names of which those that come again have a number, as pandas has them."""
+    return [one if (k := names[:n].count(one)) == 0 else f"{one}.{k}" for n, one in enumerate(names)]
 
 
 def _is_number(text: str) -> bool:

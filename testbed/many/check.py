@@ -183,7 +183,9 @@ def tasks(names: Sequence[str], out: Path, golden: Path | None, update: bool = F
             raise UserError(f"{one}: there is another scenario of that name among these: check one at a time")
         known = read_golden(golden / f"{name}.json") if golden is not None and scenario.golden else None
         if not scenario.expect and known is None and not update:
-            raise UserError(f"{one}: has no [expect] and no golden metrics, so there is nothing to check: add some")
+            raise UserError(
+                f"{one}: has no [expect] and no golden metrics (or golden = false): there is nothing to check: add some"
+            )
         made[name] = Task(name, scenario, out / name, None if update else known)
     return list(made.values())
 

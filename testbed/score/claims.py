@@ -153,10 +153,14 @@ def _product(values: Array, exponents: tuple[float, ...]) -> Interval:
     """
     means = values.mean(axis=0)
     value = float(np.prod(means**exponents))
+    if len(values) < 2 or value < 0:
+        return Interval(value, -math.inf, math.inf)
     if not 0 < value < math.inf:
         return Interval(value, value, value)
     mean, _, high = student((values / means) @ exponents)
-    return Interval(value, value * math.exp(mean - high), value * math.exp(high - mean))
+    with np.errstate(over="ignore"):
+        wide = float(np.exp(high - mean))
+    return Interval(value, value / wide, value * wide)
 
 
 def _rms_over_bound(values: Array) -> Interval:

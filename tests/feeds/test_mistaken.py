@@ -98,6 +98,24 @@ def test_one_row_that_is_wrong_is_no_wrong_unit():
     assert mistaken(log(replace(IMU, dtheta=dtheta))) == []
 
 
+def test_few_turns_of_a_long_way_are_felt():
+    """All that turned were the one step in a hundred that turned most."""
+    t = np.arange(0.1, 2000, 0.1)
+    rate = np.where(np.abs(t % 500 - 250) < 2.5, 0.4, 0.0)
+    angle = np.concatenate([[0.0], np.cumsum(rate * 0.1)])[:-1]
+    imu = ImuSamples(t, np.full(len(t), 0.1), 0.1 * rate[:, None] * [0, 0, 1.0], np.tile([0, 0, -0.98], (len(t), 1)))
+    fixes = []
+    north = east = 0.0
+    for now, turned in zip(t[::10].tolist(), angle[::10].tolist(), strict=True):
+        v_n = 25.0 * np.array([math.cos(turned), math.sin(turned), 0.0])
+        north, east = north + v_n[0], east + v_n[1]
+        lat, lon, h = pymap3d.enu2geodetic(east, north, 0.0, 47.0, 8.0, 400.0)
+        fixes.append(
+            replace(FIXES[0], t=now, t_arrival=now, lat=math.radians(lat), lon=math.radians(lon), h=h, v_n=v_n)
+        )
+    assert not [one for one in mistaken(log(imu, fixes)) if "its gyros feel" in one]
+
+
 @pytest.mark.parametrize("wrong", [9.8, 1 / 9.8, 0.5])
 def test_accelerometers_in_another_unit(wrong):
     (said,) = mistaken(log(replace(IMU, dv=wrong * IMU.dv)))

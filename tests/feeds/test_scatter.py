@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,13 @@ def test_white_noise_is_found_beside_motion_and_what_lasts(rate_hz: float, veloc
     found = scatter(circling(rate_hz, 2.0, lasting=2.0, velocities=velocities))
     assert found is not None
     np.testing.assert_allclose(found, WHITE, rtol=0.25)
+
+
+def test_fixes_that_are_told_again_are_no_scatter() -> None:
+    once = circling(5.0, 2.0, white=0.1 * WHITE, lasting=2.0)
+    again = [replace(one, t=one.t + late, t_arrival=one.t + late) for one in once for late in (0.0, 0.1)]
+    assert otherwise(again, GRADES["u-blox-m8"]) == {}
+    np.testing.assert_allclose(scatter(again), scatter(once))  # type: ignore[arg-type]
 
 
 def test_of_few_fixes_nothing_is_known() -> None:

@@ -366,6 +366,20 @@ def test_texts_as_tools_write_them(
     assert [numbers[name].tolist() for name in names[1:]] == [[0.5] * 3, [-0.25] * 3]
 
 
+@pytest.mark.parametrize(
+    "text", ["t,ok\n1,T\n2,F\n", "id,sys\n1,G\n2,R\n", "t,flag,n\n1,-,1\n2,-,5\n", "s,m\n1,2\n3,4\n"]
+)
+def test_a_first_row_of_data_is_no_line_of_units(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    first = next(iter(load(tmp_path / "a.csv").numbers.values()))
+    assert len(first) == 2
+
+
+def test_names_that_come_again_have_a_number_above_units_too(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,a,a\ns,m,m\n5,1,2\n")
+    assert list(load(tmp_path / "a.csv").numbers) == ["t", "a", "a.1"]
+
+
 def test_a_date_and_a_time_of_day_alone_are_a_table(tmp_path: Path) -> None:
     """KITTI's timestamps.txt, and rows of RTKLIB without their head."""
     (tmp_path / "stamps.txt").write_text("2011-09-26 13:02:25.010000000\n2011-09-26 13:02:25.020000000\n")
@@ -384,6 +398,9 @@ def test_seconds_and_nanoseconds_are_one_time(tmp_path: Path) -> None:
     table["sec"], table["nanosec"] = np.floor(table["t"]), np.round(table["t"] % 1 * 1e9)
     apart = read(tmp_path, table, imu={**IMU, "time": ["sec", "nanosec"]}).imus["imu"]
     np.testing.assert_allclose(apart.t, table["t"], atol=1e-9)
+    table["usec"] = np.round(table["t"] % 1 * 1e6)
+    with pytest.raises(UserError, match="time: has 2 columns: 1 are needed"):
+        read(tmp_path, table, imu={**IMU, "time": ["sec", "usec"]})
 
 
 def dashed(rows: list[str]) -> None:

@@ -13,7 +13,7 @@ from nav.error_model import CROSS, MOTION, ErrorModel, ImuModel, sensor_errors
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.samples import ImuSamples
-from nav.smoother import Smoothed, Smoother
+from nav.smoother import LEAST, Smoothed, Smoother, _spread
 from nav.state import State
 from nav.unscented import Scaling
 
@@ -109,6 +109,15 @@ def test_what_axes_feel_of_each_other_is_taken_off_between_nodes():
         _, last = smoother._carried(Smoothed(truth.t[5000], state), float(clean.t[-1]), measured)
         np.testing.assert_allclose(last.v_n, truth.v_n[5090], atol=0.02)  # to the second order in 17 mrad
     np.testing.assert_allclose(maps[1], maps[0], rtol=2e-3, atol=0.01)
+
+
+def test_a_sound_covariance_is_as_it_comes_and_one_that_is_none_is_kept_positive():
+    P = np.array([[100.0, 0.0], [0.0, 4.0]])
+    exact = np.diag([1 / (100 + 1e-6), 1 / (4 + 1.0)])  # of later measurements of 1 mm and 1 m
+    np.testing.assert_array_equal(_spread(P, exact), P - P @ exact @ P)
+    spread = _spread(P, exact * [[1.0001, 1.0], [1.0, 1.0]])
+    np.testing.assert_allclose(spread, np.diag([LEAST * 100, 0.8]), rtol=1e-6)
+    assert not _spread(np.zeros((2, 2)), exact).any()
 
 
 def flown(seed, smooth=True):

@@ -80,6 +80,12 @@ def test_intervals_of_few_draws_are_wide_enough(statistic: Statistic, columns: t
     assert held > 0.89
 
 
+def test_one_draw_says_nothing_of_an_rms_or_a_ratio() -> None:
+    assert RMS.of(np.zeros(1)) == (0.0, -math.inf, math.inf)
+    assert RATIO_OF_RMS.of(np.array([[1.0, 2.0]])) == (0.5, -math.inf, math.inf)
+    assert RATIO_OF_MEANS.of(np.array([[1000.0, 1.0], [-999.9, 1.0]])).high == math.inf
+
+
 def test_a_ratio_is_paired() -> None:
     """Where each draw has the same ratio there is no doubt about it, however the draws differ."""
     found = RATIO_OF_RMS.of(np.column_stack([0.5 * HUNDRED, HUNDRED]))
