@@ -1,7 +1,7 @@
 """The benchmark of denied navigation on paper: statistics of every case, files, tables, the page of the manual.
 
 Intervals are at 95 %: of median and 95th percentile by order statistics, of shares Clopper and Pearson's, of RMS over
-bound Student's, of the mean square (`testbed.score.claims`).
+bound Student's, of its logarithm (`testbed.score.claims`).
 """
 
 from __future__ import annotations

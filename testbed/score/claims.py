@@ -163,12 +163,6 @@ def _product(values: Array, exponents: tuple[float, ...]) -> Interval:
     return Interval(value, value / wide, value * wide)
 
 
-def _rms_over_bound(values: Array) -> Interval:
-    """Of (draws, 2), errors and their bounds: the ratio of root mean squares, by Student's interval of the squares."""
-    error, bound = (values**2).T
-    return Interval(*(math.sqrt(max(end, 0.0)) for end in student(error / bound.mean())))
-
-
 RATIO = (1.0, -1.0)  # of (draws, 2): the first over the second
 ROOT, RATIO_OF_ROOTS = (0.5,), (0.5, -0.5)
 MEDIAN = quantile(0.5)
@@ -177,7 +171,7 @@ MEAN = Statistic("mean", student)
 RMS = Statistic("RMS", lambda values: _product(values[:, None] ** 2, ROOT))
 RATIO_OF_RMS = Statistic("ratio of RMS", lambda values: _product(values**2, RATIO_OF_ROOTS))
 RATIO_OF_MEANS = Statistic("ratio of means", lambda values: _product(values, RATIO))
-RMS_OVER_BOUND = Statistic("RMS / bound", _rms_over_bound)
+RMS_OVER_BOUND = RATIO_OF_RMS._replace(name="RMS / bound")  # of errors and their bounds
 SHARE = Statistic("share", _share)
 EXACT = Statistic("exact", _exact)  # of a figure that nothing is drawn for
 
