@@ -17,6 +17,7 @@ from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
 from testbed.feeds.doubted import contradicted
+from testbed.feeds.earth_fixed import on_the_ellipsoid
 from testbed.feeds.formats import known
 from testbed.feeds.log import TABLE, Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.reference import usual_sigma
@@ -47,6 +48,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "lat": ANGLE,
     "lon": ANGLE,
     "height": LENGTH,
+    "position": LENGTH,
     "velocity": SPEED,
     "sigma_position": LENGTH,
     "sigma_velocity": SPEED,
@@ -70,11 +72,11 @@ QUATERNION = (
 )
 CODES = "and are taken to be without a fix: leave fix out where it is another code, as RTKLIB's Q or NMEA's quality"
 NOWHERE = "are without height, or at latitude and longitude 0"
-VECTORS = frozenset({"gyro", "accel", "velocity", "sigma_position", "sigma_velocity", "field"})
+VECTORS = frozenset({"gyro", "accel", "position", "velocity", "sigma_position", "sigma_velocity", "field"})
 # What each kind needs, one of each tuple, and what it may have.
 NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "imu": (("gyro",), ("accel",)),
-    "gnss": (("lat",), ("lon",), ("height",)),
+    "gnss": (("lat", "position"), ("lon", "position"), ("height", "position")),
     "barometer": (("pressure", "height"),),
     "magnetometer": (("field",),),
     "airspeed": (("airspeed", "pressure"),),
@@ -82,7 +84,7 @@ NEEDED: Mapping[str, tuple[tuple[str, ...], ...]] = {
 }
 OPTIONAL: Mapping[str, tuple[str, ...]] = {
     "gnss": ("velocity", "sigma_position", "sigma_velocity", "fix", "satellites", "hdop", "vdop"),
-    "reference": ("lat", "lon", "height", "velocity", "attitude", "sigma_position", "sigma_velocity"),
+    "reference": ("lat", "lon", "height", "position", "velocity", "attitude", "sigma_position", "sigma_velocity"),
 }
 
 
@@ -327,6 +329,7 @@ def quantities(
             raise UserError(f"{where}.{key}: has {len(array)} rows, and its time has {len(stamps)}")
     if not len(stamps):
         raise UserError(f"{where}.time: has no rows")
+    values = on_the_ellipsoid(where, stream, values)
     blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
     apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]

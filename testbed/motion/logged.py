@@ -15,6 +15,8 @@ AXES = "xyz"
 INTEGRALS = {"gyro": ("rad", "deg"), "accel": ("m/s",)}  # the units of increments
 # Of whose axes a left-handed set is a slip: of those of the Earth up is often the third, beside north and east.
 OF_BODY = ("gyro", "accel", "field")
+# What a column may be between or along, the usual one first.
+FRAMES = {"attitude": ("frd-ned", "flu-enu"), "velocity": ("frd-ned", "ecef"), "position": ("frd-ned", "ecef")}
 REVERSED = ("-x", "-y", "-z")
 
 Component: TypeAlias = Annotated[str, Field(description="x, y or z: first, second or third column; - turns it round")]
@@ -44,10 +46,11 @@ class Column(Section):
         description="of a vector, which column is forward, right, down, or north, east, down; of angles, which is "
         "roll, pitch, heading",
     )
-    frame: Literal["frd-ned", "flu-enu"] = Field(
+    frame: Literal["frd-ned", "flu-enu", "ecef"] = Field(
         default="frd-ned",
         description="of an attitude, from which body axes to which of the Earth it turns: forward, right, down to "
-        "north, east, down, or, as ROS has it, forward, left, up to east, north, up",
+        "north, east, down, or, as ROS has it, forward, left, up to east, north, up; of a velocity `ecef` where it is "
+        "along the Earth's own axes",
     )
     scale: float = Field(default=1.0, description="what it is multiplied by, before the unit")
     offset: float = Field(default=0.0, description="what is added then, in the unit")
@@ -107,6 +110,9 @@ class Stream(Section):
     lat: Column | None = Field(default=None, description="geodetic latitude")
     lon: Column | None = Field(default=None, description="longitude")
     height: Column | None = Field(default=None, description="above the ellipsoid; of a barometer its altitude")
+    position: Column | None = Field(
+        default=None, description="from the centre of the Earth (ECEF), in place of lat, lon and height"
+    )
     velocity: Column | None = Field(default=None, description="over ground, north, east, down")
     sigma_position: Column | None = Field(default=None, description="1-sigma of position, north, east, down")
     sigma_velocity: Column | None = Field(default=None, description="1-sigma of velocity, north, east, down")
@@ -132,10 +138,12 @@ class Stream(Section):
         return {key: file for key, file in {"file": self.file, **own}.items() if file is not None}
 
     @model_validator(mode="after")
-    def _frames_are_of_attitudes(self) -> Stream:
+    def _frames_are_of_few(self) -> Stream:
         for name, column in self.columns.items():
-            if name != "attitude" and column.frame != "frd-ned":
-                raise ValueError(f"{name}.frame: is nothing but an attitude's: say it with axes")
+            if column.frame not in FRAMES.get(name, ("frd-ned",)):
+                frames = ", ".join(f'"{frame}"' for frame in FRAMES.get(name, ()))
+                others = f"must be one of {frames}" if frames else "is an attitude's or a velocity's: say it with axes"
+                raise ValueError(f"{name}.frame: {others}")
         return self
 
     @model_validator(mode="after")
