@@ -18,7 +18,8 @@ QUOTED = re.compile(r'"[^"]*"')
 DECIMAL_COMMA, DECIMAL_POINT = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?\d*\.\d+(e[-+]?\d+)?", re.IGNORECASE)
 MOMENT = re.compile(r"\d{4}([-/])\d\d\1\d\d([T ]\d\d:\d\d\S*)?|\d\d:\d\d:\d\d(\.\d+)?")
 UNITS = re.compile(
-    r"[kmcuµn]?(s|g|m|Pa|T|G|bar)|(rad|deg|k?m|cm|mm|ft|kn)(/(s|h|min)|/s/s|/s\^?2|/s²)?|[hm](Pa|bar)|min|%|-"
+    r"[kmcuµn]?(s|sec|g|m|Pa|T|G|bar|[Gg]auss)|(rad|deg|°|k?m|cm|mm|ft|kn)(/(s|sec|hr?|min)|/s/s|/s\^?2|/s²)?"
+    r"|[hm](Pa|bar)|dps|min|°C|%|-"
 )
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole

@@ -349,6 +349,7 @@ STAMPS = ["2024-05-03T09:00:00.010000", "2024-05-03T09:00:00.020000", "2024-05-0
         (["time\tgx\tgy"], "\t", ["time", "gx", "gy"]),
         (["time,gx,gy", "s,rad/s,rad/s"], ",", ["time", "gx", "gy"]),
         (["time\tgx\tgy", "[s]\t[rad/s]\t[rad/s]"], "\t", ["time", "gx", "gy"]),
+        (["time;gx;gy", "sec;°/s;dps"], ";", ["time", "gx", "gy"]),
         (["% time gx gy", "% s rad/s rad/s"], " ", ["time", "gx", "gy"]),
         (["# anything at all", "# time gx gy", "# (s) (rad/s) (deg/s)"], " ", ["time", "gx", "gy"]),
     ],
