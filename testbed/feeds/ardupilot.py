@@ -227,15 +227,18 @@ def _aiding(units: Mapping[str, Mapping[str, Rows]], notes: list[str]) -> dict[s
 
 
 def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Samples:
-    if not {"Lat", "Lng", "Alt", "GCrs", "Spd", "Status", "NSats", "HDop"} <= rows.keys():
+    if not {"Lat", "Lng", "Alt"} <= rows.keys():
         return []
+    if lacking := [key for key in ("Status", "NSats", "HDop", "Spd", "GCrs") if key not in rows]:
+        notes.append(f"{name}: its messages have no {', '.join(lacking)}: taken for unknown")
     t, kept = _times(name, rows, notes)
     own = {key: values[kept] for key, values in rows.items()}
     fixes = Fixes(t, np.radians(own["Lat"]), np.radians(own["Lng"]), own["Alt"])
-    course = np.radians(own["GCrs"])
-    down = own.get("VZ", np.full(len(t), np.nan))
-    fixes.v_n = np.column_stack([own["Spd"] * np.cos(course), own["Spd"] * np.sin(course), down])
-    fixes.fix, fixes.satellites, fixes.hdop = own["Status"], own["NSats"], own["HDop"]
+    unknown = np.full(len(t), np.nan)
+    speed, course, down = (own.get(key, unknown) for key in ("Spd", "GCrs", "VZ"))
+    fixes.v_n = np.column_stack([speed * np.cos(np.radians(course)), speed * np.sin(np.radians(course)), down])
+    fixes.fix = own.get("Status", np.where((own["Lat"] == 0) & (own["Lng"] == 0), FixType.NO_FIX, fixes.fix))
+    fixes.satellites, fixes.hdop = own.get("NSats", fixes.satellites), own.get("HDop", fixes.hdop)
     if accuracy is not None and {"HAcc", "VAcc", "SAcc", "VDop"} <= accuracy.keys():
         t_acc, kept_acc = _times(f"{name} accuracy", accuracy, [])
         at, of = joined(t, t_acc, ACCURACY_WITHIN_S)
@@ -244,7 +247,7 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
         # of the whole horizontal error and of the whole velocity, in parts that are alike
         fixes.sigma_position_n[at] = spread(told["HAcc"] / math.sqrt(2), told["VAcc"])
         fixes.sigma_velocity_n[at] = spread(told["SAcc"] / math.sqrt(3), told["SAcc"] / math.sqrt(3))
-    return fixes.samples(name)
+    return fixes.samples(name, notes)
 
 
 def _first_fix(samples: Mapping[str, Samples]) -> float:

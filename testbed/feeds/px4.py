@@ -201,7 +201,7 @@ def _fixes(name: str, rows: Rows, notes: list[str]) -> Samples:
     fixes.sigma_position_n = spread(own["eph"] / math.sqrt(2), own["epv"])
     each = own["s_variance_m_s"] / math.sqrt(3)
     fixes.sigma_velocity_n = spread(each, each)
-    return fixes.samples(name)
+    return fixes.samples(name, notes)
 
 
 def _heights(rows: Rows) -> tuple[Array, Array]:

@@ -310,11 +310,14 @@ def _lagging(found: Reference, lag: float) -> Reference:
 
 
 def _with_attitude(found: Reference, solution: Reference, start: float) -> Reference:
-    """The receiver's reference with the attitude that the log's solution has at its times."""
-    rows = ReferenceMotion(replace(solution, t=solution.t - start), 1.0, 0)
-    q = rows.at(found.t).q_nb
-    name = f"{found.name}; attitude: {solution.name}"
-    return replace(found, name=name, columns={**found.columns, "q_nb": q})
+    """The receiver's reference with the attitude of the log's solution, at its times too: it turns between fixes."""
+    own = solution.t - start
+    within = own[(own > found.t[0]) & (own < found.t[-1])] if len(found.t) else own[:0]
+    t = np.union1d(found.t, within)
+    place = ReferenceMotion(found, 1.0, 0).at(t)
+    columns = {name: getattr(place, name) for name in found.columns}
+    columns["q_nb"] = ReferenceMotion(replace(solution, t=own), 1.0, 0).at(t).q_nb
+    return replace(found, name=f"{found.name}; attitude: {solution.name}", t=t, columns=columns)
 
 
 def _increments(scenario: Scenario, log: Log, start: float) -> dict[str, ImuSamples]:

@@ -45,8 +45,14 @@ class Fixes:
         self.fix = np.where(known, int(FixType.FIX_3D), int(FixType.NO_FIX)).astype(float)
         self.satellites, self.hdop, self.vdop = np.zeros(n), np.full(n, np.nan), np.full(n, np.nan)
 
-    def samples(self, name: str) -> list[Sample]:
-        """The same as samples of the receiver ``name``."""
+    def samples(self, name: str, notes: list[str] | None = None) -> list[Sample]:
+        """The same as samples of the receiver ``name``; a velocity of which not all is known is none, and noted."""
+        there = np.isfinite(self.v_n)
+        half = there.any(axis=1) & ~there.all(axis=1) & (self.fix >= FixType.FIX_3D)
+        if half.any() and notes is not None:
+            lacking = ", ".join(np.array(["north", "east", "down"])[~there[half].all(axis=0)])
+            notes.append(f"{name}: {half.sum()} of {len(half)} velocities have no {lacking}, and are taken for unknown")
+        self.v_n = np.where(there.all(axis=1, keepdims=True), self.v_n, np.nan)
         return [self._sample(k, name) for k in range(len(self.t))]
 
     def _sample(self, k: int, name: str) -> Sample:

@@ -19,8 +19,8 @@ from nav.samples import Array, ImuSamples
 Rows: TypeAlias = npt.NDArray[np.intp]
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
-# After which counters begin anew [s]: 32 bits of microseconds, of milliseconds; 16 of milliseconds; a GPS week.
-WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0)
+# After which counters begin anew [s]: 32 bits of microseconds, of milliseconds; 16 of milliseconds; a GPS week; a day.
+WRAPS = (2**32 * 1e-6, 2**32 * 1e-3, 2**16 * 1e-3, 604_800.0, 86_400.0)
 WRAP_SHARE = 0.02  # of it, that may be lost where it begins anew
 STRAY, STRAY_SHARE = 8, 0.01  # rows by which times may be out of order, or that may be far off; of all rows
 LONGEST_GAP_S = 3600.0  # beyond which a gap that is longer than all else is none: the clock was set
@@ -160,6 +160,7 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     newest = np.maximum.accumulate(t)
     behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
     behind &= t < newest - GAP_S  # not a burst that came late
+    behind &= ~_catches_up(t, newest)  # nor rows that are shuffled
     begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
     if not len(begins):
         return t, rows
@@ -170,6 +171,12 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     told = f"time goes back {len(begins)} times: the longest part is kept, {left} rows are left out"
     notes.append(left_out(name, told, left, len(t)))
     return t[part], rows[part]
+
+
+def _catches_up(t: Array, newest: Array) -> Mask:
+    """At which of times (N,) one of the next few is as late as the ``newest`` (N,) before it."""
+    ahead = np.lib.stride_tricks.sliding_window_view(np.append(t, np.full(2 * STRAY, -np.inf)), 2 * STRAY + 1)
+    return np.asarray(ahead.max(axis=1) >= newest)
 
 
 def _of_one_clock(t: Array, heard: tuple[float, float] | None) -> Mask:

@@ -453,7 +453,7 @@ def _samples(name: str, kind: str, t: Array, values: Mapping[str, Array], notes:
     for key in ("fix", "satellites", "hdop", "vdop"):
         if key in values:
             setattr(fixes, key, values[key])
-    return fixes.samples(name)
+    return fixes.samples(name, notes)
 
 
 def known_motion(t: Array, values: Mapping[str, Array], notes: list[str]) -> Reference:

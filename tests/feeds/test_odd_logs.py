@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worlds import log_writers
 from worlds.log_writers import dataflash, dataflash_text, ulog, us
 
 import testbed.__main__ as cli
@@ -492,3 +493,21 @@ def test_a_solution_in_metres_across_the_date_line_has_longitudes_as_they_are(tm
     east = np.degrees(log.solution.columns["lon"])
     assert -180.0 < east[-1] < -179.99
     np.testing.assert_allclose(np.mod(east, 360.0)[5:], 179.9999 + 20.0 * log.solution.t[5:] / 106447.0, atol=2e-5)
+
+
+@pytest.mark.parametrize("lacking", ["HDop", "NSats", "Status", "VZ", "Spd"])
+def test_a_receiver_whose_messages_lack_a_field_is_heard(
+    lacking: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was left out; and without a velocity down its fixes, place and all, were refused by every filter."""
+    letters, names = log_writers.DATAFLASH["GPS"]
+    at = names.split(",").index(lacking)
+    fewer = letters[:at] + letters[at + 1 :], ",".join(one for one in names.split(",") if one != lacking)
+    monkeypatch.setitem(log_writers.DATAFLASH, "GPS", fewer)
+    messages = [(name, values[:at] + values[at + 1 :] if name == "GPS" else values) for name, values in circling()]
+    log = read(messages, tmp_path)
+    fixes = [one for one in log.samples["gnss"] if isinstance(one, GnssSample)]
+    assert len(fixes) == SECONDS * GNSS_HZ
+    assert all(one.has_fix for one in fixes)
+    assert all(np.isfinite(one.v_n).all() == (lacking not in ("VZ", "Spd")) for one in fixes)
+    assert any(note.startswith("gnss: ") for note in log.notes)

@@ -61,6 +61,24 @@ def again(flown: RunResult, text: str, changes: Mapping[str, Any], folder: Path)
     return fly(log_of(text, flown.path / "run.nc", 'aircraft = "loiter"'), {**FLIGHT, **changes}, folder)
 
 
+def test_attitudes_are_judged_between_the_fixes_of_a_slow_receiver(tmp_path: Path) -> None:
+    """By the log's solution at its own rate: between two fixes an aircraft in a turn does not turn evenly."""
+    text = Scenario.load("u_turn").text
+    slow = {**FLIGHT, "sensors.gnss.rate_hz": 1.0, "truth.wind.turbulence": "severe"}
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    first = fly(text, slow, tmp_path / "first")
+    second = again(first, text, {"sensors.gnss.rate_hz": 1.0, "truth.reference": "gnss"}, tmp_path / "second")
+    true, judged = (
+        (one.dataset["truth"]["time"].to_numpy(), one.dataset["truth"]["q_nb"].to_numpy()) for one in (first, second)
+    )
+    _, i, j = np.intersect1d(true[0].round(3), judged[0].round(3), return_indices=True)
+    known = np.isfinite(judged[1][j]).all(axis=1)
+    off = Rotation.from_quat(true[1][i][known]).inv() * Rotation.from_quat(judged[1][j][known])
+    assert known.sum() > 0.8 * len(i)
+    assert np.degrees(off.magnitude()).max() < 0.1
+
+
 def test_a_record_as_log_gives_every_estimate_bit_for_bit(flown: tuple[str, RunResult], tmp_path: Path) -> None:
     text, first = flown
     second = again(first, text, {}, tmp_path)

@@ -23,7 +23,7 @@ def test_times_in_order_are_left_as_they_are() -> None:
     assert notes == []
 
 
-@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0])
+@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0, 86_400.0])
 def test_a_counter_that_wraps_goes_on(wrap: float) -> None:
     notes: list[str] = []
     t, rows = ordered("imu", (T + wrap - 4) % wrap, notes)
@@ -32,7 +32,7 @@ def test_a_counter_that_wraps_goes_on(wrap: float) -> None:
     assert [note for note in notes if "began anew" in note]
 
 
-@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0])
+@pytest.mark.parametrize("wrap", [2**32 * 1e-6, 2**16 * 1e-3, 604_800.0, 86_400.0])
 @pytest.mark.parametrize("moved", [4.0, -300.0, 1e6])
 def test_a_counter_that_wraps_goes_on_where_its_times_were_moved(wrap: float, moved: float) -> None:
     """As less its first, or by an offset that a scenario gives."""
@@ -92,6 +92,19 @@ def test_a_row_that_comes_late_does_not_cut_the_stream(late: int) -> None:
     t, rows = ordered("imu", LONG[order], notes)
     assert len(t) == len(LONG) - (late > 20)
     assert np.array_equal(LONG[order][rows], t)
+    assert len(notes) == 1
+
+
+def test_rows_that_are_shuffled_are_put_in_order() -> None:
+    """As several threads write them, here and there by more than a tenth of a second."""
+    rng = np.random.default_rng(0)
+    stamps, order = np.arange(35_000) / 50, np.arange(35_000)
+    for first in rng.integers(0, len(order) - 6, len(order) // 50):
+        order[first : first + 5] = rng.permutation(order[first : first + 5])
+    notes: list[str] = []
+    t, rows = ordered("imu", stamps[order], notes)
+    assert np.array_equal(t, stamps)
+    assert np.array_equal(order[rows], np.arange(len(order)))
     assert len(notes) == 1
 
 
