@@ -5,25 +5,41 @@ from __future__ import annotations
 import math
 from collections.abc import Container, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from typing import Protocol
+
+import numpy as np
 
 from nav._jit import njit
 from nav.aids.gnss import has_velocity
-from nav.alignment import Alignment, InitialState, whole
-from nav.earth import displacement_n
+from nav.alignment import USUAL_ACCELERATION, Alignment, InitialState, whole
+from nav.earth import SEA_LEVEL_DENSITY, displacement_n, isa_density
 from nav.error_model import PHI, POS, VEL
 from nav.heading_recovery import HeadingRecovery
 from nav.reference import Reference, align
-from nav.samples import Array, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
+from nav.rotation import dcm_from_quat, skew
+from nav.samples import (
+    AirspeedSample,
+    Array,
+    FixType,
+    GnssSample,
+    ImuSamples,
+    MagnetometerSample,
+    Outcome,
+    Sample,
+    UpdateReport,
+)
 from nav.smoother import Smoother
 from nav.state import State
 
 LOST_TILT = 0.5  # roll or pitch, 1 sigma [rad]
 GRAVITY = 9.8  # [m/s^2]
 DV, DP = range(VEL, VEL + 3), range(POS, POS + 3)
+TURNED, MOVED = slice(PHI, PHI + 3), slice(VEL, VEL + 3)
 WAIT_S = 5.0  # the longest that samples are withheld for an alignment,
 LONG_S = 30.0  # the same of one that has no compass, and that one goes on though the tilt seems to be known again
 ELSEWHERE = 5.0  # sigmas
+WIND, SLIP = 8.0, 3.0  # where no filter has one, and across the nose [m/s]
 SWING = 1.0  # of an antenna about the IMU, in a body whose turns nobody knows [rad/s]
 
 
@@ -45,9 +61,10 @@ class Realignment:
     A correction of an attitude that is off by half a radian goes along wrong axes, and the covariance shrinks as if it
     did not. So the fixes of one receiver, and samples of the ``sensors``, go to an alignment, which is as ``alignment``
     at its beginning and knows nothing of before. All are withheld from the filters, whose velocity and position are
-    those of the receiver meanwhile; where it comes to no end in `WAIT_S` from the last missing increment on, or in
-    `LONG_S` without a compass, they are used as well as may be. The same where it contradicts the position that was
-    known.
+    those of the receiver meanwhile. Where none is heard, gravity and a magnetic field tell the attitude `WAIT_S` after
+    the last missing increment, as well as a body that is not thought to be accelerated can be levelled (`level`). Where
+    nothing comes to an end in that time, or in `LONG_S` without a compass, they are used as well as may be. The
+    same where it contradicts the position that was known.
 
     Without missing increments it may be another than the estimator is sure of, which refuses samples then: see
     `nav.heading_recovery`.
@@ -65,6 +82,8 @@ class Realignment:
         """The estimator starts at ``t`` [s]: what was missing before is of no account."""
         self.since = t
         self._alignment: Alignment | None = None
+        self._by_gravity: Alignment | None = None
+        self._eas = 0.0
         self._heading.begin()
         self._receiver = ""
         self._lost_at = self._moved_at = self._widened = math.nan
@@ -76,8 +95,9 @@ class Realignment:
 
     def propagate(self, imu: ImuSamples) -> None:
         """Add a block of increments."""
-        if self._alignment is not None:
-            self._alignment.propagate(imu)
+        for alignment in (self._alignment, self._by_gravity):
+            if alignment is not None:
+                alignment.propagate(imu)
         self._heading.propagate(imu)
 
     def took(self, sensor: str) -> None:
@@ -120,6 +140,8 @@ class Realignment:
             self._alignment = deepcopy(self._beginning)
             self._lost_at = self._moved_at = self._widened = sample.t
         waited = sample.t - max(self._lost_at, last_bad)
+        if sound and isinstance(sample, AirspeedSample):
+            self._eas = sample.eas
         is_part = sound and self._is_part(sample)
         if is_part:
             initial = align(self._alignment, self._reference, sample)
@@ -128,6 +150,9 @@ class Realignment:
                 return None
             if initial is not None:
                 estimator.start(initial)
+                return []
+            alone = waited > 0 and not self._receiver
+            if alone and isinstance(sample, MagnetometerSample) and self._level(state, filters, sample):
                 return []
         patience = LONG_S if self._alignment.matching else WAIT_S
         if waited <= patience:
@@ -138,6 +163,57 @@ class Realignment:
         if waited > LONG_S and not lost:  # it has come back without
             self.begin(sample.t)
         return None
+
+    def _level(self, state: State, filters: int, sample: MagnetometerSample) -> bool:
+        """Find the attitude by gravity and the field, where no fix was heard, and whether it was: see `level`.
+
+        All else the filters keep, such as the iron that they know beside the magnetometer.
+        """
+        if self._by_gravity is None:
+            self._by_gravity = deepcopy(self._beginning)
+            self._by_gravity.duration_s = WAIT_S
+        found = level(self._by_gravity, self._reference, self._without_iron(state, sample), state.lla)
+        if found is None:
+            return False
+        state.q_nb[:] = found.q_nb
+        state.x[:, TURNED] = 0.0
+        state.P[:, TURNED, :] = 0.0
+        state.P[:, :, TURNED] = 0.0
+        state.P[:, TURNED, TURNED] = filters * found.covariance[TURNED, TURNED]
+        if self._eas > 0.0:
+            self._fly_on(state, filters, found.covariance[TURNED, TURNED])
+        if self._smoother is not None:
+            self._smoother.begin(sample.t, state)
+        self.begin(sample.t)
+        return True
+
+    def _fly_on(self, state: State, filters: int, variance: Array) -> None:
+        """Take the velocity that was heard through the air, along the nose, in place of one that gravity may have had.
+
+        It is off as the nose is, of the ``variance`` (3, 3), and by wind and slip.
+        """
+        wind, wind_variance = np.zeros(3), WIND**2
+        for x, P, model in zip(state.x, state.P, self._reference.models, strict=False):
+            if (where := model.slices.get("wind")) is not None:
+                wind[:2], wind_variance = x[where], float(P.diagonal()[where].max()) / filters
+                break
+        speed = self._eas * math.sqrt(SEA_LEVEL_DENSITY / isa_density(float(state.lla[2])))
+        air = speed * dcm_from_quat(state.q_nb)[:, 0]
+        state.v_n[:] = wind + air
+        state.x[:, MOVED] = 0.0
+        state.P[:, MOVED, :] = 0.0
+        state.P[:, :, MOVED] = 0.0
+        swung = skew(air) @ variance
+        state.P[:, MOVED, TURNED] = filters * swung
+        state.P[:, TURNED, MOVED] = filters * swung.T
+        state.P[:, MOVED, MOVED] = filters * (swung @ skew(air).T + (wind_variance + SLIP**2) * np.eye(3))
+
+    def _without_iron(self, state: State, sample: MagnetometerSample) -> MagnetometerSample:
+        """The sample without the hard iron that a filter has found, if one looks for it."""
+        for x, model in zip(state.x, self._reference.models, strict=False):
+            if (iron := model.slices.get(f"{sample.sensor}_bias")) is not None:
+                return replace(sample, field_b=sample.field_b - x[iron])
+        return sample
 
     def _is_part(self, sample: Sample) -> bool:
         """Whether the alignment is to have it: of receivers it is the first that is heard."""
@@ -171,6 +247,19 @@ class Realignment:
         self._widened = t
         P[:, DV, DV] += filters * GRAVITY**2 * (now**2 - before**2)
         P[:, DP, DP] += filters * (0.5 * GRAVITY) ** 2 * (now**4 - before**4)
+
+
+def level(alignment: Alignment, reference: Reference, sample: MagnetometerSample, lla: Array) -> InitialState | None:
+    """Give a field to an alignment that is to take the body at ``lla`` for one that stands; the attitude once known.
+
+    That is as if a receiver had said so at both ends of the alignment's time, and were wrong by what a steady
+    acceleration of `USUAL_ACCELERATION` does in it.
+    """
+    wrong = np.full(3, USUAL_ACCELERATION * alignment.duration_s / math.sqrt(2))
+    t, (lat, lon, h) = sample.t, lla.tolist()
+    fix = GnssSample(t, t, lat, lon, h, np.zeros(3), wrong, wrong, FixType.FIX_3D, 0, math.nan, math.nan)
+    align(alignment, reference, sample)
+    return align(alignment, reference, fix)
 
 
 def _is_elsewhere(place: InitialState | GnssSample, variance: Array, state: State, filters: int) -> bool:

@@ -314,8 +314,10 @@ def propagate(
                 pushed = push_unseen(elapsed[2] + T) - push_unseen(elapsed[2])
                 elapsed[2] += T
                 for f in range(filters):
+                    most = in_motion[f, 3] * ANYHOW
                     for i in range(3):
-                        P[f, PHI + i, PHI + i] += in_motion[f, 3] * turned
+                        p = P[f, PHI + i, PHI + i]
+                        P[f, PHI + i, PHI + i] = max(p, min(p + in_motion[f, 3] * turned, most))
                         P[f, VEL + i, VEL + i] += in_motion[f, 3] * pushed
             take_errors(angle, push, rates, T, errors, imu, driven)
             for i in range(4):
@@ -349,8 +351,11 @@ def push_unseen(gap: float) -> float:
 
 @inlined
 def turn_unseen(gap: float) -> float:
-    """The same of an angle [rad^2], by `BRIDGED_RATE`."""
-    return min((BRIDGED_RATE * gap * gap / (gap + CHANGE_S)) ** 2, ANYHOW)
+    """The same of an angle [rad^2], by `BRIDGED_RATE`: on and on, as what has been measured of it since passes too.
+
+    No angle is less well known than `ANYHOW`.
+    """
+    return (BRIDGED_RATE * gap * gap / (gap + CHANGE_S)) ** 2
 
 
 @inlined

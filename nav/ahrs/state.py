@@ -10,7 +10,7 @@ import numpy as np
 from nav._jit import inlined, njit
 from nav.rotation import rotation_coefficients
 from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array
-from nav.state import turn_unseen
+from nav.state import ANYHOW, turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 UNKNOWN = np.full(3, np.nan)
@@ -161,7 +161,7 @@ def propagate(
             grown = turn_unseen(elapsed[3] + T) - turn_unseen(elapsed[3])
             elapsed[3] += T
             for i in range(3):
-                P[PHI + i, PHI + i] += grown
+                P[PHI + i, PHI + i] = max(P[PHI + i, PHI + i], min(P[PHI + i, PHI + i] + grown, ANYHOW))
             p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T
             u0, u1, u2 = rates[1, 0] * T, rates[1, 1] * T, rates[1, 2] * T
         angle[0] += p0

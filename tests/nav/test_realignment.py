@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 from worlds.federated import field, named, three, true_start
-from worlds.ins import CONSUMER, barometer, error, feed, flight, gnss, imu, magnetometer
+from worlds.ins import CONSUMER, airspeed, barometer, error, feed, flight, gnss, imu, magnetometer
 
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid
 from nav.federated import Federated
@@ -14,7 +14,7 @@ from nav.federation import Config
 from nav.horizon import FusionHorizon
 from nav.ins import Ins, InsConfig
 from nav.realignment import tilt_is_lost
-from nav.samples import BarometerSample, Outcome
+from nav.samples import BarometerSample, ImuSamples, Outcome
 
 SMALL = dataclasses.replace(CONSUMER, gyro_motion=0.01, accel_motion=0.01)
 RECEIVER_M = 10.0  # its sigma is 1.5 m, per axis, and nothing smooths it while the attitude is lost
@@ -155,6 +155,60 @@ def test_of_increments_alone_it_is_right_in_three_seconds(kind, gap_s):
     """The aids go on; nothing is concluded from them along axes that nobody knows."""
     truth, estimates, _ = flown(a_filter(kind), gap_s, all_lost=False)
     right_in_three_seconds(truth, estimates, gap_s, most_m=6.0)
+
+
+def rows(imu, first, stop):
+    return ImuSamples(*(getattr(imu, name)[first:stop] for name in ("t", "dt", "dtheta", "dv")))
+
+
+def last_rate_wrong(increments, lost, rate):
+    """Let the increment before the ``lost`` ones turn by ``rate`` (3,) [rad/s], which bridges the gap."""
+    before = np.flatnonzero(lost)[0] - 1
+    increments.dtheta[before] = np.array(rate) * increments.dt[before]
+
+
+@pytest.mark.parametrize("gap_s", [1.0, 3.0, 10.0, 60.0])
+def test_what_is_measured_of_an_attitude_in_a_gap_does_not_last(gap_s):
+    """A body goes on to turn unseen, however long it has: a recorded flight was 30 deg off at a claim of 3.
+
+    Held rates are off by `BRIDGED_RATE` in the end: after 0.2 s by a tenth of a radian at least; never is an angle less
+    well known than by chance.
+    """
+    truth = flight(90)
+    estimator = a_filter("ins", CONSUMER)
+    estimator.start(true_start(truth))
+    n = round((gap_s + 0.2) / 0.01)
+    unknown = np.full((n, 3), math.nan)
+    gap = ImuSamples(0.01 * np.arange(1, n + 1), np.full(n, 0.01), unknown, unknown)
+    estimator.propagate(rows(gap, 0, n - 20))
+    before = estimator.estimate().covariance.diagonal()[6:]
+    assert (before <= math.pi**2 / 3 + 1e-3).all()
+    estimator._state.P[0, :3, :3] = np.eye(3) * 1e-4  # as a measurement would
+    estimator.propagate(rows(gap, n - 20, n))
+    assert (estimator.estimate().covariance.diagonal()[6:] > 0.1**2).all()
+
+
+@pytest.mark.parametrize("iron", [0.0, 30e-6])
+def test_without_fixes_it_levels_itself_after_a_gap(iron):
+    """By gravity and the field, less the iron that it knows; before, what came was used along axes that nobody knew."""
+    truth = flight(90)
+    rng = np.random.default_rng(8)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    lost = (increments.t > 50) & (increments.t <= 60)
+    last_rate_wrong(increments, lost, (0.2, 0.1, 0.3))
+    increments.dtheta[lost] = increments.dv[lost] = math.nan
+    samples = [one for one in gnss(truth, rng, 5.0) if one.t <= 50] + barometer(truth, rng) + airspeed(truth, rng)
+    magnetic = MagnetometerAid(bias_sigma=max(iron, 1e-6))
+    estimator = Ins(InsConfig(CONSUMER, (GnssAid(), BarometerAid(), magnetic, AirspeedAid())), field)
+    estimator.start(true_start(truth))
+    estimates, _ = feed(FusionHorizon(estimator), increments, samples + magnetometer(truth, rng, bias=iron), 1.0)
+    for estimate in estimates:
+        off, sigma = error(estimate, truth), np.sqrt(np.diag(estimate.covariance))
+        if estimate.t > 60:
+            assert (np.abs(off[:3]) < 5 * sigma[:3] + 1.0).all(), estimate.t
+        if estimate.t > 67:
+            assert np.abs(off[3:6]).max() < 15, estimate.t
+            assert np.degrees(np.abs(off[6:])).max() < 15, estimate.t
 
 
 def test_a_bad_alignment_is_no_gap():
