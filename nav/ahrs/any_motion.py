@@ -44,7 +44,7 @@ from nav.ahrs.state import BIAS, PHI, STATES, State
 from nav.kalman import update
 from nav.realignment import LOST_TILT
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
-from nav.samples import Array, Outcome, UpdateReport, usable
+from nav.samples import Array, Outcome, UpdateReport
 
 REST_GATE = 16.3  # chi-square of three, 99.9 %
 MOST_TILT = math.radians(60)  # claimed of a first levelling
@@ -90,11 +90,6 @@ class AnyMotionLevelling:
         if not compensated:
             s.P[level, level] += min(abs(m.turn_rate) * speed / self._g, MOST_TILT) ** 2 * np.eye(2)
         s.P[level, own] = s.P[own, level] = -tilt * speed * np.eye(2)
-
-    def miss(self, s: State, dtheta: Array, dv: Array, dt: Array) -> None:
-        """Count those of N increments that are not usable."""
-        for T in dt[~usable(dtheta, dv, dt)].tolist():  # one by one: however they are cut into blocks, the same bits
-            s.in_motion.missing_s += T
 
     def misses(self, s: State) -> bool:
         """Whether most of the period is missing, and it shows nothing."""

@@ -12,6 +12,7 @@ from nav.ahrs import steps as kernels
 from nav.ahrs.any_motion import AnyMotionLevelling
 from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig, limited
 from nav.ahrs.further import RIGHT, FurtherStates
+from nav.ahrs.reports import fuse, refused
 from nav.ahrs.state import (
     BIAS,
     CORRECTIONS,
@@ -29,7 +30,6 @@ from nav.columns import Estimates, FusedReports, Reported, Told
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
 from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Steps
-from nav.kalman import update
 from nav.motion import TrueAirspeed, true_over_equivalent
 from nav.rotation import quat_from_euler, quat_multiply, quat_rotate
 from nav.samples import (
@@ -39,7 +39,6 @@ from nav.samples import (
     Estimate,
     ImuSamples,
     MagnetometerSample,
-    Outcome,
     Sample,
     Status,
     UpdateReport,
@@ -158,7 +157,7 @@ class Ahrs:
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         s, imu, plan = self._state, ahead.imu, self._plan(steps)
-        if s is None or not len(plan):
+        if s is None or not s.levelled or not len(plan):
             return 0
         periods = self._periods(float(imu.t[-1]) + ahead.longest - ahead.t)  # what is predicted counts
         told = np.empty((len(plan) + periods, kernels.REPORT))
@@ -169,6 +168,7 @@ class Ahrs:
             ahead.next, ahead.t, ahead.longest, self._last_bad, plan, told, wholes, when,
         )  # fmt: skip
         self.t = ahead.t
+        self._begin_anew_if_lost(s, ahead.t)
         if written:
             reports.append(self._reports(told[:written]))
         if drafted:
@@ -221,7 +221,7 @@ class Ahrs:
         trouble = aids.problem(sample)
         if trouble:
             self._last_bad = max(self._last_bad, sample.t if math.isfinite(sample.t) else self.t)
-            return [_refused(sample, trouble)]
+            return [refused(sample, trouble)]
         if not math.isnan(self.t) and abs(sample.t - self.t) > TIME_TOLERANCE:
             raise ValueError(f"sample at {sample.t} s, but the filter is at {self.t} s")
         match sample:
@@ -238,7 +238,7 @@ class Ahrs:
 
     def refuse(self, sample: Sample, reason: str) -> list[UpdateReport]:
         """The report on a sample that is not used."""
-        return [_refused(sample, reason)]
+        return [refused(sample, reason)]
 
     def estimate(self) -> Estimate:
         """The state at the filter's own time."""
@@ -261,7 +261,10 @@ class Ahrs:
         start, n = 0, len(imu)
         while start < n:
             if s.levelled and self._usual:
-                return max(last_bad, self._advance(s, imu, start, reports))
+                bad, taken = self._advance(s, imu, start, reports)
+                last_bad, start = max(last_bad, bad), start + taken
+                self._begin_anew_if_lost(s, float(imu.t[start - 1]))
+                continue
             end = int(imu.t.searchsorted(s.counts[PERIOD_END] - COINCIDENT)) + 1
             rows = slice(start, min(end, n))
             bad = propagate(
@@ -270,22 +273,30 @@ class Ahrs:
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[start + bad])
-                if self._any_motion is not None:
-                    self._any_motion.miss(s, imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
+                s.in_motion.miss(imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
             start = rows.stop
             if end <= n:
                 self._end_period(s, float(imu.t[end - 1]), reports)
         return last_bad
 
-    def _advance(self, s: State, imu: ImuSamples, start: int, reports: list[UpdateReport]) -> float:
-        """Propagate a levelled state of a filter that levels as usual by the increments from ``start`` on."""
+    def _begin_anew_if_lost(self, s: State, t: float) -> None:
+        """Find the level anew where a filter that levels as usual is at the end of a period with its tilt lost."""
+        if t >= s.counts[PERIOD_END] - COINCIDENT and kernels.lost(s.elapsed, s.P):
+            self._begin_levelling(s)
+            self._begin_period(s, t)
+
+    def _advance(self, s: State, imu: ImuSamples, start: int, reports: list[UpdateReport]) -> tuple[float, int]:
+        """Propagate a levelled state of a filter that levels as usual by the increments from ``start`` on.
+
+        When one was not usable last, and how many were taken: not all where the tilt is lost.
+        """
         rows = np.empty((self._periods(float(imu.t[-1] - imu.t[start])), kernels.REPORT))
-        bad, written = kernels.advance(
+        bad, written, taken = kernels.advance(
             s.whole, s.n, *self._model, self._airspeed.numbers, self._busy, imu.t[start:], imu.dtheta[start:],
-            imu.dv[start:], imu.dt[start:], -math.inf, rows,
+            imu.dv[start:], imu.dt[start:], -math.inf, True, rows,
         )  # fmt: skip
         reports += self._reports(rows[:written])[:]
-        return bad
+        return bad, taken
 
     def _periods(self, T: float) -> int:
         """How many may end within ``T`` [s], at most."""
@@ -307,6 +318,9 @@ class Ahrs:
             self._begin_levelling(s)
         else:
             self._find_level(s, t)
+        self._begin_period(s, t)
+
+    def _begin_period(self, s: State, t: float) -> None:
         s.in_motion.missing_s = 0.0
         period = self.config.period_s if s.levelled else self.config.levelling_s
         kernels.begin_period(
@@ -393,7 +407,7 @@ class Ahrs:
         s.shown[:] = acceleration, abs(float(omega_b[2])), abs(float(omega_b[0]))
         s.counts[LEVELLINGS] += 1
         H, R = self.level_measurement(s.q_nb, omega_b, compensated, acceleration, turn_rate, T)
-        reports.append(_fuse(s, H, R, how.unexplained(s, level_n, T), t, "accelerometer", LEVEL))
+        reports.append(fuse(s, H, R, how.unexplained(s, level_n, T), t, "accelerometer", LEVEL))
         how.move(s, level_n, turn_rate, T)
         if s.in_motion.fields and self._field_n is not None:
             field_n = s.field_n / s.in_motion.fields
@@ -479,20 +493,6 @@ class Ahrs:
             sigma[:, BIAS:STATES], sigma_accel_bias, np.where(bad, KNOWN | Status.BAD_SAMPLE, KNOWN),
             {name: (value.copy(), zero) for name, value in zip((*COUNTED, *JUDGED), values, strict=True)},
         )  # fmt: skip
-
-
-def _fuse(s: State, H: Array, R: Array, z: Array, t: float, sensor: str, aid: str) -> UpdateReport:
-    """Update the error states with ``z`` = H x + noise."""
-    nu = z - H @ s.x
-    S, nis = update(s.x, s.P, H, R, nu, math.inf)
-    return UpdateReport(t, sensor, aid, nu, S, nis, math.inf, 1.0, Outcome.FUSED)
-
-
-def _refused(sample: Sample, reason: str) -> UpdateReport:
-    aid = MAGNETIC_HEADING if isinstance(sample, MagnetometerSample) else KINDS[type(sample)]
-    return UpdateReport(
-        sample.t, sample.sensor, aid, np.empty(0), np.empty((0, 0)), math.nan, math.nan, 0.0, Outcome.UNSOUND, reason
-    )
 
 
 def _azimuth(x_n: Array) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 
 from nav._jit import inlined, njit
 from nav.rotation import rotation_coefficients
-from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array
+from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array, usable
 from nav.state import ANYHOW, turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
@@ -47,6 +47,11 @@ class InMotion:
     other_s: float = 0.0  # for how long that has been seen
     quiet: int = 0  # periods in a row
     missing_s: float = 0.0  # of increments in the period
+
+    def miss(self, dtheta: Array, dv: Array, dt: Array) -> None:
+        """Count those of N increments that are not usable."""
+        for T in dt[~usable(dtheta, dv, dt)].tolist():  # one by one: however they are cut into blocks, the same bits
+            self.missing_s += T
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""

@@ -45,6 +45,7 @@ from nav.kalman import take_rest, update
 from nav.motion import acceleration_n, add_eas, passes, true_airspeed
 from nav.rotation import dot, quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import Array
+from nav.state import ANYHOW
 
 # ``told``: the Earth's rate (3,), and what begins where
 G, PERIOD, FORCE_VARIANCE, AIRSPEED_VARIANCE, WELL_KNOWN, PHI_LIMIT, AZIMUTH, HEADING_VARIANCE, SMOOTHING = range(3, 12)
@@ -57,6 +58,7 @@ MISALIGNMENT, ACCEL_BIAS, GUST, FED_BACK, SEES_HEADING = range(5)
 AIRSPEED, DENSITY, MAGNETIC = 0, 1, 2  # what a step is that has a sample
 WIDTH = NUMBERS + 4
 TURN_MEMORY_S = 30.0  # over which the rate of a turn is taken, so that what a nose does in gusts is none
+AS_GOOD_AS = 0.95  # of the variance of an angle of which nothing is known
 REPORT = 15  # kind, t, nis, innovation (3,), S (9,)
 
 
@@ -310,12 +312,13 @@ def is_busy(busy: Array, start: float, end: float) -> bool:
 @njit
 def advance(
     whole: Array, n: int, told: Array, rows: Array, places: Indices, air: Array, busy: Array,
-    t: Array, dtheta: Array, dv: Array, dt: Array, last_bad: float, reports: Array,
-) -> tuple[float, int]:  # fmt: skip
-    """Take N increments, with the levellings on the way; when one was not usable last, and how many ``reports`` (_, 15)
-    were written.
+    t: Array, dtheta: Array, dv: Array, dt: Array, last_bad: float, stops: bool, reports: Array,
+) -> tuple[float, int, int]:  # fmt: skip
+    """Take N increments, with the levellings on the way; when one was not usable last, how many ``reports`` (_, 15)
+    were written, and how many increments were taken.
 
-    The autopilot commanded something else than level flight up to the times ``busy`` (M,).
+    The autopilot commanded something else than level flight up to the times ``busy`` (M,). A period that ends while
+    increments are missing shows nothing; where the tilt is lost then, none is taken any more if it ``stops`` (`lost`).
     """
     (
         q_nb, gyro_bias, air_velocity_n, _, shown, counts, rates, turned, angle, force, elapsed, sums, x, P,
@@ -335,9 +338,12 @@ def advance(
         if bad >= 0:
             last_bad = max(last_bad, t[row + bad])
         row = stop
+        if ends and stops and lost(elapsed, P):
+            return last_bad, written, row
         if ends:
             now = t[row - 1]
             settle(x, P, turned, angle, elapsed, told, rows, places, 0.0)
+        if ends and elapsed[3] == 0.0:
             commanded = not is_busy(busy, now - elapsed[1], now)
             low = level(
                 q_nb, gyro_bias, air_velocity_n, shown, counts, angle, force, elapsed, x, P, told, rows, places, air,
@@ -348,8 +354,15 @@ def advance(
                 known, phi = outstanding(x, P, told, places)
                 if known:
                     correct(q_nb, gyro_bias, counts, x, limited(phi, told[PHI_LIMIT]), places)
+        if ends:
             begin_period(q_nb, air_velocity_n, counts, angle, force, elapsed, sums, air, now, told[PERIOD])
-    return last_bad, written
+    return last_bad, written, row
+
+
+@njit
+def lost(elapsed: Array, P: Array) -> bool:
+    """Whether as good as nothing is known of roll or pitch, while increments are missing."""
+    return bool(elapsed[3] > 0.0 and max(P[PHI, PHI], P[PHI + 1, PHI + 1]) > AS_GOOD_AS * ANYHOW)
 
 
 @njit
@@ -363,9 +376,10 @@ def follow(
     The increments as of `nav.increments.Increments`, from ``row`` on. Into ``reports`` (_, `REPORT`), which have room
     for those of what is predicted as well, ``estimates`` (_, whole) and ``when`` (_, 2), of each of these its time and
     that of the last bad increment. Returned are steps, the first row that is left, the time reached, that of the last
-    bad increment, reports and estimates.
+    bad increment, reports and estimates. Where the tilt is `lost` no further step is taken.
     """
     one_t, one_dt, one_angle, one_push = np.empty(1), np.empty(1), np.empty((1, 3)), np.empty((1, 3))
+    _, _, _, _, _, counts, _, _, _, _, elapsed, _, _, P = parts(whole, n)
     written = drafted = some = 0
     then = now
     for k in range(len(steps)):
@@ -374,11 +388,13 @@ def follow(
             return k, row, now, last_bad, written, drafted
         stop = row_after(t, steps[k, HORIZON], row)
         if stop > row:
-            last_bad, some = advance(
+            last_bad, some, came = advance(
                 whole, n, told, rows, places, air, busy, t[row:stop], dtheta[row:stop], dv[row:stop],
-                dt[row:stop], last_bad, reports[written:],
+                dt[row:stop], last_bad, True, reports[written:],
             )  # fmt: skip
-            row, now, written = stop, t[stop - 1], written + some
+            row, now, written = row + came, t[row + came - 1], written + some
+            if lost(elapsed, P) and now >= counts[PERIOD_END] - COINCIDENT:
+                return k, row, now, last_bad, written, drafted
         if what == ADVANCE:
             continue
         state, partly, part, of_row, bad = whole, False, 0.0, row, last_bad
@@ -392,9 +408,9 @@ def follow(
             state, of_row, then = estimates[drafted], stop - 1, now if stop == row else t[stop - 1]
             for i in range(len(whole)):
                 state[i] = whole[i]
-            bad, some = advance(
+            bad, some, came = advance(
                 state, n, told, rows, places, air, busy, t[row:stop], dtheta[row:stop], dv[row:stop], dt[row:stop],
-                last_bad, reports[written:],
+                last_bad, False, reports[written:],
             )  # fmt: skip
             if further > COINCIDENT:
                 partly, part, then = True, further / dt[of_row], time
@@ -403,18 +419,21 @@ def follow(
         if partly:
             share(one_dt, one_angle, one_push, dt, dtheta, dv, of_row, part)
             one_t[0] = time
-            bad, some = advance(
-                state, n, told, rows, places, air, busy, one_t, one_angle, one_push, one_dt, bad, reports[written:]
-            )
+            bad, some, came = advance(
+                state, n, told, rows, places, air, busy, one_t, one_angle, one_push, one_dt, bad, what != ESTIMATE,
+                reports[written:],
+            )  # fmt: skip
         if what == ESTIMATE:
-            _, _, _, _, _, _, _, turned, angle, _, elapsed, _, x, P = parts(state, n)
-            settle(x, P, turned, angle, elapsed, told, rows, places, 0.0)
+            _, _, _, _, _, _, _, turned, angle, _, its, _, x, own = parts(state, n)
+            settle(x, own, turned, angle, its, told, rows, places, 0.0)
             when[drafted, 0], when[drafted, 1] = then, bad
             drafted += 1
             continue
         if partly:
             take_off(one_dt, one_angle, one_push, dt, dtheta, dv, row)
             now, last_bad, written = time, bad, written + some
+            if lost(elapsed, P) and now >= counts[PERIOD_END] - COINCIDENT:
+                return k, row, now, last_bad, written, drafted
         numbers = steps[k, NUMBERS:]
         if what == MAGNETIC:
             turn(whole, n, told, rows, places, numbers[:3], reports[written], int(numbers[3]), time)

@@ -294,6 +294,25 @@ def test_what_happens_in_a_gap_is_claimed_however_increments_are_cut(gap_s):
     np.testing.assert_allclose(np.sqrt(widened.sum() / 3), 0.5 * gap_s**2 / (gap_s + 0.2), rtol=0.02)
 
 
+@pytest.mark.parametrize("size", [77, 5000])
+def test_after_a_long_gap_the_level_is_found_anew(size):
+    """Held on were the rates of a moment; corrected by no more than equation 10 allows, a tilt of 80 deg stayed."""
+    increments = imu(level_flight(), 1)
+    first, stop = round(8 / DT), round(18 / DT)
+    increments.dtheta[first - 1] = np.array([0.3, -0.2, 0.1]) * increments.dt[first - 1]
+    increments.dtheta[first:stop] = increments.dv[first:stop] = math.nan
+    filter_, found = Ahrs(PAPER), []
+    for start in range(0, len(increments), size):
+        filter_.propagate(cut(increments, slice(start, start + size)))
+        found.append(filter_.estimate())
+    if size < 5000:
+        assert any(np.isnan(one.q_nb).all() for one in found if 13 < one.t < 18)
+        assert not any(np.isnan(one.q_nb).any() for one in found if one.t > 23)
+    tilt = Rotation.from_quat(found[-1].q_nb, scalar_first=True).apply([0, 0, 1])[2]
+    assert math.degrees(math.acos(tilt)) < 2.0
+    assert found[-1].t > 23
+
+
 def test_prediction_is_the_future_and_changes_nothing():
     increments = imu(level_flight(), 1)
     filter_ = Ahrs(PAPER)
