@@ -35,6 +35,7 @@ EDGE_S = 1e-6  # a sample this close to a row comes with it
 DIGITS = 3  # of a rate that is found
 FASTEST_HZ = 10_000.0  # of any sensor
 SLOWEST_IMU_HZ = 5.0
+OTHER_CLOCK_S = 0.5  # by which a receiver is late otherwise than is told
 NOBODY = Reference("none: nothing is judged", np.empty(0), {})
 
 
@@ -152,7 +153,8 @@ class Recorded:
             doubt = f"{apart} of the run: nothing is judged by it"
         scattered = [misjudged(one, log.samples[one], sections[one]) for one in self.receptions if one in log.samples]
         lost = _losses(log, [*scenario.sensors, *references(truth)])
-        told = [doubt, *mistaken(_as_used(log, sections)), *scattered, *lost]
+        late = [_later(name, section, log) for name, section in sections.items() if name == log.receiver]
+        told = [doubt, *mistaken(_as_used(log, sections)), *late, *scattered, *lost]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
@@ -299,6 +301,16 @@ def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Refer
     lag = lag if shown is None else min(shown, late)
     by = f"{late - lag:.2f} s late by the IMU" + (f", its velocities {lag:.2f} s more" if shown else "")
     return replace(_lagging(found, lag), name=f"{found.name}, {by}", t=found.t + section.latency_s - (late - lag))
+
+
+def _later(name: str, section: Any, log: Log) -> str:
+    """What there is to say of a receiver that is much later than it is told to be, or sooner; else nothing."""
+    found = latency(next(iter(log.imus.values())), log.samples[name]) if log.imus else None
+    told = 0.0 if log.valid_times else section.latency_s + section.velocity_lag_s
+    if found is None or abs(found - told) < OTHER_CLOCK_S:
+        return ""
+    mends = "" if log.valid_times else f"latency_s = {max(found - section.velocity_lag_s, 0.0):.2g}, or "
+    return f"{name} is {found:.2f} s late by the IMU, and told to be {told:g}: {mends}an offset of its time mends it"
 
 
 def _lagging(found: Reference, lag: float) -> Reference:

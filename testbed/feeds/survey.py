@@ -28,13 +28,15 @@ MOVING = ("moving", "flying")  # the phases in which it does
 ABOUT_S = 20.0  # over which positions tell a speed
 FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
-LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s]
+LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s],
+FURTHER = np.append(0.0, np.arange(0.6, 3.01, 0.02))  # and where the last of these fits best: a clock is off then
 CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
 LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # [s], -, [m]
 TOGETHER = 10  # steps
 ROUNDING_S = 1e-9  # of times that are numbers
 SLOWEST_IMU_S = 2.0  # between its samples: more is another unit of time
+NEAR = 10  # lags to either side, of which one is the least
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
 LEAST_FIXES = 60
@@ -316,9 +318,35 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     0 is said where that, or the next lag that is tried, fits best, and clearly better than what a grade has, which is
     taken off where nothing is known.
     """
+    costs, weight = _misfits(imu, own, LAGS)
+    if not len(costs):
+        return None
+
+    def clearer(one: int, other: int) -> bool:
+        found = weight * math.log(costs[other] / costs[one]) if costs[one] else math.inf
+        return bool(found > CLEARER)
+
+    best, lags = int(np.argmin(costs)), LAGS
+    if best == len(LAGS) - 1:
+        lags, (costs, weight) = FURTHER, _misfits(imu, own, FURTHER)
+        best = int(np.argmin(costs)) if len(costs) else 0
+        # Who swings to and fro moves as well a swing later: the first that is no worse.
+        least = [k for k in range(1, best) if costs[k] <= min(costs[max(k - NEAR, 0) : k + NEAR])]
+        best = next((k for k in least if not clearer(best, k)), best)
+    if 0 < best < len(lags) - 1 and clearer(best, 0):
+        return float(lags[best])
+    none = lags is LAGS and best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S))))
+    return 0.0 if none else None
+
+
+def _misfits(imu: ImuSamples, own: Sequence[Any], lags: Array) -> tuple[list[float], int]:
+    """How badly velocities fit what was felt so much earlier, for each of the ``lags`` (K,) [s], none if too few do.
+
+    And twice the number of steps between fixes that this is the root mean square of.
+    """
     t, v_n, place = fixes(own)
     if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
-        return None
+        return [], 0
     gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv))
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
     step = np.diff(t)
@@ -326,25 +354,17 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     change = np.diff(v_n, axis=0)
     change[:, 2] -= g * step
     told = np.linalg.norm(change, axis=1)
-    steady = (step < 2 * np.median(step)) & (t[:-1] - LAGS[-1] > at[0]) & (t[1:] < at[-1])
+    steady = (step < 2 * np.median(step)) & (t[:-1] - lags[-1] > at[0]) & (t[1:] < at[-1])
     if steady.sum() < LEAST_FIXES:
-        return None
+        return [], 0
     costs = []
-    for lag in LAGS:
+    for lag in lags:
         moved = np.column_stack([np.interp(t - lag, at, column) for column in gained.T])
         felt = np.linalg.norm(np.diff(moved, axis=0), axis=1)
         apart = ((felt - told) / step)[steady]
         apart = np.abs(apart - np.median(apart))
         costs.append(float(np.sqrt(np.mean(np.minimum(apart, OUTLYING * np.median(apart)) ** 2))))
-
-    def clearer(one: int, other: int) -> bool:
-        found = 2 * steady.sum() * math.log(costs[other] / costs[one]) if costs[one] else math.inf
-        return bool(found > CLEARER)
-
-    best = int(np.argmin(costs))
-    if 0 < best < len(LAGS) - 1 and clearer(best, 0):
-        return float(LAGS[best])
-    return 0.0 if best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S)))) else None
+    return costs, int(2 * steady.sum())
 
 
 def velocity_lag(own: Sequence[Any]) -> float | None:

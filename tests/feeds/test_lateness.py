@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -134,3 +135,14 @@ def test_velocities_of_the_reference_are_as_old_as_is_told(tmp_path):
 @pytest.mark.parametrize(("sigma", "grade"), [(0.02, "rtk"), (0.5, "u-blox-m8")])
 def test_the_grade_of_a_receiver_is_by_what_it_claims(sigma, grade, tmp_path):
     assert drafted(tmp_path, lag=0.0, late=0.1, sigma=sigma).sensors["gnss"].grade == grade
+
+
+@pytest.mark.parametrize("late", [1.0, 2.4])
+def test_a_receiver_of_another_clock_is_found_and_told(late, tmp_path):
+    """Nothing was found, and nothing said but that noise is larger than is told."""
+    flown = run(table(tmp_path, lag=0.0, late=late).changed({"sensors.gnss.grade": "rtk"}))
+    (found,) = re.findall(r"gnss is ([\d.]+) s late by the IMU, and told to be 0.1:", " ".join(flown.remarks))
+    assert float(found) == pytest.approx(late, abs=0.03)
+    scenario = drafted(tmp_path, lag=0.0, late=late)
+    assert scenario.sensors["gnss"].latency_s == pytest.approx(late, abs=0.03)
+    assert run(scenario).metrics["ins.position_horizontal_rms_m"] < 0.5
