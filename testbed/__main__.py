@@ -317,8 +317,8 @@ def init(
     from testbed.data import make_project
 
     for path in make_project(folder):
-        print(path)
-    print(f"Now: cd {folder} && testbed run first.toml")
+        print(printable(str(path)))
+    print(printable(f"Now: cd {folder} && testbed run first.toml"))
 
 
 def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:

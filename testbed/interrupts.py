@@ -18,8 +18,9 @@ from types import FrameType
 GRACE_S = 2.0  # to close files and to end other processes
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 AGAIN_S = 0.01
-# What kernels call as they return, where most signals are heard: what is raised there becomes a SystemError of theirs.
-CALLED_BACK = ("_numba_unpickle",)
+# What kernels call as they return, where most signals are heard, and what their compiler calls: what is raised there
+# becomes a SystemError of theirs, or is lost.
+CALLED_BACK = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
 _SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
 
 _left: list[Callable[[], str]] = []  # what the contexts that are open leave behind, the innermost last
@@ -38,6 +39,9 @@ class Interrupted(BaseException):
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__(number)
         self.exit_code = 128 + number
+
+
+INTERRUPTS = (Interrupted, KeyboardInterrupt)  # which are nobody's own to take
 
 
 def end_at_once() -> None:
@@ -72,7 +76,7 @@ def heeded() -> Iterator[None]:
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal interrupted
-        if frame is not None and frame.f_code.co_name in CALLED_BACK:
+        if _in_callback(frame):
             threading.Timer(AGAIN_S, os.kill, (os.getpid(), number)).start()
             return
         interrupted = True
@@ -107,6 +111,15 @@ def heeded() -> Iterator[None]:
             os.close(tell)
 
 
+def _in_callback(frame: FrameType | None) -> bool:
+    """Whether what goes on there was called by compiled code."""
+    while frame is not None:
+        if frame.f_code.co_name in CALLED_BACK:
+            return True
+        frame = frame.f_back
+    return False
+
+
 @contextmanager
 def held() -> Iterator[None]:
     """A signal in this context is raised at its end: to start a process, and to note that it was, is one thing.
@@ -132,7 +145,7 @@ def leaving(what: Callable[[], str] = str) -> Iterator[None]:
     _left.append(what)
     try:
         yield
-    except (Interrupted, KeyboardInterrupt) as interrupt:
+    except INTERRUPTS as interrupt:
         _tell()
         raise SystemExit(interrupt.exit_code if isinstance(interrupt, Interrupted) else 130) from None
     finally:

@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from testbed.errors import UserError, printable, shown, unknown
+from testbed.interrupts import INTERRUPTS
 
 # Where Python's own modules are, and our own, and folders of packages that are not the user's to edit.
 _STDLIB = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
@@ -73,7 +74,9 @@ def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:
             raise UserError(f"{_called(kind, group)}: {where} can't be imported: {error.msg}{todo}") from error
         todo = f'install it, or give its file, such as "./{where.rpartition(".")[2]}.py:{name}"'
         raise UserError(f"{_called(kind, group)}: there is no module {where}: {todo}") from None
-    except (Exception, SystemExit) as error:
+    except INTERRUPTS:
+        raise
+    except BaseException as error:
         raise UserError(f"{_called(kind, group)}: {where} can't be imported: {raised(error)}") from error
     return module, where, name
 
@@ -141,7 +144,11 @@ def raised(error: BaseException) -> str:
     theirs = [frame for frame in frames if not _is_installed(Path(frame.filename))]
     last = (theirs or frames)[-1:]
     at = f" ({Path(last[0].filename).name}, line {last[0].lineno})" if last else ""
-    return f"{type(error).__name__}: {printable(str(error))}{at}"
+    try:
+        said = str(error)
+    except Exception:
+        said = "it can't be shown"
+    return f"{type(error).__name__}: {printable(said)}{at}"
 
 
 def _lies(path: Path, places: Sequence[Path]) -> bool:

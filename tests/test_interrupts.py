@@ -10,8 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import h5py
 import pytest
 from worlds.programs import free_port
+
+from testbed import Scenario, run
+from testbed.commands.run import _has_rows
 
 COMMANDS = {
     "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
@@ -105,19 +109,26 @@ with interrupts.heeded():
     assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
 
 
-def test_an_interrupt_that_is_heard_in_a_kernel_is_raised_when_it_has_returned() -> None:
-    """A kernel that boxes what it returns calls Python, where the signal is heard: raised there it was a traceback."""
-    script = """
+@pytest.mark.parametrize("of", ["serialize._numba_unpickle", "ExecutionEngine._raw_object_cache_notify"])
+def test_an_interrupt_that_is_heard_in_a_kernel_is_raised_when_it_has_returned(of: str) -> None:
+    """A kernel that boxes what it returns calls Python, and so does its compiler: raised there it was a traceback."""
+    script = (
+        f"""
 import os, signal, time
+from llvmlite.binding.executionengine import ExecutionEngine
 from numba.core import serialize
 from testbed import interrupts
 
-called = serialize._numba_unpickle.__code__.co_name
-
-def wait():
+called = {of}.__code__.co_name
+"""
+        + """
+def hear():
     os.kill(os.getpid(), signal.SIGTERM)
     for _ in range(1000):
         pass
+
+def wait():
+    hear()
     print("returned", flush=True)
 
 wait.__code__ = wait.__code__.replace(co_name=called)
@@ -125,6 +136,17 @@ with interrupts.heeded():
     wait()
     time.sleep(10)
 """
+    )
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
     assert ended.stdout.split() == ["returned"]
     assert (ended.returncode, ended.stderr) == (143, "testbed: interrupted\n")
+
+
+def test_a_record_without_rows_is_none_to_be_shown(tmp_path: Path) -> None:
+    """An interrupt while kernels compile leaves one: to name it sent people to a command that refuses it."""
+    assert not _has_rows(tmp_path / "run.nc")
+    with h5py.File(tmp_path / "run.nc", "w") as file:
+        file.create_group("estimators/ins")
+    assert not _has_rows(tmp_path / "run.nc")
+    run(Scenario.load("u_turn", {"duration_s": 2, "expect": {}}), out=tmp_path / "flown")
+    assert _has_rows(tmp_path / "flown/run.nc")

@@ -53,7 +53,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
     if len(set(folders)) < len(folders):
         raise UserError("a run is named twice: name each once")
     for count in range(1, max(len(folder.parts) for folder in folders) + 1):
-        names = ["/".join(folder.parts[-count:]) for folder in folders]
+        names = [printable("/".join(folder.parts[-count:])) for folder in folders]
         if len(set(names)) == len(names):
             break
     return names

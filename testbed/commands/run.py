@@ -282,7 +282,9 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
 
     record, before = folder / RECORD, _stamp(folder / RECORD)
     with (
-        interrupts.leaving(lambda: _kept(record) if _stamp(record) != before else "nothing was recorded"),
+        interrupts.leaving(
+            lambda: _kept(record) if _stamp(record) != before and _has_rows(record) else "nothing was recorded"
+        ),
         keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(console(stderr=True), scenario.title) as tell,
     ):
@@ -310,6 +312,15 @@ def _stamp(path: Path) -> tuple[int, int] | None:
         status = path.stat()
         return status.st_ino, status.st_mtime_ns
     return None
+
+
+def _has_rows(record: Path) -> bool:
+    """Whether there is a row of truth in a record, without which it shows nothing."""
+    from h5py import File
+
+    with suppress(OSError, KeyError, ValueError), File(record, "r") as file:
+        return math.isfinite(file["truth/time"][0])
+    return False
 
 
 def _kept(record: Path) -> str:

@@ -36,6 +36,7 @@ from testbed.estimators.given import Given, Unfit
 from testbed.estimators.lane import Lane, mountings
 from testbed.estimators.rig import Rig
 from testbed.estimators.section import EstimatorSection, Mistake
+from testbed.interrupts import INTERRUPTS
 from testbed.schema import keys_of
 from testbed.sensors import SensorConfig
 
@@ -83,11 +84,13 @@ def build(section: CustomSection, rig: Rig) -> Lane:
         raise UserError(f"estimator {section.name}: {error}") from None
     options = _options(section, made)
     try:
-        inner = made(rig, **options)
+        inner = made(dataclasses.replace(rig, sensors=dict(rig.sensors)), **options)
         missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     except UserError:
         raise
-    except (Exception, SystemExit) as error:
+    except INTERRUPTS:
+        raise
+    except BaseException as error:
         raise UserError(f"estimator {section.name}: {section.kind} can't be made: {plugins.raised(error)}") from error
     if missing:
         raise UserError(f"estimator {section.name}: {section.kind} lacks {', '.join(missing)}: see docs/extending.md")
@@ -200,7 +203,9 @@ class Adapter:
             return ask(*arguments)
         except Unfit as error:
             self.failure = str(error)
-        except (Exception, SystemExit, GeneratorExit) as error:  # `sys.exit` in it is its own end, not the run's
+        except INTERRUPTS:
+            raise
+        except BaseException as error:  # `sys.exit` in it, or a panic, is its own end, not the run's
             self.failure = plugins.raised(error)
         return otherwise
 

@@ -25,7 +25,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from testbed.errors import UserError
+from testbed.errors import UserError, printable
 from testbed.interrupts import Interrupted
 from testbed.mavlink.link import CONNECT_TIMEOUT_S, in_use, log_path, resolve
 
@@ -205,7 +205,9 @@ class Picture:
         both = Table.grid(padding=(0, 4))
         both.add_row(errors, sensors)
         said = Text("\n").join(Text(text, style, no_wrap=True, overflow="ellipsis") for text, style in self._texts)
-        return Panel(Group(head, "", both, "", said), title=Text(self._source), title_align="left", expand=False)
+        return Panel(
+            Group(head, "", both, "", said), title=Text(printable(self._source)), title_align="left", expand=False
+        )
 
     def _link(self) -> str:
         silence = self.clock - self._heartbeat_at

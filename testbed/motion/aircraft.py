@@ -125,6 +125,9 @@ class Envelope(Section):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         slowest = self.airspeed.margin * self.airspeed.stall_mps
+        stall = self.airspeed.stall_mps
+        if self.launch is not None and self.launch.speed_mps < stall:
+            raise ValueError(f"launch.speed_mps: must be flown, from airspeed.stall_mps, {stall:g}")
         if self.airspeed.max_mps <= slowest:
             raise ValueError(f"airspeed.max_mps: must be above margin times stall_mps, {slowest:.1f}")
         if self.altitude.ceiling_m <= self.altitude.floor_m:

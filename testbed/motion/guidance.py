@@ -130,8 +130,10 @@ def _speed_mistake(key: str, speed: float, alt: float, envelope: Envelope) -> It
     at = f"{speed:g} m/s true airspeed at {alt:g} m"
     if speed < slowest:
         yield key, f"{at} is too near the stall: {slowest:.1f} is the least"
-    elif speed > fastest or envelope.climb_limit(speed, alt) < LEAST_CLIMB:
-        yield key, f"{at} is more than engine and airframe stand: {fastest:.1f} is the most for the airframe"
+    elif speed > fastest:
+        yield key, f"{at} is more than the airframe stands: {fastest:.1f} is the most"
+    elif (climb := envelope.climb_limit(speed, alt)) < LEAST_CLIMB:
+        yield key, f"{at} leaves no climb, {climb:.1f} m/s by the fit in envelope.toml: {LEAST_CLIMB:g} is the least"
 
 
 def _vertical_mistakes(at: str, leg: Leg, alt: float, to_alt: float, limit: float) -> Iterator[tuple[str, str]]:

@@ -21,6 +21,7 @@ from nav.aids.base import Measurement, OperatingPoint
 from nav.error_model import Block
 from testbed import plugins
 from testbed.errors import UserError, shown
+from testbed.interrupts import INTERRUPTS
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.schema import Section
 from testbed.sensors import registry
@@ -41,7 +42,9 @@ def made(name: str, section: Section, *given: Any) -> Any:
         return registry.of(section).sensor(name, section, *given)
     except UserError:
         raise
-    except (Exception, SystemExit) as error:
+    except INTERRUPTS:
+        raise
+    except BaseException as error:
         raise UserError(f"{_called(name, section)} can't be made: {plugins.raised(error)}") from error
 
 
@@ -54,7 +57,9 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
         found = maker(name, section, imu)
     except UserError:
         raise
-    except (Exception, SystemExit) as error:
+    except INTERRUPTS:
+        raise
+    except BaseException as error:
         raise UserError(f"{_called(name, section)}: aid: {plugins.raised(error)}") from error
     if found is None:
         return None
@@ -184,7 +189,9 @@ def _asked(called: str, ask: Callable[..., Any], *given: Any) -> Any:
         return ask(*given)
     except UserError:
         raise
-    except (Exception, SystemExit) as error:
+    except INTERRUPTS:
+        raise
+    except BaseException as error:
         raise UserError(f"{called}: {plugins.raised(error)}") from error
 
 
@@ -223,7 +230,9 @@ class Guard:
             samples = [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
         except UserError:
             raise
-        except (Exception, SystemExit, GeneratorExit) as error:
+        except INTERRUPTS:
+            raise
+        except BaseException as error:
             raise UserError(f"{self._called}: {plugins.raised(error)}") from error
         for sample in samples:
             wrong = self._wrong(sample)

@@ -47,6 +47,7 @@ class Mine:
         self.t, self.fix, self.after_s, self.how, self.times = 0.0, None, after_s, how, []
         assert rig.sensors["gnss"].errors().latency >= 0
         assert rig.tick_rate_hz == 200.0
+        rig.sensors.clear()  # which are its own
 
     def propagate(self, imu):
         self.t = imu.t[-1]
@@ -54,6 +55,10 @@ class Mine:
             raise RuntimeError("lost its way")
         if self.t > self.after_s and self.how == "exit":
             sys.exit(3)
+        if self.t > self.after_s and self.how == "panic":
+            raise type("Panic", (BaseException,), {})("in Rust")
+        if self.t > self.after_s and self.how == "mute":
+            raise type("Mute", (Exception,), {"__str__": lambda self: 1 / 0})
         if self.how == "spoil":
             imu.dtheta[:] = 0.0
 
@@ -155,6 +160,8 @@ def test_it_runs_beside_ours_and_is_recorded(healthy) -> None:
     [
         ("raise", "RuntimeError: lost its way (filters.py, line"),
         ("exit", "SystemExit: 3 (filters.py, line"),
+        ("panic", "Panic: in Rust (filters.py, line"),
+        ("mute", "Mute: it can't be shown (filters.py, line"),
         ("shape", "estimate: q_nb has shape (3,), not (4,)"),
         ("type", "estimate gave 3.0, not a nav.samples.Estimate"),
     ],

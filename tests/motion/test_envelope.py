@@ -62,6 +62,7 @@ def test_a_mark_of_the_byte_order_is_no_matter(mine: Path) -> None:
         ("none_below_mps = 11.2", "none_below_mps = 26", "climb.none_below_mps: must lie between"),
         ("airspeed_mps = 18.0", "airspeed_mps = 11.0", "usual.airspeed_mps: must be flown, from 12.0 to 25"),
         ("rate_mps = 3.5", "rate_mps = 0.1", "climb.rate_mps: leaves no climb at usual.airspeed_mps, 18"),
+        ("speed_mps = 13.0", "speed_mps = 9.5", "launch.speed_mps: must be flown, from airspeed.stall_mps, 9.6"),
         ("turn_rate_radps = 0.08", "turn_rate_radps = 0.6", "usual.turn_rate_radps: at most 0.46 can be turned"),
         ("[climb]", "[climb", "can't be read: "),
     ],
