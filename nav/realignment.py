@@ -39,6 +39,7 @@ TURNED, MOVED = slice(PHI, PHI + 3), slice(VEL, VEL + 3)
 WAIT_S = 5.0  # the longest that samples are withheld for an alignment,
 LONG_S = 30.0  # the same of one that has no compass, and that one goes on though the tilt seems to be known again
 ELSEWHERE = 5.0  # sigmas
+CRAWLING = np.array([1.0, 0.0, 0.0])  # neither at rest, where gyros may tell the heading, nor on a course [m/s]
 WIND, SLIP = 8.0, 3.0  # where no filter has one, and across the nose [m/s]
 SWING = 1.0  # of an antenna about the IMU, in a body whose turns nobody knows [rad/s]
 
@@ -250,14 +251,15 @@ class Realignment:
 
 
 def level(alignment: Alignment, reference: Reference, sample: MagnetometerSample, lla: Array) -> InitialState | None:
-    """Give a field to an alignment that is to take the body at ``lla`` for one that stands; the attitude once known.
+    """Give a field to an alignment that is to take the body at ``lla`` for one that is not accelerated; the attitude
+    once known.
 
-    That is as if a receiver had said so at both ends of the alignment's time, and were wrong by what a steady
-    acceleration of `USUAL_ACCELERATION` does in it.
+    That is as if a receiver had told of one velocity at both ends of the alignment's time, and were wrong by what a
+    steady acceleration of `USUAL_ACCELERATION` does in it.
     """
     wrong = np.full(3, USUAL_ACCELERATION * alignment.duration_s / math.sqrt(2))
     t, (lat, lon, h) = sample.t, lla.tolist()
-    fix = GnssSample(t, t, lat, lon, h, np.zeros(3), wrong, wrong, FixType.FIX_3D, 0, math.nan, math.nan)
+    fix = GnssSample(t, t, lat, lon, h, CRAWLING, wrong, wrong, FixType.FIX_3D, 0, math.nan, math.nan)
     align(alignment, reference, sample)
     return align(alignment, reference, fix)
 

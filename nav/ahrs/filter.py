@@ -249,21 +249,22 @@ class Ahrs:
         state = self._state.copy() if self._state is not None else None
         last_bad = self._last_bad
         if state is not None and len(imu):
-            last_bad = max(last_bad, self._run(state, imu, []))
+            last_bad = max(last_bad, self._run(state, imu, [], ahead=True))
         return self._estimate(state, float(imu.t[-1]) if len(imu) else self.t, last_bad)
 
-    def _run(self, s: State, imu: ImuSamples, reports: list[UpdateReport]) -> float:
+    def _run(self, s: State, imu: ImuSamples, reports: list[UpdateReport], ahead: bool = False) -> float:
         """Propagate a state; the time of the last increment that was not usable, -inf when all were.
 
-        Periods end at times of their own, whatever the blocks.
+        Periods end at times of their own, whatever the blocks. Of one that is ``ahead`` no level is begun anew.
         """
         last_bad = -math.inf
         start, n = 0, len(imu)
         while start < n:
             if s.levelled and self._usual:
-                bad, taken = self._advance(s, imu, start, reports)
+                bad, taken = self._advance(s, imu, start, not ahead, reports)
                 last_bad, start = max(last_bad, bad), start + taken
-                self._begin_anew_if_lost(s, float(imu.t[start - 1]))
+                if not ahead:
+                    self._begin_anew_if_lost(s, float(imu.t[start - 1]))
                 continue
             end = int(imu.t.searchsorted(s.counts[PERIOD_END] - COINCIDENT)) + 1
             rows = slice(start, min(end, n))
@@ -285,15 +286,14 @@ class Ahrs:
             self._begin_levelling(s)
             self._begin_period(s, t)
 
-    def _advance(self, s: State, imu: ImuSamples, start: int, reports: list[UpdateReport]) -> tuple[float, int]:
-        """Propagate a levelled state of a filter that levels as usual by the increments from ``start`` on.
-
-        When one was not usable last, and how many were taken: not all where the tilt is lost.
-        """
+    def _advance(
+        self, s: State, imu: ImuSamples, start: int, stops: bool, reports: list[UpdateReport]
+    ) -> tuple[float, int]:
+        """`kernels.advance` by the increments from ``start`` on: when one was bad last, and how many were taken."""
         rows = np.empty((self._periods(float(imu.t[-1] - imu.t[start])), kernels.REPORT))
         bad, written, taken = kernels.advance(
             s.whole, s.n, *self._model, self._airspeed.numbers, self._busy, imu.t[start:], imu.dtheta[start:],
-            imu.dv[start:], imu.dt[start:], -math.inf, True, rows,
+            imu.dv[start:], imu.dt[start:], -math.inf, stops, rows,
         )  # fmt: skip
         reports += self._reports(rows[:written])[:]
         return bad, taken
