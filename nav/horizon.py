@@ -60,7 +60,7 @@ class TakesSteps(Protocol):
 
     @property
     def in_steps(self) -> bool:
-        """Whether it does so now: from then on it listens, and accepts the same sensors, for ever."""
+        """Whether it does so now: as long as it does it listens, and accepts the same sensors."""
         ...
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:

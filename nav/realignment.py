@@ -85,6 +85,7 @@ class Realignment:
         self._alignment: Alignment | None = None
         self._by_gravity: Alignment | None = None
         self._eas = 0.0
+        self._fix_at = -math.inf  # when one was heard last
         self._heading.begin()
         self._receiver = ""
         self._lost_at = self._moved_at = self._widened = math.nan
@@ -152,10 +153,13 @@ class Realignment:
             if initial is not None:
                 estimator.start(initial)
                 return []
-            alone = waited > 0 and not self._receiver
-            if alone and isinstance(sample, MagnetometerSample) and self._level(state, filters, sample):
+            if isinstance(sample, GnssSample):
+                self._fix_at = sample.t
+            if isinstance(sample, MagnetometerSample) and waited > 0 and self._level(state, filters, sample):
                 return []
         patience = LONG_S if self._alignment.matching else WAIT_S
+        if self._by_gravity is not None and sample.t - self._fix_at > WAIT_S:
+            patience = max(patience, 2 * WAIT_S)  # which takes as long, and begins with a field
         if waited <= patience:
             self._widen(state.P, filters, sample.t)
             if is_part and isinstance(sample, GnssSample):
@@ -166,7 +170,7 @@ class Realignment:
         return None
 
     def _level(self, state: State, filters: int, sample: MagnetometerSample) -> bool:
-        """Find the attitude by gravity and the field, where no fix was heard, and whether it was: see `level`.
+        """Find the attitude by gravity and the field, where no fix was heard of late; whether it was: see `level`.
 
         All else the filters keep, such as the iron that they know beside the magnetometer.
         """
@@ -174,7 +178,7 @@ class Realignment:
             self._by_gravity = deepcopy(self._beginning)
             self._by_gravity.duration_s = WAIT_S
         found = level(self._by_gravity, self._reference, self._without_iron(state, sample), state.lla)
-        if found is None:
+        if found is None or sample.t - self._fix_at <= WAIT_S:
             return False
         state.q_nb[:] = found.q_nb
         state.x[:, TURNED] = 0.0
@@ -193,11 +197,14 @@ class Realignment:
 
         It is off as the nose is, of the ``variance`` (3, 3), and by wind and slip.
         """
-        wind, wind_variance = np.zeros(3), WIND**2
-        for x, P, model in zip(state.x, state.P, self._reference.models, strict=False):
-            if (where := model.slices.get("wind")) is not None:
-                wind[:2], wind_variance = x[where], float(P.diagonal()[where].max()) / filters
-                break
+        wind, off = np.zeros(3), np.zeros((3, 3))
+        own = [model.slices.get("wind") for model in self._reference.models]
+        row = next((k for k, where in enumerate(own) if where is not None), None)
+        if row is None:
+            off = WIND**2 * np.eye(3)
+        else:
+            wind[:2] = state.x[row, own[row]]
+            off[:2, :2] = state.P[row, own[row], own[row]] / filters
         speed = self._eas * math.sqrt(SEA_LEVEL_DENSITY / isa_density(float(state.lla[2])))
         air = speed * dcm_from_quat(state.q_nb)[:, 0]
         state.v_n[:] = wind + air
@@ -207,7 +214,10 @@ class Realignment:
         swung = skew(air) @ variance
         state.P[:, MOVED, TURNED] = filters * swung
         state.P[:, TURNED, MOVED] = filters * swung.T
-        state.P[:, MOVED, MOVED] = filters * (swung @ skew(air).T + (wind_variance + SLIP**2) * np.eye(3))
+        state.P[:, MOVED, MOVED] = filters * (swung @ skew(air).T + off + SLIP**2 * np.eye(3))
+        if row is not None:
+            state.P[row, MOVED, own[row]] = filters * off[:, :2]
+            state.P[row, own[row], MOVED] = filters * off[:2]
 
     def _without_iron(self, state: State, sample: MagnetometerSample) -> MagnetometerSample:
         """The sample without the hard iron that a filter has found, if one looks for it."""

@@ -91,10 +91,6 @@ class AnyMotionLevelling:
             s.P[level, level] += min(abs(m.turn_rate) * speed / self._g, MOST_TILT) ** 2 * np.eye(2)
         s.P[level, own] = s.P[own, level] = -tilt * speed * np.eye(2)
 
-    def misses(self, s: State) -> bool:
-        """Whether most of the period is missing, and it shows nothing."""
-        return s.in_motion.missing_s > 0.5 * float(s.elapsed[1])
-
     def lost(self, s: State) -> bool:
         """Whether the tilt is, so that it must be found anew."""
         return bool(max(s.P[PHI, PHI], s.P[PHI + 1, PHI + 1]) > LOST_TILT**2)

@@ -18,6 +18,7 @@ from nav.ahrs.state import (
     CORRECTIONS,
     FIXED,
     LEVELLINGS,
+    MISSING,
     PERIOD_END,
     PHI,
     STATES,
@@ -274,7 +275,6 @@ class Ahrs:
             )  # fmt: skip
             if bad >= 0:
                 last_bad = float(imu.t[start + bad])
-                s.in_motion.miss(imu.dtheta[rows], imu.dv[rows], imu.dt[rows])
             start = rows.stop
             if end <= n:
                 self._end_period(s, float(imu.t[end - 1]), reports)
@@ -282,7 +282,7 @@ class Ahrs:
 
     def _begin_anew_if_lost(self, s: State, t: float) -> None:
         """Find the level anew where a filter that levels as usual is at the end of a period with its tilt lost."""
-        if t >= s.counts[PERIOD_END] - COINCIDENT and kernels.lost(s.elapsed, s.P):
+        if t >= s.counts[PERIOD_END] - COINCIDENT and kernels.lost(s.P):
             self._begin_levelling(s)
             self._begin_period(s, t)
 
@@ -308,20 +308,19 @@ class Ahrs:
             self._settle(s)
             if self._any_motion is None:
                 self._level(s, t, reports)
-            elif not self._any_motion.misses(s):
+            elif not kernels.shows_nothing(s.elapsed):
                 self._level_in_motion(s, self._any_motion, t, reports)
             elif self._any_motion.lost(s):
                 self._begin_levelling(s)
             else:
                 self._any_motion.bridge(s)
-        elif s.in_motion.missing_s > 0.0:
+        elif s.elapsed[MISSING] > 0.0:
             self._begin_levelling(s)
         else:
             self._find_level(s, t)
         self._begin_period(s, t)
 
     def _begin_period(self, s: State, t: float) -> None:
-        s.in_motion.missing_s = 0.0
         period = self.config.period_s if s.levelled else self.config.levelling_s
         kernels.begin_period(
             s.q_nb, s.air_velocity_n, s.counts, s.angle, s.force, s.elapsed, s.sums, self._airspeed.numbers, t, period
@@ -355,7 +354,7 @@ class Ahrs:
             heading = _azimuth(self._field_n) - _azimuth(level)
         s.levelled = True
         s.q_nb[:] = quat_multiply(quat_from_euler(roll, pitch, heading), s.q_nb)
-        s.P[:] = self._initial_covariance()
+        s.P[:], s.x[:] = self._initial_covariance(), 0.0
         if self._any_motion is not None:
             s.P[PHI, PHI] = s.P[PHI + 1, PHI + 1] = tilt_variance
             self._any_motion.begin(s, f_0, s.angle / float(s.elapsed[1]), compensated)
@@ -480,7 +479,7 @@ class Ahrs:
         phi = x[:, PHI : PHI + 3]
         covariance = np.full((N, 9, 9), np.nan)
         covariance[:, 6:, 6:] = P[:, PHI : PHI + 3, PHI : PHI + 3] + phi[:, :, None] * phi[:, None] + self._floor
-        turned = np.square(wholes[:, 40:45][:, TURN_RATE] / AVERAGING)
+        turned = np.square(wholes[:, 40:46][:, TURN_RATE] / AVERAGING)
         covariance[:, 8, 8] = np.maximum(covariance[:, 8, 8], self.config.iron_sigma**2 * np.exp(-turned))
         sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         accel_bias, sigma_accel_bias = np.zeros((N, 3)), np.tile(self._sigma_accel_bias, (N, 1))

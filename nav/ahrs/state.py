@@ -9,14 +9,14 @@ import numpy as np
 
 from nav._jit import inlined, njit
 from nav.rotation import rotation_coefficients
-from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array, usable
+from nav.samples import FORCE_LIMIT, RATE_LIMIT, Array
 from nav.state import ANYHOW, turn_unseen
 
 PHI, BIAS, STATES = 0, 3, 6  # where the error states begin, and how many there are before those of `nav.ahrs.further`
 UNKNOWN = np.full(3, np.nan)
-FIXED = 54  # numbers in a `State` of any size
+FIXED = 55  # numbers in a `State` of any size
 PERIOD_END, LEVELLINGS, CORRECTIONS = 0, 1, 2  # what is where in `State.counts`
-TURN_RATE = 4  # and in `State.elapsed`
+TURN_RATE, MISSING = 4, 5  # and in `State.elapsed`
 
 
 @dataclasses.dataclass
@@ -46,12 +46,6 @@ class InMotion:
     other: Array = dataclasses.field(default_factory=lambda: UNKNOWN[:2])  # the same of a field that may replace it
     other_s: float = 0.0  # for how long that has been seen
     quiet: int = 0  # periods in a row
-    missing_s: float = 0.0  # of increments in the period
-
-    def miss(self, dtheta: Array, dv: Array, dt: Array) -> None:
-        """Count those of N increments that are not usable."""
-        for T in dt[~usable(dtheta, dv, dt)].tolist():  # one by one: however they are cut into blocks, the same bits
-            self.missing_s += T
 
     def copy(self) -> InMotion:
         """The same in arrays of its own."""
@@ -77,8 +71,9 @@ class State:
     turned: Array  # (3, 3) integral of C_nb since the last covariance step
     angle: Array  # (3,) integral of angular rate over the period, body axes
     force: Array  # (3,) integral of specific force over the period, n
-    elapsed: Array  # (5,) seconds since the last covariance step, since the start of the period; increments since then;
-    # seconds since a sound increment; and `TURN_RATE`, about the vertical, mean of the last half-minute [rad/s]
+    elapsed: Array  # (6,) seconds since the last covariance step, since the start of the period; increments since then;
+    # seconds since a sound increment; `TURN_RATE`, about the vertical, mean of the last half-minute [rad/s]; and
+    # seconds of the period that are `MISSING`
     sums: Array  # (3, 3) integrals over the period of specific force and of the squares of rate and of it, body axes
     x: Array  # (n,) estimated errors still in the attitude and the gyros, and `nav.ahrs.further.FurtherStates`
     P: Array  # (n, n)
@@ -114,7 +109,7 @@ def parts(
     x = FIXED + n
     return (
         whole[:4], whole[4:7], whole[7:10], whole[10:13], whole[13:16], whole[16:19], whole[19:25].reshape(2, 3),
-        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:45], whole[45:FIXED].reshape(3, 3),
+        whole[25:34].reshape(3, 3), whole[34:37], whole[37:40], whole[40:46], whole[46:FIXED].reshape(3, 3),
         whole[FIXED:x], whole[x:].reshape(n, n),
     )  # fmt: skip
 
@@ -165,6 +160,7 @@ def propagate(
             bad = k
             grown = turn_unseen(elapsed[3] + T) - turn_unseen(elapsed[3])
             elapsed[3] += T
+            elapsed[MISSING] += T
             for i in range(3):
                 P[PHI + i, PHI + i] = max(P[PHI + i, PHI + i], min(P[PHI + i, PHI + i] + grown, ANYHOW))
             p0, p1, p2 = rates[0, 0] * T, rates[0, 1] * T, rates[0, 2] * T

@@ -19,6 +19,7 @@ from nav.ahrs.state import (
     BIAS,
     CORRECTIONS,
     LEVELLINGS,
+    MISSING,
     PERIOD_END,
     PHI,
     STATES,
@@ -292,7 +293,7 @@ def begin_period(
         air_velocity_n[i] = velocity[i]
         for j in range(3):
             sums[i, j] = 0.0
-    elapsed[1] = elapsed[2] = 0.0
+    elapsed[1] = elapsed[2] = elapsed[MISSING] = 0.0
     while counts[PERIOD_END] <= t + COINCIDENT:
         counts[PERIOD_END] += period
 
@@ -317,8 +318,8 @@ def advance(
     """Take N increments, with the levellings on the way; when one was not usable last, how many ``reports`` (_, 15)
     were written, and how many increments were taken.
 
-    The autopilot commanded something else than level flight up to the times ``busy`` (M,). A period that ends while
-    increments are missing shows nothing; where the tilt is lost then, none is taken any more if it ``stops`` (`lost`).
+    The autopilot commanded something else than level flight up to the times ``busy`` (M,). From one most of which is
+    missing nothing is taken for a level; where the tilt is `lost` at its end, no more increments are if it ``stops``.
     """
     (
         q_nb, gyro_bias, air_velocity_n, _, shown, counts, rates, turned, angle, force, elapsed, sums, x, P,
@@ -338,12 +339,12 @@ def advance(
         if bad >= 0:
             last_bad = max(last_bad, t[row + bad])
         row = stop
-        if ends and stops and lost(elapsed, P):
+        if ends and stops and lost(P):
             return last_bad, written, row
         if ends:
             now = t[row - 1]
             settle(x, P, turned, angle, elapsed, told, rows, places, 0.0)
-        if ends and elapsed[3] == 0.0:
+        if ends and not shows_nothing(elapsed):
             commanded = not is_busy(busy, now - elapsed[1], now)
             low = level(
                 q_nb, gyro_bias, air_velocity_n, shown, counts, angle, force, elapsed, x, P, told, rows, places, air,
@@ -360,9 +361,15 @@ def advance(
 
 
 @njit
-def lost(elapsed: Array, P: Array) -> bool:
-    """Whether as good as nothing is known of roll or pitch, while increments are missing."""
-    return bool(elapsed[3] > 0.0 and max(P[PHI, PHI], P[PHI + 1, PHI + 1]) > AS_GOOD_AS * ANYHOW)
+def shows_nothing(elapsed: Array) -> bool:
+    """Whether most of a period's increments are missing."""
+    return bool(elapsed[MISSING] > 0.5 * elapsed[1])
+
+
+@njit
+def lost(P: Array) -> bool:
+    """Whether as good as nothing is known of roll or pitch: increments were missing for long."""
+    return bool(max(P[PHI, PHI], P[PHI + 1, PHI + 1]) > AS_GOOD_AS * ANYHOW)
 
 
 @njit
@@ -379,7 +386,7 @@ def follow(
     bad increment, reports and estimates. Where the tilt is `lost` no further step is taken.
     """
     one_t, one_dt, one_angle, one_push = np.empty(1), np.empty(1), np.empty((1, 3)), np.empty((1, 3))
-    _, _, _, _, _, counts, _, _, _, _, elapsed, _, _, P = parts(whole, n)
+    _, _, _, _, _, counts, _, _, _, _, _, _, _, P = parts(whole, n)
     written = drafted = some = 0
     then = now
     for k in range(len(steps)):
@@ -393,7 +400,7 @@ def follow(
                 dt[row:stop], last_bad, True, reports[written:],
             )  # fmt: skip
             row, now, written = row + came, t[row + came - 1], written + some
-            if lost(elapsed, P) and now >= counts[PERIOD_END] - COINCIDENT:
+            if lost(P) and now >= counts[PERIOD_END] - COINCIDENT:
                 return k, row, now, last_bad, written, drafted
         if what == ADVANCE:
             continue
@@ -424,15 +431,15 @@ def follow(
                 reports[written:],
             )  # fmt: skip
         if what == ESTIMATE:
-            _, _, _, _, _, _, _, turned, angle, _, its, _, x, own = parts(state, n)
-            settle(x, own, turned, angle, its, told, rows, places, 0.0)
+            _, _, _, _, _, _, _, turned, angle, _, elapsed, _, x, own = parts(state, n)
+            settle(x, own, turned, angle, elapsed, told, rows, places, 0.0)
             when[drafted, 0], when[drafted, 1] = then, bad
             drafted += 1
             continue
         if partly:
             take_off(one_dt, one_angle, one_push, dt, dtheta, dv, row)
             now, last_bad, written = time, bad, written + some
-            if lost(elapsed, P) and now >= counts[PERIOD_END] - COINCIDENT:
+            if lost(P) and now >= counts[PERIOD_END] - COINCIDENT:
                 return k, row, now, last_bad, written, drafted
         numbers = steps[k, NUMBERS:]
         if what == MAGNETIC:

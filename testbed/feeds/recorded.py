@@ -324,8 +324,9 @@ def _lagging(found: Reference, lag: float) -> Reference:
 def _with_attitude(found: Reference, solution: Reference, start: float) -> Reference:
     """The receiver's reference with the attitude of the log's solution, at its times too: it turns between fixes."""
     own = solution.t - start
-    within = own[(own > found.t[0]) & (own < found.t[-1])] if len(found.t) else own[:0]
-    t = np.union1d(found.t, within)
+    # And each second, as it may be silent for longer than rows are joined, but not than those of a slow receiver are.
+    further = np.union1d(own, np.arange(found.t[0], found.t[-1])) if len(found.t) else own[:0]
+    t = np.union1d(found.t, further[(further > found.t[0]) & (further < found.t[-1])] if len(found.t) else further)
     place = ReferenceMotion(found, 1.0, 0).at(t)
     columns = {name: getattr(place, name) for name in found.columns}
     columns["q_nb"] = ReferenceMotion(replace(solution, t=own), 1.0, 0).at(t).q_nb

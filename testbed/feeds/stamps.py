@@ -160,8 +160,8 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     newest = np.maximum.accumulate(t)
     behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
     behind &= t < newest - GAP_S  # not a burst that came late
-    behind &= ~_catches_up(t, newest)  # nor rows that are shuffled
     begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
+    begins = np.array([k for k in begins.tolist() if not _is_shuffled(t, k, float(newest[k]))], np.intp)
     if not len(begins):
         return t, rows
     edges = [0, *begins.tolist(), len(t)]
@@ -173,10 +173,14 @@ def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Ar
     return t[part], rows[part]
 
 
-def _catches_up(t: Array, newest: Array) -> Mask:
-    """At which of times (N,) one of the next few is as late as the ``newest`` (N,) before it."""
-    ahead = np.lib.stride_tricks.sliding_window_view(np.append(t, np.full(2 * STRAY, -np.inf)), 2 * STRAY + 1)
-    return np.asarray(ahead.max(axis=1) >= newest)
+def _is_shuffled(t: Array, row: int, newest: float) -> bool:
+    """Whether rows about one that is behind the ``newest`` time before it are in disorder, and one after it is newer.
+
+    Of a clock that was set back there are twice as many rows in the time that it goes through again.
+    """
+    about = t[max(row - 2 * STRAY, 0) : row + 2 * STRAY + 1]
+    again = np.count_nonzero((about >= t[row]) & (about <= newest))
+    return bool(about[min(row, 2 * STRAY) :].max() >= newest and again <= 1.5 * (newest - t[row]) / _usual(t) + 2)
 
 
 def _of_one_clock(t: Array, heard: tuple[float, float] | None) -> Mask:

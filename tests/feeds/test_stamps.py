@@ -108,6 +108,15 @@ def test_rows_that_are_shuffled_are_put_in_order() -> None:
     assert len(notes) == 1
 
 
+@pytest.mark.parametrize(("rate_hz", "back_s"), [(1.0, 10.0), (1.0, 12.0), (0.5, 20.0), (10.0, 1.0)])
+def test_a_slow_clock_that_is_set_back_is_not_shuffled(rate_hz: float, back_s: float) -> None:
+    stamps = np.arange(400) / rate_hz
+    notes: list[str] = []
+    _, rows = ordered("gnss", stamps - np.where(np.arange(400) >= 250, back_s, 0.0), notes)
+    assert np.array_equal(rows, np.arange(250))
+    assert isinstance(notes[0], Loss)
+
+
 @pytest.mark.parametrize("begins", [-3.0, 3.0])
 def test_a_clock_that_is_set_back_is_not_one_that_began_anew(begins: float) -> None:
     """By nearly the size of a counter, or with a return to where it was."""

@@ -295,10 +295,11 @@ def test_what_happens_in_a_gap_is_claimed_however_increments_are_cut(gap_s):
 
 
 @pytest.mark.parametrize("size", [77, 5000])
-def test_after_a_long_gap_the_level_is_found_anew(size):
+@pytest.mark.parametrize(("begins", "ends"), [(8.0, 18.0), (8.02, 11.98), (8.5, 12.3), (8.05, 12.02)])
+def test_after_a_long_gap_the_level_is_found_anew(begins, ends, size):
     """Held on were the rates of a moment; corrected by no more than equation 10 allows, a tilt of 80 deg stayed."""
     increments = imu(level_flight(), 1)
-    first, stop = round(8 / DT), round(18 / DT)
+    first, stop = round(begins / DT), round(ends / DT)
     increments.dtheta[first - 1] = np.array([0.3, -0.2, 0.1]) * increments.dt[first - 1]
     increments.dtheta[first:stop] = increments.dv[first:stop] = math.nan
     filter_, found = Ahrs(PAPER), []
@@ -306,7 +307,7 @@ def test_after_a_long_gap_the_level_is_found_anew(size):
         filter_.propagate(cut(increments, slice(start, start + size)))
         found.append(filter_.estimate())
     if size < 5000:
-        assert any(np.isnan(one.q_nb).all() for one in found if 13 < one.t < 18)
+        assert any(np.isnan(one.q_nb).all() for one in found)
         assert not any(np.isnan(one.q_nb).any() for one in found if one.t > 23)
     tilt = Rotation.from_quat(found[-1].q_nb, scalar_first=True).apply([0, 0, 1])[2]
     assert math.degrees(math.acos(tilt)) < 2.0

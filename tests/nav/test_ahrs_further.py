@@ -79,7 +79,7 @@ def test_a_step_against_dense_matrices():
         turned,
         x,
         P,
-        (T, 0.9, 180, 0.0, 0.0),
+        (T, 0.9, 180, 0.0, 0.0, 0.0),
         0.3,
     )
     earth_n = np.array([math.cos(PAPER.lat), 0.0, -math.sin(PAPER.lat)]) * OMEGA_IE
