@@ -24,7 +24,7 @@ from nav.aids.barometer import PRESSURE_LIMITS, barometer, thinness
 from nav.aids.base import Kind, PlainAid, well_within
 from nav.aids.gnss import gnss_position, gnss_velocity, is_whole, white
 from nav.aids.magnetometer import FIELD_LIMITS, magnetometer
-from nav.columns import Estimates, FusedReports, Reported, Told
+from nav.columns import Estimated, Estimates, FusedReports, Reported
 from nav.detection import whiten
 from nav.earth import pressure_altitude
 from nav.error_model import Indices
@@ -140,12 +140,12 @@ class Batch:
                     kinds.append([plain[0], len(aid.parts), *starts, *[-1] * (5 - len(starts)), filter_.row])
                     told.append([*plain[1], *[0.0] * (LIMITS + 2 - len(plain[1]))])
         self._first = np.array(first, np.int64)
-        self._kinds, self._told = np.array(kinds, np.int64).reshape(-1, 8), np.array(told).reshape(-1, LIMITS + 2)
+        self._kinds, self._models = np.array(kinds, np.int64).reshape(-1, 8), np.array(told).reshape(-1, LIMITS + 2)
         self._wholes = np.empty((0, 0))  # states on the way to estimates, many times as long as these: used again
 
     def take(
         self, taker: Taker, state: State, last_bad: float, last_fix: float, steps: Steps, ahead: Increments,
-        reports: Reported, estimates: Told,
+        reports: Reported, estimates: Estimated,
     ) -> tuple[int, float]:  # fmt: skip
         """Take the next of ``steps`` as far as they are plain; how many, and when an increment was not usable last.
 
@@ -163,7 +163,7 @@ class Batch:
         done = Done(
             *follow(
                 state.whole, common, filters, n, *self._reference.moving, imu.t, imu.dt, imu.dtheta, imu.dv, ahead.next,
-                ahead.t, ahead.longest, last_bad, plan, self._kinds, self._told, self._reference.field,
+                ahead.t, ahead.longest, last_bad, plan, self._kinds, self._models, self._reference.field,
                 self._filters[0].closed, len(self._filters), taker.realignment.since, told, wholes, when,
             )
         )  # fmt: skip
@@ -206,7 +206,7 @@ class Batch:
         step, part = rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64)
         what = plan[step, WHAT].astype(np.int64)
         t, nis, statistic = plan[step, TIME], rows[:, 2].copy(), rows[:, 3]
-        kind, limit = self._first[what] + part, self._told[what, LIMITS + part]
+        kind, limit = self._first[what] + part, self._models[what, LIMITS + part]
         for number, (sensor, name, _) in enumerate(self._parts):
             monitor = self._aids[sensor][2].monitors.get((sensor, name))
             if monitor is not None:
@@ -224,7 +224,7 @@ class Batch:
         for sensor, (row, _, filter_) in self._aids.items():
             limits = filter_.limits(sensor)
             if limits is not None:
-                self._told[row, LIMITS : LIMITS + len(limits)] = limits
+                self._models[row, LIMITS : LIMITS + len(limits)] = limits
                 known[row] = True
         return known
 

@@ -223,7 +223,7 @@ def _status(number: int) -> Status:
     return Status(number)
 
 
-Told: TypeAlias = list[Estimate | Estimates]  # on the way, one at a time or several
+Estimated: TypeAlias = list[Estimate | Estimates]  # on the way, one at a time or several
 Reported: TypeAlias = list[UpdateReport | FusedReports]
 _NUMBERS = ("t", "lat", "lon", "h", "status")
 _EMPTY: dict[str, Any] = dict.fromkeys(("t", "lat", "lon", "h"), np.empty(0)) | {

@@ -21,7 +21,7 @@ from nav.aids import Aid, GnssAid, MagnetometerAid
 from nav.aids.base import OUTSIDE, Measurement, Ruling, refusals, report_on, without_position
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
-from nav.columns import Estimates, Reported, Told
+from nav.columns import Estimated, Estimates, Reported
 from nav.detection import ChiSquareGate, chi_square_threshold, whiten
 from nav.doubts import Doubts
 from nav.error_model import MOTION, POS, VEL
@@ -215,7 +215,7 @@ class Federated:
         """Whether it takes many steps at once."""
         return self._state is not None and self.config.weighting == "none" and not self._reference.scalings
 
-    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self.realignment.under_way or self._doubts.off.any():
             return 0

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol, cast
 
-from nav.columns import Estimates, Reported, Reports, Told
+from nav.columns import Estimated, Estimates, Reported, Reports
 from nav.increments import COINCIDENT, Increments, Steps, joined, share_of
 from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
@@ -63,7 +63,7 @@ class TakesSteps(Protocol):
         """Whether it does so now: as long as it does it listens, and accepts the same sensors."""
         ...
 
-    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """How many of the next ``steps`` it took, zero when the next of them must be taken by itself."""
         ...
 
@@ -109,7 +109,7 @@ class FusionHorizon:
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
             self._ahead.append(ready)
         reports: Reported = []
-        estimates: Told = []
+        estimates: Estimated = []
         estimator = self.estimator
         if getattr(estimator, "in_steps", False) and self._ahead.next:
             self._take(cast(TakesSteps, estimator), times, reports, estimates)
@@ -146,7 +146,7 @@ class FusionHorizon:
             front = joined(front, share_of(last, further / last.dt[0], t))
         return self.estimator.predict(front)
 
-    def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Told) -> None:
+    def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Estimated) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         lag = self.lag_s if self.estimator.listening else 0.0
         queue, accepts, due = self._queue, self.estimator.accepts, 0
@@ -170,7 +170,7 @@ class FusionHorizon:
                 self._go(steps, reports, estimates)
             steps.next += max(taken, 1)
 
-    def _go(self, steps: Steps, reports: Reported, estimates: Told) -> None:
+    def _go(self, steps: Steps, reports: Reported, estimates: Estimated) -> None:
         """Take one step by itself."""
         t, horizon, sample = steps.t[steps.next], steps.horizon[steps.next], steps.samples[steps.next]
         if sample is not None:

@@ -21,7 +21,7 @@ from nav.aids.gnss import has_velocity
 from nav.aids.terrain import TERRAIN
 from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
-from nav.columns import Estimates, Reported, Told
+from nav.columns import Estimated, Estimates, Reported
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
 from nav.doubts import RULINGS, WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
@@ -200,7 +200,7 @@ class Ins:
         """Whether it takes many steps at once."""
         return self._takes_steps and self._state is not None
 
-    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         if self._state is None or self.realignment.under_way or self._doubt.any() or self._wind_doubt.pending:
             return 0

@@ -25,7 +25,7 @@ _SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
 
 _left: list[Callable[[], str]] = []  # what the contexts that are open leave behind, the innermost last
 _last: list[Callable[[], object]] = []  # what is to be done though no context is left in order
-_told = False
+_announced = False
 _held = False
 _waiting: list[int] = []  # signals that came in the meantime
 
@@ -163,8 +163,8 @@ def lastly(do: Callable[[], object]) -> Iterator[None]:
 
 
 def _tell() -> None:
-    global _told
-    _told = True
+    global _announced
+    _announced = True
     what = _left[-1]() if _left else ""
     print(f"testbed: interrupted{': ' if what else ''}{what}", file=sys.stderr, flush=True)
 
@@ -181,7 +181,7 @@ def _watch(heard: int) -> None:
             do()
     if sys.stderr.isatty():
         print(end=_SHOW_CURSOR, file=sys.stderr)
-    if not _told:
+    if not _announced:
         with suppress(Exception):
             _tell()
     os._exit(128 + number[0])

@@ -27,7 +27,7 @@ from nav.ahrs.state import (
     fresh,
     propagate,
 )
-from nav.columns import Estimates, FusedReports, Reported, Told
+from nav.columns import Estimated, Estimates, FusedReports, Reported
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
 from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Steps
@@ -155,7 +155,7 @@ class Ahrs:
         """Whether it takes many steps at once: it has an attitude, and levels as usual."""
         return self.aligned and self._usual
 
-    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Told) -> int:
+    def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
         s, imu, plan = self._state, ahead.imu, self._plan(steps)
         if s is None or not s.levelled or not len(plan):

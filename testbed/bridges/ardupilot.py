@@ -9,10 +9,10 @@ magnetometer and barometer of its own; our fixes can go to its MAVLink beside (`
 to fly: then from its first throttle above `STARTED_US` on channels 1 to 4 are aileron, elevator, throttle and rudder, a
 packet old when they move.
 
-Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.told`), once they are asked to
-speak. ArduPilot's clock is that of the lines: the sum of the differences of their stamps. One that is not armed takes
-itself for landed, and has no position without fixes: so one that does not fly is armed there, by force, once it has
-said where it is.
+Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.vehicle`), once they are asked
+to speak. ArduPilot's clock is that of the lines: the sum of the differences of their stamps. One that is not armed
+takes itself for landed, and has no position without fixes: so one that does not fly is armed there, by force, once it
+has said where it is.
 
 A packet that comes again, as ArduPilot's do after a second without an answer, is answered again by the same line;
 earlier frames and what is no such packet are passed over. A first frame after others, none within ``answer_s``, or
@@ -120,9 +120,9 @@ class ArduPilot:
         asks = t >= self._ask_due
         for one in self._ears.values():
             one.listen(SYSTEM)
-            if asks and not one.told.moving:
+            if asks and not one.state.moving:
                 one.ask(SYSTEM)
-            elif asks and not (one.told.armed or self.flies):
+            elif asks and not (one.state.armed or self.flies):
                 one.arm_ardupilot(SYSTEM)
         self._ask_due = t + ASK_S if asks else self._ask_due
 
@@ -130,7 +130,7 @@ class ArduPilot:
         """What ArduPilot said over the whole run of its own motion."""
         for one in self._ears.values():
             one.listen(SYSTEM, LAST_S)
-        return {name: Estimates.of(one.told.estimates(times, 0.0)) for name, one in self._ears.items()}
+        return {name: Estimates.of(one.state.estimates(times, 0.0)) for name, one in self._ears.items()}
 
     def close(self) -> None:
         """Close the port, the link for fixes, and where its estimators are heard."""

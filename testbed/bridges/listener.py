@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from testbed.bridges.address import address, bound
 from testbed.mavlink.encode import Encoder
 from testbed.mavlink.orders import armed, asked, typed
-from testbed.mavlink.told import Told
+from testbed.mavlink.vehicle import VehicleState
 
 DEFAULT = "udpin:127.0.0.1:14540"
 MOST_DATAGRAMS = 10_000  # heard at once
@@ -22,7 +22,7 @@ class Listener:
     """Hears at a UDP address; ``told`` is what came of it. Raises UserError when the address is none, or is taken."""
 
     def __init__(self, url: str) -> None:
-        self.told = Told()
+        self.state = VehicleState()
         self._encoder = Encoder(system=STATION)
         self._speaker: tuple[str, int] | None = None
         self._socket = bound(url, address(url, "udpin", DEFAULT), socket.SOCK_DGRAM)
@@ -36,7 +36,7 @@ class Listener:
                 datagram, speaker = self._socket.recvfrom(65536)
             except OSError:  # there is no more
                 return
-            if self.told.hear(datagram, system):
+            if self.state.hear(datagram, system):
                 self._speaker = speaker
 
     def arm_px4(self, system: int) -> None:

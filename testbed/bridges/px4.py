@@ -7,10 +7,10 @@ again and again, in real time, and the run waits at its beginning. So stamps are
 took; what else is sent depends on the run alone. What PX4 answers moves nothing here, unless it is to fly: then from
 when it is armed its outputs 1 to 4 are aileron, elevator, throttle and rudder, positive to the right, up, on, right.
 
-Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.told`). PX4's clock is that of
-the stamps it is sent, from the first of them on. PX4 takes itself for landed until it is armed, and its estimator then
-uses neither airspeed nor sideslip: so one that does not fly is armed there, by force, once it has said where it is.
-Armed before, it would terminate its flight, and a PX4 that has done so has no outputs to answer with.
+Its estimators of ``estimators``, names and addresses, are heard there (`testbed.mavlink.vehicle`). PX4's clock is that
+of the stamps it is sent, from the first of them on. PX4 takes itself for landed until it is armed, and its estimator
+then uses neither airspeed nor sideslip: so one that does not fly is armed there, by force, once it has said where it
+is. Armed before, it would terminate its flight, and a PX4 that has done so has no outputs to answer with.
 
 * Samples are those of the scenario with all their errors; of several units of a kind, the first, but all receivers.
 * Answers to earlier steps are passed over; a later one, none within ``answer_s``, more than `MOST_BYTES` without the
@@ -121,7 +121,7 @@ class Px4:
                     self._await(stamp, step.t)
         for one in self._ears.values():
             one.listen(self._system)
-            if one.told.placed and not (self.armed or self.flies) and turn.reference.t[-1] >= self._arm_due:
+            if one.state.placed and not (self.armed or self.flies) and turn.reference.t[-1] >= self._arm_due:
                 self._arm_due = float(turn.reference.t[-1]) + ARM_S
                 one.arm_px4(self._system)
 
@@ -130,7 +130,7 @@ class Px4:
         boot = (self._first_us - (self._offset_us or 0)) / 1e6
         for one in self._ears.values():
             one.listen(self._system, LAST_S)
-        return {name: Estimates.of(one.told.estimates(times, boot)) for name, one in self._ears.items()}
+        return {name: Estimates.of(one.state.estimates(times, boot)) for name, one in self._ears.items()}
 
     def close(self) -> None:
         """Close the connections."""

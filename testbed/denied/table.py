@@ -96,7 +96,7 @@ WEATHERS = (
         "walk_mps_per_sqrt_s = 0.02, front = {{ time_s = {front}, width_s = 60, from_deg = 310, speed_mps = 10 }}",
     ),
 )
-AIDS = (
+AIDINGS = (
     Aids("air_data", "air data"),
     Aids("flow", "flow and range", '[sensors.optical_flow]\ngrade = "camera"\n[sensors.rangefinder]\ngrade = "radar"'),
     Aids("terrain", "air data and height over hills", '[sensors.rangefinder]\ngrade = "radar"', route=HILLS),
@@ -207,7 +207,7 @@ class Table:
     """
 
     weathers: Sequence[Weather] = WEATHERS
-    aids: Sequence[Aids] = AIDS
+    aids: Sequence[Aids] = AIDINGS
     grades: Sequence[Grade] = GRADES
     marks_s: Sequence[int] = (60, 120, 600, LONGEST_S)
     draws: int = 20

@@ -32,7 +32,7 @@ from testbed.schema import Heading, Section
 from testbed.sensors import SensorConfig, geomagnetic_field_n
 from testbed.sensors.magnetometer import MagnetometerConfig
 
-AIDS = frozenset({"barometer", "magnetometer", "airspeed"})
+USABLE_AIDS = frozenset({"barometer", "magnetometer", "airspeed"})
 FIELD_ERROR = 1.4e-7  # of the model of it [T]: `geomagnetic_field_n`
 LEVELLING_FORCE = 0.3  # what light turbulence leaves of a second's mean horizontal specific force [m/s^2]
 IRON_TURN_S = 15.0  # how long iron pulls the heading the same way, turning at 0.06 rad/s: so much more than noise
@@ -118,7 +118,7 @@ class AhrsSection(EstimatorSection):
                 if key in self.model_fields_set:
                     yield (key,), 'says how profile "jiang2021" levels: leave it out, or the profile "any_motion"'
         yield from super().mistakes(sensors)
-        yield from aid_mistakes("ahrs", self.aids, sensors, AIDS, own=False)
+        yield from aid_mistakes("ahrs", self.aids, sensors, USABLE_AIDS, own=False)
         yield from second_of_a_kind("ahrs", self.aids, sensors)
 
 

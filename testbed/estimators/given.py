@@ -41,19 +41,19 @@ class Given:
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
-        self._told = [0.0]  # times that it knows before the first increment
+        self._reached = [0.0]  # times that it knows before the first increment
         self._innovations: dict[str, int] = {}  # by aid
         self._states: dict[str, int] = {}
 
     def handed(self, t: float) -> None:
         """Before the first increment a sample of ``t`` [s] is handed over."""
         if math.isfinite(t):
-            self._told = [min(t, *self._told), max(t, *self._told)]
+            self._reached = [min(t, *self._reached), max(t, *self._reached)]
 
     def estimate(self, given: Any, method: str, t: float) -> Estimate:
         """What a method gave as an estimate at ``t`` [s], NaN before the first increment. Raises Unfit."""
         if not isinstance(given, Estimate):
-            raise Unfit(f"{method} gave {_told(given)}, not a nav.samples.Estimate")
+            raise Unfit(f"{method} gave {_described(given)}, not a nav.samples.Estimate")
         changes: dict[str, Any] = {}
         for name in NUMBERS:
             value = getattr(given, name)
@@ -88,7 +88,7 @@ class Given:
     def _require_time(self, own: float, method: str, t: float) -> None:
         """Raises Unfit of an estimate of another time than ``t`` [s], NaN before the first increment."""
         begun, tick_s = not math.isnan(t), self._tick_s * (1 + LENGTH)
-        known = [t] if begun else self._told
+        known = [t] if begun else self._reached
         if own < min(known) - tick_s or own > max(known) + tick_s:  # false for NaN
             when = f"not of {t:.10g} s, the end of the last increment"
             early = "before the first increment: there its t is nan, 0, or that of a sample"
@@ -99,11 +99,11 @@ class Given:
         if isinstance(given, UpdateReport):
             return [self._report(given, f"{method}: a report's", t)]
         if not isinstance(given, Iterable) or isinstance(given, str):
-            raise Unfit(f"{method} gave {_told(given)}, not a list of reports")
+            raise Unfit(f"{method} gave {_described(given)}, not a list of reports")
         reports = []
         for one in given:
             if not isinstance(one, UpdateReport):
-                raise Unfit(f"{method} gave a list with {_told(one)} in it, not a nav.samples.UpdateReport")
+                raise Unfit(f"{method} gave a list with {_described(one)} in it, not a nav.samples.UpdateReport")
             reports.append(self._report(one, f"{method}: a report's", t))
         return reports
 
@@ -119,7 +119,7 @@ class Given:
             raise Unfit(f"{of} t is {changes['t']:.10g} s, where the run is at {until:.10g} s: give that of the sample")
         for name in ("sensor", "reason"):
             if not _is_text(getattr(given, name)):
-                raise Unfit(f"{of} {name} is {_told(getattr(given, name))}, not a text")
+                raise Unfit(f"{of} {name} is {_described(getattr(given, name))}, not a text")
         _require_name(given.aid, f"{of} aid")
         if given.aid in DIMENSIONS:
             raise Unfit(f"{of} aid can't be called {given.aid}: the record has {given.aid} already")
@@ -135,19 +135,19 @@ class Given:
         try:
             changes["outcome"] = Outcome(given.outcome)
         except ValueError:
-            raise Unfit(f"{of} outcome is {_told(given.outcome)}, not a nav.samples.Outcome") from None
+            raise Unfit(f"{of} outcome is {_described(given.outcome)}, not a nav.samples.Outcome") from None
         return dataclasses.replace(given, **changes)
 
     def _extra(self, given: Any, what: str) -> dict[str, tuple[Array, Array]]:
         if not isinstance(given, Mapping):
-            raise Unfit(f"{what} is {_told(given)}, not further states by name")
+            raise Unfit(f"{what} is {_described(given)}, not further states by name")
         states = {}
         for name, pair in given.items():
             if name not in self._states:
                 self._require_free(name, what)
             own = f"{what}: {name}"
             if not (isinstance(pair, tuple | list) or np.ndim(pair) > 1) or len(pair) != 2:
-                raise Unfit(f"{own} is {_told(pair)}, not (value, sigma)")
+                raise Unfit(f"{own} is {_described(pair)}, not (value, sigma)")
             value, sigma = (_array(one, f"{own}, {part}") for one, part in zip(pair, ("value", "sigma"), strict=True))
             if value.ndim != 1 or not len(value):
                 raise Unfit(f"{own}, value has shape {value.shape}, not (k,)")
@@ -175,7 +175,7 @@ def _number(value: Any, what: str) -> float:
     if isinstance(value, np.ndarray) and not value.ndim:
         value = value[()]
     if not isinstance(value, Real) or isinstance(value, bool):
-        raise Unfit(f"{what} is {_told(value)}, not a number")
+        raise Unfit(f"{what} is {_described(value)}, not a number")
     return float(value)
 
 
@@ -185,9 +185,9 @@ def _array(value: Any, what: str) -> Array:
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths
-        raise Unfit(f"{what} is {_told(value)}, not an array of numbers") from None
+        raise Unfit(f"{what} is {_described(value)}, not an array of numbers") from None
     if array.dtype.kind not in "fiu" and array.size:
-        raise Unfit(f"{what} is {_told(value)}, not an array of real numbers")
+        raise Unfit(f"{what} is {_described(value)}, not an array of real numbers")
     numbers: Array = array.astype(float)
     numbers[np.ma.getmaskarray(value)] = np.nan
     return numbers
@@ -202,14 +202,14 @@ def _is_symmetric(covariance: Array) -> bool:
 
 def _status(value: Any, what: str) -> Status:
     if not isinstance(value, Integral) or not 0 <= int(value) <= ALL:
-        raise Unfit(f"{what} is {_told(value)}, not a nav.samples.Status")
+        raise Unfit(f"{what} is {_described(value)}, not a nav.samples.Status")
     return Status(int(value))
 
 
 def _require_name(name: Any, what: str) -> None:
     """Raises Unfit when a group or a column of the record can't be called so."""
     if not plugins.can_be_name(name):
-        raise Unfit(f"{what} is {_told(name)}, not a text that can be a name: no slash, no control character")
+        raise Unfit(f"{what} is {_described(name)}, not a text that can be a name: no slash, no control character")
 
 
 def _require_length(lengths: dict[str, int], name: str, length: int, what: str) -> None:
@@ -225,7 +225,7 @@ def _is_text(value: Any) -> bool:
         return False
 
 
-def _told(value: Any) -> str:
+def _described(value: Any) -> str:
     """What something is, in a few words."""
     if value is None or isinstance(value, int | float | np.number):
         return str(value)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any
 
 from nav import _jit
 from nav.ahrs.steps import advance
@@ -36,7 +36,6 @@ BUILT_IN: Mapping[str, Kind] = {
     "px4": Kind(outside.Px4Section, outside.build),
     "ardupilot": Kind(outside.ArduPilotSection, outside.build),
 }
-Build: TypeAlias = Callable[[Sequence[EstimatorSection], Rig], dict[str, Lane]]  # as `build`
 CUSTOM = Kind(custom.CustomSection, custom.build)
 
 

@@ -47,7 +47,7 @@ USABLE_EAS = 8.0  # from which speed on EKF2 is to take the airspeed [m/s]
 SLOWEST_DELAY_MS = 200.0  # EKF2 keeps samples for so long by itself
 
 # Topics of what became of an aid, which of its components, and whether it points up where PX4's points down.
-AIDS = (
+AID_TOPICS = (
     ("estimator_aid_src_gnss_pos", "gnss_position", slice(0, 2), False),
     ("estimator_aid_src_gnss_hgt", "gnss_position", slice(2, 3), False),
     ("estimator_aid_src_gnss_vel", "gnss_velocity", slice(0, 3), False),
@@ -269,7 +269,7 @@ def _states(view: View, own: Columns) -> dict[str, dict[str, Any]]:
 
 def _innovations(view: View, version: str) -> Iterator[Topic]:
     for k, estimator in enumerate(view.estimators):
-        for topic, aid, part, up in AIDS:
+        for topic, aid, part, up in AID_TOPICS:
             own = view.reports(estimator, aid)
             if "innovation" not in own:
                 continue

@@ -36,7 +36,10 @@ NOISE_MARGIN, BIAS_SIGMAS = 2.0, 3.0  # a part is of a grade with so much of its
 DIGITS = 3
 MOST_RTK_CLAIM = 0.05  # level [m]
 UNSURE = {"latency_sigma_s": RECEIVERS["u-blox-m8"]["latency_sigma_s"]}
-AIDS = {"ins": ("gnss", "barometer", "airspeed", "magnetometer"), "ahrs": ("magnetometer", "barometer", "airspeed")}
+USUAL_AIDS = {
+    "ins": ("gnss", "barometer", "airspeed", "magnetometer"),
+    "ahrs": ("magnetometer", "barometer", "airspeed"),
+}
 ROWS_HZ, RECORD_HZ = 100.0, 10.0
 SHORTEST_S = 0.1  # of a run; one that begins after the log's end is refused when it is run
 # A place for a log that has none, so that its scenario runs: an AHRS needs gravity and declination.
@@ -175,9 +178,9 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     for name, keys in own.items():
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
     main = next(iter(log.imus))
-    for kind in AIDS:
+    for kind in USUAL_AIDS:
         if kind != "ins" or log.receiver is not None:
-            used = [first[one] for one in AIDS[kind] if one in first]
+            used = [first[one] for one in USUAL_AIDS[kind] if one in first]
             lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
             lines.append(f"aids = {_inline(used)}")
             lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was

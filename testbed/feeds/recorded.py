@@ -129,7 +129,7 @@ class Recorded:
         self._start = log.t0 + truth.start_s
         self._imus = _increments(scenario, log, self._start)
         self._samples = {
-            name: _told(section, log, name, self._start)
+            name: _samples_of(section, log, name, self._start)
             for name, section in scenario.sensors.items()
             if not isinstance(section, ImuConfig)
         }
@@ -147,7 +147,7 @@ class Recorded:
         self.receptions = {name: Reception(one) for name, one in sections.items() if isinstance(one, GnssConfig)}
         self._denied = {name: one.denied for name, one in sections.items() if isinstance(one, InterruptedTiming)}
         self.faults = Faults(scenario.fault, sections, seed)
-        self._told = False
+        self._remarked = False
         doubt = log.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
@@ -174,8 +174,8 @@ class Recorded:
 
     def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
         """What was odd with the log, once."""
-        told, self._told = self._told, True
-        return [] if told else [(0.0, "info", f"log: {note}") for note in self.notes]
+        remarked, self._remarked = self._remarked, True
+        return [] if remarked else [(0.0, "info", f"log: {note}") for note in self.notes]
 
     def remark(self) -> str:
         """Whether what errors are against contradicts the receiver, and what much of the log was left out for."""
@@ -200,7 +200,7 @@ class Recorded:
             return NOBODY if solution is None else replace(solution, t=solution.t - self._start)
         else:
             section = sections.get(receiver, GnssConfig.model_validate({}))
-            told = self._samples.get(receiver) or _told(section, log, receiver, self._start)
+            told = self._samples.get(receiver) or _samples_of(section, log, receiver, self._start)
             found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver)
             found = _when_felt(found, section, log, receiver)
             if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
@@ -359,7 +359,7 @@ def _cut(imu: ImuSamples, after: float, until: float) -> ImuSamples:
     return ImuSamples(imu.t[rows], imu.dt[rows], imu.dtheta[rows], imu.dv[rows])
 
 
-def _told(section: Any, log: Log, name: str, start: float) -> list[Sample]:
+def _samples_of(section: Any, log: Log, name: str, start: float) -> list[Sample]:
     """The samples of one sensor in the order of their times, from the start on, with what the log leaves out.
 
     A log that has one time only tells when a sample arrived: it was valid a ``latency_s`` before.

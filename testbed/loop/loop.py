@@ -14,9 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from functools import partial
-from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 from nav.columns import Estimates
 from nav.samples import Sample, Status
@@ -25,20 +24,18 @@ from testbed.errors import UserError
 from testbed.estimators import registry
 from testbed.estimators.lane import Lane, Tracked
 from testbed.estimators.section import EstimatorSection
-from testbed.feeds.bridged import FarEnd
 from testbed.feeds.build import located, open_feed
 from testbed.feeds.feed import Feed, Turn
 from testbed.feeds.known import commanded, handed_over
+from testbed.loop.arguments import Others, Setup, require_sound, setup_of
 from testbed.loop.director import Director, Executor, Restarted
 from testbed.loop.events import EventWatch, legs_unflown, plan_flown
-from testbed.loop.links import Listeners, Progress, Publisher, shown_estimator
+from testbed.loop.links import Listeners, Progress
 from testbed.loop.rehearsal import Rehearsal
-from testbed.loop.requests import Recorded, Request
 from testbed.loop.settings import Parts
 from testbed.loop.showing import Arrivals, Backlog, Showing
 from testbed.motion.ahead import Ahead
 from testbed.motion.logged import LogTruth
-from testbed.motion.table import MotionSource
 from testbed.record.recorder import Recorder
 from testbed.results import METRICS, RECORD, held, require_own, start_anew
 from testbed.scenario import Scenario
@@ -57,7 +54,6 @@ PACED_S = 0.1  # and when it keeps to the clock, or a far end follows
 EVENTS_S = 0.1  # how often events are looked for, at times of their own: watching a run must not change its record
 REHEARSAL_S = 5.0  # that an estimator aligns in
 COLLECT_AFTER = 200_000  # objects kept
-LARGEST_SEED = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,62 +85,38 @@ def run(
     *,
     seed: int | None = None,
     out: str | Path | None = None,
-    links: Sequence[Publisher] = (),
-    shown: str | None = None,
-    realtime: float | None = None,
     progress: Callable[[Progress], None] | None = None,
-    source: MotionSource | None = None,
-    controls: Sequence[Callable[[], Sequence[Request]]] = (),
-    replay: Sequence[tuple[float, Recorded]] = (),
-    build: registry.Build = registry.build,
-    far_end: FarEnd | None = None,
+    **others: Unpack[Others],
 ) -> RunResult:
     """Fly, sense, estimate and record one scenario.
 
     ``seed`` replaces the scenario's own. With ``out`` the record goes to ``out/run.nc`` as it is made, and
-    metrics.json beside it; without, everything stays in memory. ``links`` watch the estimator ``shown``, the first
-    unless it is named, and are closed at the end, however it comes; ``realtime`` paces the run (1 = wall clock).
-    ``source`` replaces the motion, to share one flown truth between runs. Links and ``controls`` may make requests
-    (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. ``build`` makes the estimators
-    of their sections, in place of `registry.build`. A ``far_end`` is told of every turn, flies if it is to, and is
-    closed at the end; when it fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when
-    the folder can't be written, the motion can't be started, or the seed or ``shown`` is none.
+    metrics.json beside it; without, everything stays in memory. ``progress`` is told how far it is. Further arguments,
+    by name: ``links`` watch the estimator ``shown``, the first unless it is named, and are closed at the end, however
+    it comes; ``realtime`` paces the run (1 = wall clock). Links and ``controls`` may make requests
+    (`testbed.loop.requests`); ``replay`` are those of an earlier run with their times. ``source`` replaces the motion,
+    to share one flown truth between runs. A ``far_end`` is told of every turn, flies if it is to, and is closed at the
+    end; when it fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when the folder
+    can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
-    if not isinstance(scenario, Scenario):
-        raise UserError(f"run: give a Scenario, such as Scenario.load({str(scenario)!r})")
-    if not isinstance(out, str | Path | None) or out == "":
-        raise UserError(f"run: out: give a folder, not {repr(out) if isinstance(out, str) else type(out).__name__}")
-    if not all(callable(getattr(link, "publish", None)) for link in links):
-        raise UserError("run: links: give publishers, such as testbed.mavlink.MavlinkPublisher(addresses, scenario)")
-    if progress is not None and not callable(progress):
-        raise UserError(f"run: progress: give a function that is told how far it is, not {type(progress).__name__}")
+    require_sound(scenario, out, progress, others.get("links", ()))
     with ExitStack() as ending:
-        for link in links:
+        for link in others.get("links", ()):
             ending.callback(link.close)
-        if far_end is not None:
+        if (far_end := others.get("far_end")) is not None:
             ending.callback(far_end.close)
         scenario = located(scenario)
-        seed = scenario.seed if seed is None else seed
-        if not (isinstance(seed, Integral) and 0 <= seed <= LARGEST_SEED):
-            raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}, a whole number")
-        shown = shown_estimator(_own(scenario, far_end), shown) if links or shown is not None else None
-        setup = Setup(seed, None if out is None else Path(out), links, shown, progress, source, build, far_end)
-        own, helper = _own(scenario, far_end), None
-        if _leaves_to_compile(scenario, setup):
-            # From the other end: sensors, then the last estimator, while the run begins with the first.
-            others = ((), *((one,) for one in reversed(own) if registry.find(one.kind).kernel))
-            with interrupts.held():
-                helper = Rehearsal([partial(_rehearse, scenario, some, Setup(seed)) for some in others])
-                ending.callback(helper.close)
+        setup = setup_of(scenario, seed, out, progress, others)
+        helper = _helper(scenario, setup)
+        if helper is not None:
+            ending.callback(helper.close)
         if setup.out is not None:
             ending.enter_context(held(setup.out))
             require_own(setup.out, [RECORD, METRICS])
-        rate_hz = scenario.truth.rate_hz if source is None else source.rate_hz
-        asking = (*(link.requests for link in links if link.asks), *controls)
-        director = Director(asking, replay, realtime, rate_hz, source is None and far_end is None)
-        if realtime is not None and source is None:
+        director = _director(scenario, setup)
+        if setup.realtime is not None and setup.source is None:
             # The first calls load and compile, for which there is no time later.
-            _rehearse(scenario, own, Setup(seed, build=build))
+            _rehearse(scenario, setup.own(scenario), setup.seed)
             gc.collect()  # an estimator of the user's lets go of what it holds, such as a port, before it is made again
             if helper is not None:
                 helper.close()
@@ -159,13 +131,33 @@ def run(
     return RunResult(flown.dataset, results, setup.out, flown.failure, told, flown.ended)
 
 
+def _director(scenario: Scenario, setup: Setup) -> Director:
+    """Who heeds requests and the clock."""
+    rate_hz = scenario.truth.rate_hz if setup.source is None else setup.source.rate_hz
+    asking = (*(link.requests for link in setup.links if link.asks), *setup.controls)
+    may_restart = setup.source is None and setup.far_end is None
+    return Director(asking, setup.replay, setup.realtime, rate_hz, may_restart)
+
+
+def _helper(scenario: Scenario, setup: Setup) -> Rehearsal | None:
+    """A second process that compiles from the other end, where that is worth it.
+
+    Sensors come first there, then the last estimator, while the run begins with the first.
+    """
+    if not _leaves_to_compile(scenario, setup):
+        return None
+    kernels = [(one,) for one in reversed(setup.own(scenario)) if registry.find(one.kind).kernel]
+    with interrupts.held():
+        return Rehearsal([partial(_rehearse, scenario, some, setup.seed) for some in ((), *kernels)])
+
+
 def _leaves_to_compile(scenario: Scenario, setup: Setup) -> bool:
     """Whether much of what a run needs is still to be compiled, and a second process may do a part of that.
 
     That flies parts of the scenario once more: not where a filter steers, a log would be read, or anybody else's code
     would be called.
     """
-    ours = (setup.source, setup.far_end, setup.build) == (None, None, registry.build)
+    ours = setup.source is None and setup.far_end is None
     ours &= all(section.kind in BUILT_IN for section in scenario.sensors.values())
     open_loop = not isinstance(scenario.truth, LogTruth) and not scenario.autopilot.feedback.estimators
     return ours and open_loop and Ahead.possible() and not registry.is_kept(scenario.estimator)
@@ -179,24 +171,10 @@ def _own_code(scenario: Scenario) -> dict[str, str]:
     return {}
 
 
-def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], setup: Setup) -> None:
+def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], seed: int) -> None:
     """Fly the beginning of a scenario with some of its estimators, and keep nothing."""
     beginning = {"duration_s": min(REHEARSAL_S, scenario.duration_s), "estimator": tuple(estimators)}
-    _fly(scenario.model_copy(update=beginning), setup, Director((), (), None, scenario.truth.rate_hz))
-
-
-@dataclass(frozen=True, slots=True)
-class Setup:
-    """What a run is to do beside its scenario: the arguments of `run` of the same names."""
-
-    seed: int
-    out: Path | None = None
-    links: Sequence[Publisher] = ()
-    shown: str | None = None
-    progress: Callable[[Progress], None] | None = None
-    source: MotionSource | None = None
-    build: registry.Build = registry.build
-    far_end: FarEnd | None = None
+    _fly(scenario.model_copy(update=beginning), Setup(seed), Director((), (), None, scenario.truth.rate_hz))
 
 
 class _Flown(NamedTuple):
@@ -261,7 +239,7 @@ class _Passage:
         self.batch = round((alone if setup.far_end is None else PACED_S) * rate_hz)
         self.slow, self.quick = min(self.batch, round(HEARD_S * rate_hz)), False
         self.paced = min(publish or self.ticks, max(1, round(PACED_S * rate_hz)))
-        self.lanes = setup.build(_own(scenario, setup.far_end), scenario.rig(setup.seed))
+        self.lanes = registry.build(setup.own(scenario), scenario.rig(setup.seed))
         ahead = None if director.listens else (self.batch, self.ticks)
         self.feed: Feed = open_feed(scenario, setup.seed, self.lanes, setup.source, ahead, setup.far_end)
         ending.callback(self.feed.close)
@@ -308,7 +286,7 @@ class _Passage:
         self._record(turn)
         recorded = range(-self.tick % self.cadence.record, len(block), self.cadence.record)
         known = {name for name, aligned in self.watch.aligned.items() if aligned}
-        told = {name: _Told.of(tracked[name].estimates, wanted[name], name in known) for name in self.lanes}
+        told = {name: _TurnEstimates.of(tracked[name].estimates, wanted[name], name in known) for name in self.lanes}
         for name, one in told.items():
             self.recorder.estimates(name, one.of_rows(recorded))
         self._hand_out(turn, tracked, told)
@@ -348,7 +326,7 @@ class _Passage:
             self.recorder.samples(name, own)
         self.recorder.steered(turn.steered)
 
-    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], told: Mapping[str, _Told]) -> None:
+    def _hand_out(self, turn: Turn, tracked: Mapping[str, Tracked], told: Mapping[str, _TurnEstimates]) -> None:
         """The rows of a turn, with what estimators that were asked told: to who looks for events, and to links."""
         block, shown = turn.reference, self.setup.shown
         for own in turn.samples.values():
@@ -370,7 +348,7 @@ class _Passage:
         self.showing.until(self.row)
         self.told.emit(t, severity, text)
 
-    def _look(self, t: float, leg: float, told: Mapping[str, _Told], k: int) -> None:
+    def _look(self, t: float, leg: float, told: Mapping[str, _TurnEstimates], k: int) -> None:
         """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
             self._emit(*event)
@@ -417,7 +395,7 @@ class _Passage:
     def look_back(self) -> None:
         """Record what estimators say of the whole run when they look back."""
         times = [tick / self.rate_hz for tick in range(0, self.tick, self.cadence.record)]
-        for section in _own(self.scenario, self.setup.far_end):
+        for section in self.setup.own(self.scenario):
             _, *smoothed = section.recorded
             for name in smoothed:
                 self.recorder.estimates(name, Estimates.of(self.lanes[section.name].smoothed(times)))
@@ -439,7 +417,7 @@ class _Passage:
         return seconds
 
 
-class _Told(NamedTuple):
+class _TurnEstimates(NamedTuple):
     """What an estimator told in a turn, and where each row of the turn is among it; of the same, if it is news, time
     and whether it is aligned.
     """
@@ -449,7 +427,7 @@ class _Told(NamedTuple):
     news: list[tuple[float, bool]]
 
     @classmethod
-    def of(cls, estimates: Estimates, rows: Sequence[int], known: bool) -> _Told:
+    def of(cls, estimates: Estimates, rows: Sequence[int], known: bool) -> _TurnEstimates:
         """Of the ``rows`` that were wanted; that it is aligned may be ``known``."""
         aligned = (estimates.status & Status.ALIGNED).astype(bool)
         at = {row: k for k, row in enumerate(rows)}
@@ -459,8 +437,3 @@ class _Told(NamedTuple):
     def of_rows(self, rows: Sequence[int]) -> Estimates:
         """Those of some rows."""
         return self.estimates if len(rows) == len(self.at) else self.estimates[[self.at[row] for row in rows]]
-
-
-def _own(scenario: Scenario, far_end: FarEnd | None) -> tuple[EstimatorSection, ...]:
-    """The estimators that do not run in the far end."""
-    return tuple(one for one in scenario.estimator if far_end is None or one.name not in far_end.estimators)

@@ -291,18 +291,18 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
         outcome = Outcome(task, rows, result.metrics, failure, time.perf_counter() - started)
     except Exception as error:
         wall_s = time.perf_counter() - started
-        return Outcome(task, failure=_told(error), wall_s=wall_s, kept=task.folder.exists())
+        return Outcome(task, failure=_described(error), wall_s=wall_s, kept=task.folder.exists())
     if not outcome.failed:
         clear(task.folder)
         return outcome
     try:
         report.write_report(result.dataset, result.metrics, task.folder)
     except Exception as error:
-        outcome = replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_told(error)}"))))
+        outcome = replace(outcome, failure="\n".join(filter(None, (failure, f"no report: {_described(error)}"))))
     return replace(outcome, kept=True)
 
 
-def _told(error: Exception) -> str:
+def _described(error: Exception) -> str:
     """What an error says; where it comes from too, unless it is a user's mistake."""
     if isinstance(error, UserError):
         return str(error)

@@ -20,7 +20,7 @@ def require_path(what: str, given: Any, wanted: str) -> None:
 def whole(what: str, given: Any) -> int:
     """A whole number. Raises UserError where it is none."""
     if not isinstance(given, Integral) or isinstance(given, bool):
-        raise UserError(f"{what}: give a whole number, not {_told(given)}")
+        raise UserError(f"{what}: give a whole number, not {_described(given)}")
     return int(given)
 
 
@@ -43,7 +43,7 @@ def overrides(given: Any) -> Sequence[str]:
         if all(isinstance(one, str) for one in listed):
             return listed
     wanted = 'give values by key, such as {"duration_s": 60}, or a list such as ["duration_s=60"]'
-    raise UserError(f"campaign: overrides: {wanted}, not {_told(given)}")
+    raise UserError(f"campaign: overrides: {wanted}, not {_described(given)}")
 
 
 def varied(given: Any) -> dict[str, Sequence[str]]:
@@ -52,7 +52,7 @@ def varied(given: Any) -> dict[str, Sequence[str]]:
         return {}
     if not isinstance(given, Mapping):
         wanted = 'give lists of values by key, such as {"sensors.gnss.latency_s": [0, 0.2]}'
-        raise UserError(f"campaign: vary: {wanted}, not {_told(given)}")
+        raise UserError(f"campaign: vary: {wanted}, not {_described(given)}")
     return {_key("vary", key): _listed(key, listed) for key, listed in given.items()}
 
 
@@ -78,9 +78,9 @@ def _listed(key: str, given: Any) -> Sequence[str]:
 
 def _key(what: str, given: Any) -> str:
     if not isinstance(given, str):
-        raise UserError(f"campaign: {what}: a key is a text, not {_told(given)}")
+        raise UserError(f"campaign: {what}: a key is a text, not {_described(given)}")
     return given
 
 
-def _told(given: Any) -> str:
+def _described(given: Any) -> str:
     return shown(given) if isinstance(given, str | int | float) else type(given).__name__

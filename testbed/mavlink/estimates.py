@@ -301,7 +301,7 @@ def error(name: str, r: Rows) -> Fields:
 # The other estimators
 
 
-def _other(pose: Array) -> dict[str, Array]:
+def _pose(pose: Array) -> dict[str, Array]:
     roll, pitch, yaw, lat, lon, h = pose.T
     return {
         "roll": roll,
@@ -315,9 +315,9 @@ def _other(pose: Array) -> dict[str, Array]:
 
 def ahrs2(r: Rows) -> Fields:
     """The second estimator, as MAVProxy draws it on the map."""
-    return _other(r.second)
+    return _pose(r.second)
 
 
 def ahrs3(r: Rows) -> Fields:
     """The third estimator."""
-    return {**_other(r.third), "v1": 0, "v2": 0, "v3": 0, "v4": 0}
+    return {**_pose(r.third), "v1": 0, "v2": 0, "v3": 0, "v4": 0}

@@ -101,7 +101,7 @@ def drive(seed: int, series: bool = False) -> Draw:
         worse.append(other.track())
     others = {UNGATED: FIRST_TURN_S} | ({NO_COURSE: DURATION_S} if series else {})
     tracks |= {name: _track(chosen, seed, name, sensed, duration) for name, duration in others.items()}
-    wrong = {"10 times too small": _told(sensed, 1 / WRONG), "10 times too large": _told(sensed, WRONG)}
+    wrong = {"10 times too small": _misstated(sensed, 1 / WRONG), "10 times too large": _misstated(sensed, WRONG)}
     pairs = {how: [_track(chosen, seed, name, one, learned) for name in (IMPROVED, TOLD)]
              for how, one in wrong.items()} | {"too small by 4 from 350 s on": worse}  # fmt: skip
     return Draw(
@@ -118,7 +118,7 @@ def _track(chosen: Scenario, seed: int, name: str, sensed: Sensed, duration: int
     return flights.track(flights.lanes(chosen, seed)[name], sensed, t)
 
 
-def _told(sensed: Sensed, factor: float) -> Sensed:
+def _misstated(sensed: Sensed, factor: float) -> Sensed:
     """The same with a receiver that says another accuracy than it has."""
     fixes = [
         replace(fix, sigma_position_n=factor * fix.sigma_position_n, sigma_velocity_n=factor * fix.sigma_velocity_n)

@@ -197,7 +197,7 @@ def extra_state(name: str, width: int) -> Variable:
 
 
 # Unit of the innovation of each aid, and its components.
-AIDS: dict[str, tuple[str, tuple[str, ...]]] = {
+INNOVATIONS: dict[str, tuple[str, tuple[str, ...]]] = {
     "gnss_position": ("m", ("ned",)),
     "gnss_velocity": ("m/s", ("ned",)),
     "magnetometer": ("T", ("body",)),

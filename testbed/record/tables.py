@@ -16,11 +16,11 @@ from nav.columns import VECTORS, Estimates, FusedReports
 from nav.samples import Outcome, Sample, UpdateReport
 from testbed import interrupts
 from testbed.record.columns import (
-    AIDS,
     AXES,
     ESTIMATE,
     EVENT,
     FAULT,
+    INNOVATIONS,
     REPORT,
     REQUEST,
     SAMPLE,
@@ -234,7 +234,7 @@ def fused_columns(reports: FusedReports) -> tuple[Block, dict[str, Variable]]:
 
 def _innovation(aid: str, m: int) -> dict[str, Variable]:
     """What an innovation of an aid with m components is, and its covariance."""
-    unit, dims = AIDS.get(aid, ("unknown", ("component",)))
+    unit, dims = INNOVATIONS.get(aid, ("unknown", ("component",)))
     if len(AXES.get(dims[0], range(m))) != m:  # an estimator of the user's may call another thing so
         unit, dims = "unknown", ("component",)
     return {

@@ -33,12 +33,15 @@ def federation(name: str, structure: str, detector: str) -> str:
 def isolations(path: Path, begin: float, end: float) -> list[str]:
     """Parts isolated between two times."""
     lanes: dict[str, Lane] = {}
+    original = registry.build
 
     def build(*arguments):
-        lanes.update(registry.build(*arguments))
+        lanes.update(original(*arguments))
         return lanes
 
-    run(Scenario.load(path, {"truth.reference": "gnss"}), build=build)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "build", build)
+        run(Scenario.load(path, {"truth.reference": "gnss"}))
     federated = lanes["federated"].horizon.estimator
     assert isinstance(federated, Federated)
     found, before = [], {}

@@ -22,7 +22,7 @@ from testbed.data import data_dir
 from testbed.denied import benchmark, flight, goals, saved
 from testbed.denied.benchmark import Plan, Result, contestants
 from testbed.denied.flight import Outcome
-from testbed.denied.table import AIDS, CIRCLES, FULL, GRADES, QUICK, WEATHERS, Case, Contestant, Table
+from testbed.denied.table import AIDINGS, CIRCLES, FULL, GRADES, QUICK, WEATHERS, Case, Contestant, Table
 from testbed.errors import UserError
 from testbed.interrupts import Interrupted
 from testbed.report import denied as report
@@ -32,7 +32,7 @@ from testbed.score.claims import Verdict
 
 INS = (Contestant("ins", "ins"),)
 HIGHER = CIRCLES._replace(start=CIRCLES.start.replace("280", "300"))
-SMALL = Table(WEATHERS[1:2], (AIDS[0], AIDS[1]._replace(route=HIGHER)), GRADES[:1], (10, 20), draws=2, lost_s=60)
+SMALL = Table(WEATHERS[1:2], (AIDINGS[0], AIDINGS[1]._replace(route=HIGHER)), GRADES[:1], (10, 20), draws=2, lost_s=60)
 FILTERS = '''
 import numpy as np
 from nav.samples import Estimate
@@ -123,7 +123,7 @@ def test_some_aids_are_flown_longer(flown: Outcome) -> None:
     """Then the others have nothing after their own end, and goals have a time of their own."""
     table = dataclasses.replace(SMALL, judged_longest_s={"flow": 30})
     longer = flight.fly(table.judged(INS), 7)
-    shared = dataclasses.replace(table, aids=AIDS[:2])  # one route, but each flown for as long as it is asked
+    shared = dataclasses.replace(table, aids=AIDINGS[:2])  # one route, but each flown for as long as it is asked
     assert np.isfinite(flight.fly(shared.judged(INS), 7).error[1]).all()
     assert longer.t.tolist() == [0, 10, 20, 30]
     for k, lane in enumerate(longer.lanes):
@@ -225,7 +225,7 @@ def test_what_was_interrupted_ends_as_if_it_had_not_been(
 
 def test_what_goals_are_set_for_has_further_draws(made: list[tuple[str, int]], tmp_path: Path) -> None:
     """They count for the goals, and for nothing else; more draws of the whole table fly theirs whole."""
-    table = dataclasses.replace(FULL, aids=AIDS[:2], grades=GRADES[:2], marks_s=(60, 120), judged_draws=3)
+    table = dataclasses.replace(FULL, aids=AIDINGS[:2], grades=GRADES[:2], marks_s=(60, 120), judged_draws=3)
     result = benchmark.fly(Plan(table, INS, tmp_path, 5, 2), 1)
     first = result.plan.seeds.start
     assert made[6:] == [("walking", first + k) for k in (2, 3, 4, 5)]
@@ -304,7 +304,7 @@ def test_a_flight_that_fails_stops_no_other(
 def test_an_efficient_and_honest_estimator_is_found_to_be_one() -> None:
     result = whole(100)
     found = report.cells(result)
-    assert len(found) == len(WEATHERS) * len(AIDS) * len(GRADES) * 4
+    assert len(found) == len(WEATHERS) * len(AIDINGS) * len(GRADES) * 4
     efficient = [cell.efficiency.low <= 1.0 <= cell.efficiency.high for cell in found if cell.efficiency]
     honest = [cell.inside.low <= 0.95 <= cell.inside.high for cell in found if cell.inside]
     assert np.mean(efficient) > 0.88
@@ -368,7 +368,7 @@ def test_the_page_can_be_looked_around_in(tmp_path: Path) -> None:
     with browser.opened() as tab:
         tab.size(1200, 900)
         tab.open(tmp_path / REPORT, "document.documentElement.dataset.state")
-        assert tab.run("page.panels.length") == len(WEATHERS) * len(AIDS)
+        assert tab.run("page.panels.length") == len(WEATHERS) * len(AIDINGS)
         tab.run("page.setCursor(60)")
         tab.until("page.panels[0].view && page.panels[0].told.textContent.includes(' m')")
         assert tab.run("page.panels[0].values()[0][1]").endswith(": RMS")
@@ -391,11 +391,11 @@ def test_files_and_page_have_every_cell(tmp_path: Path) -> None:
     assert np.hypot(float(lines[0]["north_m"]), float(lines[0]["east_m"])) < 100
     page = report.page(result, found, claims)
     assert "`testbed denied --save --draw 5 --draws 6`" in page
-    assert sum(line.startswith(f"| {AIDS[1].name} | consumer | ") for line in page.splitlines()) == 4 * len(WEATHERS)
+    assert sum(line.startswith(f"| {AIDINGS[1].name} | consumer | ") for line in page.splitlines()) == 4 * len(WEATHERS)
     assert all(f"| {claim.verdict.value} |" in page for claim in claims["ins"])
     assert (tmp_path / "denied_ins.png").stat().st_size > 10_000
     assert [table.row_count for table in report.tables(result, found, claims)] == [
-        *[len(AIDS) * len(GRADES) * 4] * len(WEATHERS),
+        *[len(AIDINGS) * len(GRADES) * 4] * len(WEATHERS),
         len(claims["ins"]),
     ]
 
@@ -446,7 +446,7 @@ def test_the_command_shows_table_and_goals(
     assert "Constant wind: 3 draws" in ended.stdout
     assert "Goals: consumer IMU, walking wind" in ended.stdout
     scenarios = sorted((tmp_path / "out" / "scenarios").iterdir())
-    assert len(scenarios) == len(WEATHERS) * len(AIDS)
+    assert len(scenarios) == len(WEATHERS) * len(AIDINGS)
     assert Scenario.load(scenarios[0]).estimator[0].name == "ins"
 
 

@@ -12,7 +12,8 @@ import pytest
 
 from testbed import Scenario, run
 from testbed.estimators import registry
-from testbed.loop.loop import Setup, _leaves_to_compile
+from testbed.loop.arguments import Setup
+from testbed.loop.loop import _leaves_to_compile
 from testbed.loop.rehearsal import Rehearsal
 
 SCENARIO = """
@@ -142,7 +143,6 @@ def test_neither_somebody_elses_code_is_rehearsed_nor_what_a_filter_steers_nor_a
     others = scenario.model_copy(update={"sensors": scenario.sensors | mine})
     assert _leaves_to_compile(scenario, Setup(1))
     assert not _leaves_to_compile(others, Setup(1))
-    assert not _leaves_to_compile(scenario, Setup(1, build=lambda sections, rig: {}))
     assert not _leaves_to_compile(Scenario.load("closed_loop_spoofed"), Setup(1))
     assert not _leaves_to_compile(Scenario.load("recorded_flight"), Setup(1))
 

@@ -330,14 +330,14 @@ from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 from testbed.record.recorder import Recorder
 
-class Told(Recorder):
+class Announced(Recorder):
     def flush(self):
         super().flush()
         if self.path.exists():
             sys.stdout.write(f"{self._t}\\n")
             sys.stdout.flush()
 
-recorder = Told(Path(sys.argv[1]), scenario(600.0), 3)
+recorder = Announced(Path(sys.argv[1]), scenario(600.0), 3)
 truth = circle(600.0)
 print("ready", flush=True)
 import testbed.record.recorder

@@ -63,7 +63,7 @@ class _Series:
         return self.rows[self._stamps[k]]
 
 
-class Told:
+class VehicleState:
     """What one vehicle says of itself; ``armed`` is whether it is."""
 
     def __init__(self) -> None:
