@@ -63,7 +63,7 @@ OF_FAULTS: Mapping[str, str] = {
     "coverage": "share refused",
     "end_lag_s": "used again after [s]",
     "missed": "missed",
-    "isolation_correct": "most refused",
+    "isolation_correct": "isolated",
     "error_over_3sigma": "error / claimed 3 σ",
 }
 BEST_LARGE = frozenset({"coverage", "isolation_correct"})

@@ -44,7 +44,7 @@ FAULT_COLUMNS: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("detection_delay_s", "detected after [s]", "{:.1f}".format),
     ("coverage", "refused", lambda share: f"{100 * share:.3g} %"),
     ("end_lag_s", "used again after [s]", "{:.1f}".format),
-    ("isolation_correct", "most refused", lambda correct: "yes" if correct else "no"),
+    ("isolation_correct", "isolated", lambda correct: "yes" if correct else "no"),
     ("error_over_3sigma", "error / claimed 3 σ", "{:.2g}".format),
 )
 PHASES = ("with GNSS", "in the outage")

@@ -215,12 +215,12 @@ def _recorded_looks(dataset: xarray.DataTree, estimator: str) -> dict[str, Senso
 
 
 class FaultScore(NamedTuple):
-    """How a fault was detected, None when nobody looked; whether its sensor had the most alarms; and from when on an
-    alarm is the next fault's of the same sensor [s].
+    """How a fault was detected, None when nobody looked; whether its sensor was isolated, by a sustained alarm and more
+    alarms than any healthy one has; and from when on an alarm is the next fault's of the same sensor [s].
     """
 
     detection: DetectionScore | None
-    most: bool
+    isolated: bool
     until: float
 
 
@@ -240,7 +240,8 @@ def score_faults(every: Sequence[FaultTruth], looks: Mapping[str, SensorLooks]) 
         at_fault = {other.sensor for other in every if other.start < fault.end and other.end > fault.start}
         others = [detection(t, alarm, window) for name, (t, alarm, _) in looks.items() if name not in at_fault]
         most = max((other.coverage for other in others if other is not None), default=0.0)
-        found.append(FaultScore(score, score is not None and score.coverage > most, until))
+        isolated = score is not None and np.isfinite(score.sustained_delay) and score.coverage > most
+        found.append(FaultScore(score, bool(isolated), until))
     return found
 
 
@@ -250,7 +251,7 @@ def fault_scores(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[d
     looks = _recorded_looks(dataset, estimator) if every else {}
     result: dict[str, float] = {}
     spans: list[Window] = []
-    for fault, (score, most, until) in zip(every, score_faults(every, looks), strict=True):
+    for fault, (score, isolated, until) in zip(every, score_faults(every, looks), strict=True):
         if score is None:
             spans.append(fault_window(fault))
             continue
@@ -261,7 +262,7 @@ def fault_scores(dataset: xarray.DataTree, estimator: str, e: Errors) -> tuple[d
             "end_lag_s": score.end_lag,
             "coverage": score.coverage,
             "missed": score.missed,
-            "isolation_correct": most,
+            "isolation_correct": isolated,
         }
         result |= {f"{key}.{fault.name}": value for key, value in scored.items() if np.isfinite(value)}
         if not e.attitude_only:

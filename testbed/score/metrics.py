@@ -23,7 +23,8 @@ Keys are ``<estimator>.<quantity>_<statistic>_<unit>``. What they count:
   ``detection_delay_s``: from the beginning to the first alarm; ``missed``: 1 when there is none in the window;
   ``coverage``: share of the window's looks that are alarms; ``end_lag_s``: from the end until a whole sample is used
   again;
-  ``isolation_correct``: 1 when no sensor without a fault of its own has as large a share of alarms in the window;
+  ``isolation_correct``: 1 when four of five looks over 2 s, or from one on to the end of the window, are alarms, and no
+  sensor without a fault of its own has as large a share of alarms in the window;
   ``error_over_3sigma``: largest horizontal error over three times its claimed sigma, from the beginning of the fault to
   `RECOVERY_WINDOW_S` after its end: above 1 the estimator was led astray and does not know it.
 * ``false_alarms_per_look``: share of innovations that were refused though all was well, probation apart: once settled,

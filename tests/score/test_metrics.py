@@ -386,6 +386,18 @@ def test_the_wrong_sensor_is_no_isolation() -> None:
     assert metrics.compute(run)["ins.isolation_correct.jump"] == 0
 
 
+def test_single_refusals_are_no_isolation() -> None:
+    """Those of an estimator that was led away, and refuses a sample now and then."""
+    run = faulty(("jump", "gnss", 100.0, 120.0))
+    for start in (104.0, 110.0, 116.0):
+        refuse(run, "gnss_position", start, start + 1.0)
+    found = metrics.compute(run)
+    assert found["ins.coverage.jump"] == pytest.approx(0.15)
+    assert found["ins.isolation_correct.jump"] == 0
+    refuse(run, "gnss_position", 111.0, 112.0)
+    assert metrics.compute(run)["ins.isolation_correct.jump"] == 1
+
+
 @pytest.mark.ci
 def test_what_is_known_without_a_sample_is_no_wrong_sensor() -> None:
     run = faulty(("jump", "gnss", 100.0, 120.0))

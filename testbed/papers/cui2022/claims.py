@@ -76,7 +76,7 @@ def _detection(results: Sequence[Draw]) -> Iterator[Claim]:
                 floor=Floor(told_delay(fault), TOLD_TEST, exact=True),
             )  # fmt: skip
     found = (*STEPS, *SLOW)
-    right = [min(float(flown.scores[fault].most) for fault in found) for flown in _of(results, WITH_STAR)]
+    right = [min(float(flown.scores[fault].isolated) for fault in found) for flown in _of(results, WITH_STAR)]
     yield Claim("the right sensor isolated, those five", "", "yes", right, 1.0, at_least=True, statistic=HARDLY_ANY)
     back = [_longest_lag(flown, found) for flown in _of(results, WITH_STAR)]
     yield Claim("in full use again after a fault's end", "s", "", back, 3.0, statistic=NEARLY_ALL)
