@@ -29,10 +29,7 @@ class Doubts:
     """How long every position was refused, one `GnssMonitor` for each receiver, and the wind that is remembered.
 
     The filters give in when every position was refused for ``patience_s``, or when the wind that the first filter with
-    airspeed remembers speaks for the fixes.
-
-    ``off`` (9,) is by how much the latest fixes, which agree with each other, contradict the estimate; zeros where none
-    do. Receivers without velocity say nothing.
+    airspeed remembers speaks for the fixes. What fixes say until then, ``fixes``, says no receiver without velocity.
     """
 
     def __init__(self, filters: Sequence[LocalFilter], patience_s: float, limit: float) -> None:
@@ -44,12 +41,23 @@ class Doubts:
         }
         self._with_air = next((filter_ for filter_ in filters if filter_.wind_memory() is not None), filters[0])
         self._winds = self._with_air.wind_memory()
-        self.off = np.zeros(MOTION)
         self._refusals = Refusals(patience_s)  # of positions
+        self.fixes = FixDoubt()
+        self._witness = False  # of the latest fix
 
     def fused(self) -> None:
-        """A position was fused, or the filters gave in."""
+        """A position was fused."""
         self._refusals.taken()
+
+    def gave_in(self, off: Array, variance: Array, alone: bool) -> None:
+        """The filters gave in to fixes; see `FixDoubt.gave_in`."""
+        self.fixes.gave_in(self._refusals.since, off, variance, alone and not self._witness)
+        self._refusals.taken()
+
+    def readmitted(self, sample: Sample) -> None:
+        """A receiver that was isolated is used again: where it was refused up to now, if it was."""
+        if self.fixes.pending and (receiver := self._receivers.get(sample.sensor)) is not None:
+            self.fixes.gave_in(receiver.since, receiver.moved, np.zeros(3), alone=True)
 
     def trusted(self, fix: GnssSample, before: float) -> bool:
         """Whether a fix, if it is not refused, is simply used when that of the time ``before`` was."""
@@ -66,7 +74,8 @@ class Doubts:
     def overruled(self, state: State, sample: Sample, nu: Array, report: UpdateReport) -> bool:
         """Whether to believe a fix against the filters, given its innovation ``nu`` (3,) and what became of it."""
         lasting = report.weight == 0 and self._refusals.too_long(sample.t) and not self.astray(sample)
-        return self._witnessed(state, sample, nu, report.outcome) or lasting
+        self._witness = self._witnessed(state, sample, nu, report.outcome)
+        return self._witness or lasting
 
     def astray(self, sample: Sample) -> bool:
         """Whether a sample is of a receiver whose refused positions contradict its own velocities."""
@@ -84,10 +93,68 @@ class Doubts:
             self._with_air.remember_wind(self._winds, state, sample.t)
             for other in self._receivers.values():
                 other.last_fused = sample.t
-        self.off[:] = 0.0
-        if monitor.contradicted:
-            self.off[POS : POS + 3], self.off[VEL : VEL + 3] = nu, sample.v_n - state.v_n
+        self.fixes.contradict(nu, sample.v_n - state.v_n, monitor.contradicted)
         return verdict is Verdict.RECOVER and odds >= SURE
+
+
+class FixDoubt:
+    """What fixes say against a filter: those that it refuses, and where it was before it gave in to others.
+
+    A receiver that jumps and stays, its velocities as sound as before, was wrong before or is wrong now, and nothing on
+    board says which. Errors of receivers last for any time, long or short: let one in 1/T of them last longer than T.
+    Then, after T at the first place and s at the second, this one is wrong with the probability
+
+        p = (1/s) / (1/s + 1/T) = T / (T + s).
+    """
+
+    def __init__(self) -> None:
+        self._refused = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
+        self._off, self._variance = np.zeros(3), np.zeros(3)  # of this place from the first
+        self._since = self._lasted = 0.0
+
+    def begin(self, t: float) -> None:
+        """There is one place, since ``t`` [s]."""
+        self._refused[:], self._off[:], self._variance[:] = 0.0, 0.0, 0.0
+        self._since, self._lasted = t, 0.0
+
+    def contradict(self, position: Array, velocity: Array, contradicted: bool) -> None:
+        """The latest fix is off the filter by so much (3,) [m, m/s], and, with those before, ``contradicted`` it."""
+        self._refused[:] = 0.0
+        if contradicted:
+            self._refused[POS : POS + 3], self._refused[VEL : VEL + 3] = position, velocity
+
+    @property
+    def pending(self) -> bool:
+        """Whether fixes are refused that agree with each other."""
+        return bool(self._refused.any())
+
+    def gave_in(self, t: float, off: Array, variance: Array, alone: bool) -> None:
+        """Fixes are believed that lay ``off`` (3,) [m], known to a ``variance`` (3,) [m^2], and from ``t`` [s] on.
+
+        They did ``alone``, or the filter's velocity or the wind said so as well, which leaves no doubt. Nor does one
+        that has come back to the first place.
+        """
+        if not alone:
+            self.begin(t)
+            return
+        self._off += off
+        self._variance += variance
+        self._since, self._lasted = t, t - self._since
+
+    def off(self, t: Array) -> Array:
+        """By how much the motion is off or right (N, 9), see `nav.reference.spread`, at the times ``t`` (N,) [s].
+
+        That is by fixes that are refused now, or by the place before, if that is farther.
+        """
+        off = np.tile(self._refused, (len(t), 1))
+        if self._lasted > 0.0:
+            wrong = self._lasted / (self._lasted + t - self._since)
+            way = np.sqrt(np.maximum(self._off**2 - self._variance, 0.0)) * np.sign(self._off)
+            before = np.sqrt(2.0 * wrong)[:, None] * way
+            farther = np.sum(before**2, axis=1) > np.sum(self._refused[POS : POS + 3] ** 2)
+            off[farther] = 0.0
+            off[farther, POS : POS + 3] = before[farther]
+        return off
 
 
 class WindDoubt:

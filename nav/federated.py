@@ -142,7 +142,7 @@ class Federated:
         self._state, self._draft = state, state.copy()
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
         self.realignment.begin(initial.t)
-        self._doubts.off[:] = 0.0
+        self._doubts.fixes.begin(initial.t)
 
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
@@ -217,7 +217,7 @@ class Federated:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self.realignment.under_way or self._doubts.off.any():
+        if self._state is None or self.realignment.under_way or self._doubts.fixes.pending:
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._last_fused, steps, ahead, reports, estimates
@@ -249,7 +249,7 @@ class Federated:
     def told(self, wholes: Array, t: Array, status: Sequence[Status]) -> Estimates:
         """See `nav.batch.Taker`."""
         assert self._state is not None
-        return self._master.told(wholes, self._state.shape, t, status, self._doubts.off)
+        return self._master.told(wholes, self._state.shape, t, status, self._doubts.fixes.off(t))
 
     def refuse(self, sample: Sample, reason: str, outcome: Outcome = Outcome.UNSOUND) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN), as `update` would give."""
@@ -324,6 +324,8 @@ class Federated:
         decision, changed = monitor.judge(nu_judged, filter_.as_judged(part, sample, S_judged), t)
         if changed:
             self._note(t, filter_, sample.sensor, part, monitor)
+            if changed is Change.READMITTED and part == "gnss_position":
+                self._doubts.readmitted(sample)
             if changed is Change.ISOLATED:
                 if self.config.recall_s is None:
                     self._start_again(state, filter_, sample.sensor)
@@ -428,8 +430,7 @@ class Federated:
         It is the one whose own filter suspected it most of late: by its velocities, where it has some, for slow errors
         of positions make suspicions of their own.
         """
-        healthy = self._healthy()
-        against = np.zeros(len(healthy))
+        against = np.zeros(len(healthy := self._healthy()))
         if healthy.sum() >= 2:
             positions = state.P[: len(healthy), range(POS, POS + 3), range(POS, POS + 3)]  # not those of shadows
             for i in np.flatnonzero((healthy > 0) & (positions.max(axis=1) < LOST_M**2)):
@@ -454,18 +455,17 @@ class Federated:
 
     def _give_in(self, state: State, sample: Sample) -> None:
         """Believe the fixes: receivers are sound from now on, positions and velocities are given up."""
-        config = self.config
-        for filter_, local in zip(self.locals, config.locals, strict=True):
+        for filter_, local in zip(self.locals, self.config.locals, strict=True):
             for monitored in local.sensors:
                 monitors = filter_.of_sensor[monitored.aid.sensor]
                 if isinstance(monitored.aid, GnssAid) and any(w.suspect for w in monitors):
-                    filter_.monitor(monitored, config.patience)
+                    filter_.monitor(monitored, self.config.patience)
                     for part, monitor in zip(monitored.aid.parts, filter_.of_sensor[monitored.aid.sensor], strict=True):
                         self._note(sample.t, filter_, monitored.aid.sensor, part[0], monitor)
         self._widen(state, sample)
-        self._doubts.fused()
 
     def _widen(self, state: State, sample: Sample) -> None:
+        off, variance, alone = np.zeros(3), np.zeros(3), False
         filter_ = self._users[sample.sensor][0]
         aid = filter_.aids[sample.sensor]
         for part, start in (("gnss_position", POS), ("gnss_velocity", VEL)):
@@ -477,11 +477,13 @@ class Federated:
             nu, S, nis = filter_.innovate(state, measurement)
             if part == "gnss_velocity" and nis <= filter_.gate.threshold(3):
                 continue
+            off, variance, alone = (nu, np.diag(S), True) if part == "gnss_position" else (off, variance, False)
             for i, share in enumerate(np.tile(self._master.reset_shares(), self._copies)):
                 forget(state.P[i], start, (nu**2 + np.diag(S)) / share)
             if part == "gnss_velocity":
                 for local in self.locals:
                     local.forget_air(state)
+        self._doubts.gave_in(off, variance, alone)
 
     def _estimate(self, state: State | None, t: float, last_bad: float) -> Estimate:
         """The estimate at ``t`` from a ``state`` that may be changed."""
@@ -489,7 +491,7 @@ class Federated:
         if state is None:
             return nothing_known(t, status)
         self._reference.settle(state)
-        return self._master.told(state.whole[None].copy(), state.shape, np.array([t]), [status], self._doubts.off)[0]
+        return self.told(state.whole[None].copy(), np.array([t]), [status])[0]
 
     def status(self, t: float, last_bad: float) -> Status:
         """What it says of itself at ``t``; see `nav.batch.Taker`."""

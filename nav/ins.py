@@ -23,7 +23,7 @@ from nav.alignment import Alignment, InitialState
 from nav.batch import Batch
 from nav.columns import Estimated, Estimates, Reported
 from nav.detection import PROBATION_S, RECOVERY_S, ChiSquareGate, GnssMonitor, Refusals, Verdict
-from nav.doubts import RULINGS, WindDoubt
+from nav.doubts import RULINGS, FixDoubt, WindDoubt
 from nav.error_model import MOTION, POS, VEL, ImuModel
 from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
@@ -140,7 +140,7 @@ class Ins:
         }
         self._winds = self._filter.wind_memory()
         self._wind_doubt = WindDoubt(self._gate.threshold(2))
-        self._doubt = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
+        self._fix_doubt = FixDoubt()
         self._last_bad = self._last_unsound = -math.inf  # when an increment, a sample was refused as unsound last
         self._state: State | None = None
         self._alignment = Alignment.from_aids(config.imu, config.aids + config.alignment_aids, config.alignment_s)
@@ -170,7 +170,7 @@ class Ins:
         self._draft = self._state.copy()
         self.t = self._monitor.last_fused = initial.t
         self.realignment.begin(initial.t)
-        self._doubt[:] = 0.0
+        self._fix_doubt.begin(initial.t)
         self._filter.claim_as_told(self._reference, self._state)
         if self._smoother is not None:
             self._smoother.begin(self.t, self._state)
@@ -202,7 +202,7 @@ class Ins:
 
     def take(self, steps: Steps, ahead: Increments, reports: Reported, estimates: Estimated) -> int:
         """Take the next of ``steps``, as far as they are plain: see `nav.horizon.TakesSteps`."""
-        if self._state is None or self.realignment.under_way or self._doubt.any() or self._wind_doubt.pending:
+        if self._state is None or self.realignment.under_way or self._fix_doubt.pending or self._wind_doubt.pending:
             return 0
         taken, self._last_bad = self._batch.take(
             self, self._state, self._last_bad, self._monitor.last_fused, steps, ahead, reports, estimates
@@ -240,7 +240,7 @@ class Ins:
 
     def told(self, wholes: Array, t: Array, status: Sequence[Status]) -> Estimates:
         """See `nav.batch.Taker`."""
-        return self._described(wholes, t, status, self._doubt)
+        return self._described(wholes, t, status, self._fix_doubt.off(t))
 
     def accepts(self, sample: Sample) -> bool:
         """Whether the sample is of an aid, or can still serve the alignment."""
@@ -376,7 +376,7 @@ class Ins:
         if self._smoother is None:
             raise ValueError("this filter was not told to keep what smoothing needs: see InsConfig.smooth")
         for t, state in self._smoother.states(times):
-            yield self._described(state.whole[None].copy(), np.array([t]), [Status.ALIGNED], np.zeros(MOTION))[0]
+            yield self._described(state.whole[None].copy(), np.array([t]), [Status.ALIGNED], np.zeros((1, MOTION)))[0]
 
     def refuse(self, sample: Sample, reason: str, outcome: Outcome = Outcome.UNSOUND) -> list[UpdateReport]:
         """Reports on a sample that is not used, without innovations (NaN): one for each aid it would have served."""
@@ -423,9 +423,7 @@ class Ins:
         verdict = self._monitor.judge(fix, v_n, sigma_v, inside, odds, both)
         if verdict is not Verdict.PROBATION:
             self._filter.heard(self._reference, state, "gnss_position", sample, nis, 3)
-        self._doubt[:] = 0.0
-        if self._monitor.contradicted:
-            self._doubt[POS : POS + 3], self._doubt[VEL : VEL + 3] = nu, v_n - state.v_n
+        self._fix_doubt.contradict(nu, v_n - state.v_n, self._monitor.contradicted)
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]
@@ -464,6 +462,7 @@ class Ins:
         When velocity is off as well, it goes too, and with it wind and gusts that were estimated from it.
         """
         P = state.P[0]
+        self._fix_doubt.gave_in(self._monitor.since, nu, np.diag(S), self._monitor.unexplained)
         self._filter.claim_as_told(self._reference, state)
         off = self._filter.off(self._reference, state, aid, "gnss_velocity", sample) if use_velocity else None
         if off is not None:
@@ -478,8 +477,9 @@ class Ins:
             return nothing_known(t, status)
         self._reference.settle(state)
         self._wind_doubt.right(self._monitor.last_fused)
-        doubt = self._doubt + self._wind_doubt.off(t)
-        return self._described(state.whole[None].copy(), np.array([t]), [status], doubt)[0]
+        when = np.array([t])
+        doubt = self._fix_doubt.off(when) + self._wind_doubt.off(t)
+        return self._described(state.whole[None].copy(), when, [status], doubt)[0]
 
     def status(self, t: float, last_bad: float) -> Status:
         """What it says of itself at ``t``; see `nav.batch.Taker`."""
@@ -487,7 +487,7 @@ class Ins:
         return status | Status.BAD_SAMPLE if t - max(last_bad, self._last_unsound) <= BAD_SAMPLE_S else status
 
     def _described(self, wholes: Array, t: Array, status: Sequence[Status], doubt: Array) -> Estimates:
-        """The estimates of N settled states (N, numbers), with a ``doubt`` (9,) of their motion."""
+        """The estimates of N settled states (N, numbers), with a ``doubt`` (N, 9) of their motion."""
         assert self._state is not None
         n = self._state.shape[2]
         q_nb, v_n, lla, imu, filters, first = known(wholes, *self._state.shape)

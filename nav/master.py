@@ -99,7 +99,7 @@ class MasterFilter:
     def told(
         self, wholes: Array, shape: tuple[int, int, int], t: Array, status: Sequence[Status], off: Array
     ) -> Estimates:
-        """The estimates of settled states (N, numbers), which are changed, with a doubt ``off`` (9,) of the motion."""
+        """The estimates of settled states (N, numbers), which are changed; the motion may be ``off`` (N, 9)."""
         common, model = shape[0], self._filters[0].model
         if self._config.combination == "information" and not self._reference.scalings:
             masters = _combined(wholes, *shape, self._everyone)

@@ -324,7 +324,7 @@ def _with_drift(
 def spread(rows: Array, first: int, n: int, mounting_variance: float, off: Array) -> tuple[Array, Array]:
     """Covariances (N, 9, 9) in the order of an estimate, with the mounting's share, and 1-sigma (N, n) of every state.
 
-    A covariance (n, n) begins in each of ``rows`` at the place ``first``. The motion is off by ``off`` (9,) or right,
+    A covariance (n, n) begins in each of ``rows`` at the place ``first``. The motion is off by ``off`` (N, 9) or right,
     nobody knows which: half of its square comes on top, which is the second moment about the estimate where both are as
     likely.
     """
@@ -334,7 +334,7 @@ def spread(rows: Array, first: int, n: int, mounting_variance: float, off: Array
             a = ESTIMATE_ORDER[i]
             for j in range(MOTION):
                 b = ESTIMATE_ORDER[j]
-                covariance[k, i, j] = rows[k, first + a * n + b] + 0.5 * (off[a] * off[b])
+                covariance[k, i, j] = rows[k, first + a * n + b] + 0.5 * (off[k, a] * off[k, b])
             if a < PHI + 3:
                 covariance[k, i, i] += mounting_variance
         for i in range(n):

@@ -54,7 +54,9 @@ class GnssMonitor:
     patience_s: float
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
+    moved: Array = field(default_factory=lambda: np.zeros(3))  # by how much the streak is off the fixes before it [m]
     contradicted: bool = False  # by the latest fixes, which agree with each other and lie outside the gate
+    unexplained: bool = False  # the last recovery: nothing but the fixes speaks against the filter
     _streak_start: float = math.nan
     _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
     _heard: float = math.nan  # when the last of them was
@@ -86,15 +88,18 @@ class GnssMonitor:
             # One that stands still falls behind time and again. One that jumps, or jumps back, may be sound again.
             self._strayed = fix.t if before is not None and before @ self._jumped > 0 else -math.inf
             self._begin(fix)
+            self.moved = self._jumped
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         else:
             self._jumped = None
             if self._strays(fix, sigma_v):
                 self._begin(fix)
                 self._strayed = fix.t
+                self.moved = np.zeros(3)
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
-        wait = self._wait(odds, both)
+        alone = self._was_aided and odds < SURE and not (both and odds > -SURE)
+        wait = self.patience_s if alone else self._wait(odds)
         # a place that stands still is inside a gate that has grown wide, each time that the vehicle comes by
         comes_by = inside_gate and self.astray(fix.t) and fix.t - self.last_fused > self.outage_s
         if comes_by or (not self._was_aided and lasted < self.probation_s):
@@ -104,11 +109,18 @@ class GnssMonitor:
         else:
             verdict = Verdict.RECOVER if lasted >= wait else Verdict.REJECT
         self.contradicted = verdict is Verdict.REJECT and lasted >= self.probation_s
+        if verdict is Verdict.RECOVER:
+            self.unexplained = alone
         if verdict in (Verdict.FUSE, Verdict.RECOVER):
             self.last_fused = fix.t
             self._was_aided = True
             self._count_from(fix)
         return verdict
+
+    @property
+    def since(self) -> float:
+        """When the streak of the latest fix began [s]."""
+        return self._streak_start
 
     def sure(self, t: float, before: float) -> bool:
         """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""
@@ -124,11 +136,9 @@ class GnssMonitor:
         """Whether, of late, refused positions went elsewhere than the receiver's own velocities, at ``t`` [s]."""
         return t - self._strayed <= ASTRAY_S
 
-    def _wait(self, odds: float, both: bool) -> float:
-        """For how long fixes must agree to be believed against the filter [s]."""
-        if not self._was_aided or odds >= SURE:
-            return self.recovery_s
-        return min(LED_ASTRAY_S, self.patience_s) if both and odds > -SURE else self.patience_s
+    def _wait(self, odds: float) -> float:
+        """For how long fixes that do not stand alone must agree to be believed against the filter [s]."""
+        return self.recovery_s if not self._was_aided or odds >= SURE else min(LED_ASTRAY_S, self.patience_s)
 
     def _longest_gap(self) -> float:
         """Without fixes for longer is an outage, unless the receiver is as slow as that [s]."""

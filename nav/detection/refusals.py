@@ -20,6 +20,11 @@ class Refusals:
         """One was used."""
         self._latest = -math.inf
 
+    @property
+    def since(self) -> float:
+        """When the first of them was [s]."""
+        return self._since
+
     def too_long(self, t: float) -> bool:
         """Whether with this one, refused at ``t`` [s], patience is at its end."""
         if t - self._latest > REFUSAL_GAP_S:

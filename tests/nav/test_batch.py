@@ -83,6 +83,8 @@ def rough(increments, samples):
             change = {"lat": 1.6}
         elif within(sample, "gnss", 57, 57.3):
             change = {"v_n": np.array([0.0, 0.0, -601.0])}
+        elif within(sample, "gnss", 64, 72):
+            change = {"lat": sample.lat + 5e-5}
         elif within(sample, "barometer", 59, 59.3):
             change = {"pressure": -1.0}
         elif within(sample, "magnetometer", 61, 61.3):
@@ -154,6 +156,7 @@ def same(a, b):
         pytest.param({}, 0.0, False, marks=pytest.mark.ci),
         ({}, 0.0123, True),
         pytest.param({"covariance_period": 3}, 0.0, True, marks=pytest.mark.ci),
+        pytest.param({"patience_s": 5.0}, 0.0, True, marks=pytest.mark.ci),
         pytest.param({"aids": (*AIDS, PositionFixAid())}, 0.0, False, marks=pytest.mark.ci),
         pytest.param({"aids": AIDS[:2]}, 0.0, True, marks=pytest.mark.ci),
         pytest.param({"aids": ()}, 0.0, False, marks=pytest.mark.ci),

@@ -1,0 +1,101 @@
+"""Fixes that jump and stay: what is claimed of a filter that gave in to them, since they may be the wrong ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pymap3d
+import pytest
+from worlds.ins import CONSUMER, FIELD_N, barometer, feed, flight, gnss, imu, magnetometer
+
+from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.doubts import FixDoubt
+from nav.earth import displacement_n
+from nav.error_model import POS
+from nav.federated import Federated
+from nav.federation import Config, Local
+from nav.horizon import FusionHorizon
+from nav.ins import Ins, InsConfig
+from nav.monitor import MonitoredAid
+
+AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
+JUMPED_S, NORTH = 40.0, 300.0  # when positions jump, and by how much [s, m]
+
+
+def jumped(fix, back_s):
+    if not JUMPED_S <= fix.t < back_s:
+        return fix
+    lat, lon, h = pymap3d.ned2geodetic(NORTH, 0.0, 0.0, fix.lat, fix.lon, fix.h, deg=False)
+    return replace(fix, lat=lat, lon=lon, h=h)
+
+
+def estimator(kind):
+    if kind == "ins":
+        return Ins(InsConfig(CONSUMER, AIDS), lambda *_: FIELD_N)
+    parts = {"gnss": AIDS[:2], "field": AIDS[2:]}
+    locals_ = tuple(Local(name, tuple(MonitoredAid(aid) for aid in aids)) for name, aids in parts.items())
+    return Federated(Config(CONSUMER, locals_), lambda *_: FIELD_N)
+
+
+def flown(kind, back_s):
+    """Errors to the north and their claims [m] at each second [s]."""
+    truth, rng = flight(120.0), np.random.default_rng(56101)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    fixes = [jumped(one, back_s) for one in gnss(truth, rng, 5.0)]
+    samples = fixes + magnetometer(truth, rng) + barometer(truth, rng, 5.0)
+    estimates, _ = feed(FusionHorizon(estimator(kind)), increments, samples)
+    t = np.array([one.t for one in estimates])
+    k = np.searchsorted(truth.t, t - 1e-9)
+    errors = [
+        displacement_n(one.lat, one.lon, one.h, truth.lat[row], truth.lon[row], truth.h[row])[0]
+        for one, row in zip(estimates, k, strict=True)
+    ]
+    return t, np.array(errors), np.array([np.sqrt(one.covariance[0, 0]) for one in estimates])
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_hundreds_of_metres_are_not_claimed_as_one(kind):
+    t, error, claim = flown(kind, np.inf)
+    led = (t > JUMPED_S + 2.0) & (np.abs(error) > 100.0)
+    assert led.sum() > 40
+    assert (np.abs(error[led]) < 3.0 * claim[led]).all()
+    assert (claim[t < JUMPED_S - 1.0][10:] < 5.0).all()
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_one_that_came_back_leaves_no_doubt(kind):
+    t, error, claim = flown(kind, 85.0)
+    assert np.abs(error[(t > 75.0) & (t < 84.0)]).min() > 250.0  # it had given in
+    assert np.abs(error[-1]) < 3.0
+    assert claim[-1] < 5.0
+
+
+@pytest.mark.ci
+def test_how_likely_the_place_before_is_right():
+    """Errors that begin at any time, of which 1/T last longer than T [s], drawn; seen: 40 s, a jump, 25 s."""
+    lasted, stayed, width, rng = 40.0, 25.0, 4.0, np.random.default_rng(56102)
+    begun = rng.uniform(-4000.0, lasted + width, 8_000_000)
+    ended = begun + 1.0 / rng.uniform(size=begun.size)
+    before = ((begun < 0.0) & (np.abs(ended - lasted) < width / 2)).sum()
+    after = ((np.abs(begun - lasted) < width / 2) & (ended > lasted + stayed)).sum()
+    doubt = FixDoubt()
+    doubt.begin(0.0)
+    doubt.gave_in(lasted, np.array([10.0, 0.0, 0.0]), np.zeros(3), alone=True)
+    wrong = 0.5 * doubt.off(np.array([lasted + stayed]))[0, POS] ** 2 / 100.0
+    assert wrong == pytest.approx(after / (after + before), abs=0.03)
+
+
+def test_what_is_claimed_falls_with_time_and_is_forgotten_where_the_filter_was_wrong():
+    doubt, t = FixDoubt(), np.array([100.0, 130.0, 400.0])
+    doubt.begin(0.0)
+    assert not doubt.off(t).any()
+    doubt.gave_in(100.0, np.array([3.0, -40.0, 0.0]), np.array([25.0, 0.0, 0.0]), alone=True)
+    off = doubt.off(t)
+    assert not off[:, POS].any()  # within what is known
+    assert off[:, POS + 1] == pytest.approx(-40.0 * np.sqrt(2.0 * 100.0 / t))
+    doubt.contradict(np.array([0.0, 0.0, 90.0]), np.zeros(3), contradicted=True)
+    assert doubt.off(t)[:, POS + 2] == pytest.approx(np.full(3, 90.0))  # the larger counts
+    doubt.contradict(np.zeros(3), np.zeros(3), contradicted=False)
+    doubt.gave_in(200.0, np.array([0.0, 500.0, 0.0]), np.zeros(3), alone=False)
+    assert not doubt.off(t + 200.0).any()
