@@ -45,6 +45,10 @@ class Doubts:
         self.fixes = FixDoubt()
         self._witness = False  # of the latest fix
 
+    def begin(self, t: float) -> None:
+        """The filters begin at ``t`` [s]."""
+        self.fixes.begin(t, *self._receivers.values())
+
     def fused(self) -> None:
         """A position was fused."""
         self._refusals.taken()
@@ -53,11 +57,6 @@ class Doubts:
         """The filters gave in to fixes; see `FixDoubt.gave_in`."""
         self.fixes.gave_in(self._refusals.since, off, variance, alone and not self._witness)
         self._refusals.taken()
-
-    def readmitted(self, sample: Sample) -> None:
-        """A receiver that was isolated is used again: where it was refused up to now, if it was."""
-        if self.fixes.pending and (receiver := self._receivers.get(sample.sensor)) is not None:
-            self.fixes.gave_in(receiver.since, receiver.moved, np.zeros(3), alone=True)
 
     def trusted(self, fix: GnssSample, before: float) -> bool:
         """Whether a fix, if it is not refused, is simply used when that of the time ``before`` was."""
@@ -93,7 +92,7 @@ class Doubts:
             self._with_air.remember_wind(self._winds, state, sample.t)
             for other in self._receivers.values():
                 other.last_fused = sample.t
-        self.fixes.contradict(nu, sample.v_n - state.v_n, monitor.contradicted)
+        self.fixes.heard(nu, sample.v_n - state.v_n, monitor)
         return verdict is Verdict.RECOVER and odds >= SURE
 
 
@@ -112,15 +111,22 @@ class FixDoubt:
         self._off, self._variance = np.zeros(3), np.zeros(3)  # of this place from the first
         self._since = self._lasted = 0.0
 
-    def begin(self, t: float) -> None:
-        """There is one place, since ``t`` [s]."""
+    def begin(self, t: float, *receivers: GnssMonitor) -> None:
+        """There is one place, since ``t`` [s], or another where one of the ``receivers`` was before it jumped."""
         self._refused[:], self._off[:], self._variance[:] = 0.0, 0.0, 0.0
-        self._since, self._lasted = t, 0.0
+        before, self._since, self._lasted = self._since, t, 0.0
+        for receiver in receivers:
+            if (moved := receiver.moved) is not None:
+                self._since = before
+                self.gave_in(receiver.since, moved, np.zeros(3), alone=True)
+                return
 
-    def contradict(self, position: Array, velocity: Array, contradicted: bool) -> None:
-        """The latest fix is off the filter by so much (3,) [m, m/s], and, with those before, ``contradicted`` it."""
+    def heard(self, position: Array, velocity: Array, receiver: GnssMonitor) -> None:
+        """The latest fix of a receiver, which has judged it, is off the filter by so much (3,) [m, m/s]."""
+        if self.pending and receiver.believed is not None:  # the filter's own position became less sure than that
+            self.gave_in(receiver.since, receiver.believed, np.zeros(3), alone=True)
         self._refused[:] = 0.0
-        if contradicted:
+        if receiver.contradicted:
             self._refused[POS : POS + 3], self._refused[VEL : VEL + 3] = position, velocity
 
     @property
@@ -136,10 +142,10 @@ class FixDoubt:
         """
         if not alone:
             self.begin(t)
-            return
-        self._off += off
-        self._variance += variance
-        self._since, self._lasted = t, t - self._since
+        elif t > self._since:  # else it knows of these
+            self._off += off
+            self._variance += variance
+            self._since, self._lasted = t, t - self._since
 
     def off(self, t: Array) -> Array:
         """By how much the motion is off or right (N, 9), see `nav.reference.spread`, at the times ``t`` (N,) [s].

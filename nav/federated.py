@@ -29,7 +29,7 @@ from nav.federation import Config
 from nav.fusion import reset
 from nav.increments import Increments, Steps
 from nav.local_filter import LocalFilter
-from nav.master import LEAST_SHARE, MasterFilter, noise_shares
+from nav.master import MasterFilter, noise_shares
 from nav.monitor import Change, Isolation, Monitor, shown_limit
 from nav.realignment import Realignment
 from nav.reference import (
@@ -50,7 +50,6 @@ from nav.state import State
 from nav.weighting import InOrder, Policy, Weight
 
 CROSS_CHECK_FALSE_ALARM = 1e-7  # of a filter at a fusion
-LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
 CONTRADICTION_SHARE = 0.5  # of the largest contradiction: filters with less are not suspected of it
 
 
@@ -89,6 +88,7 @@ class Federated:
         self._last_bad = self._last_unsound = self._last_fused = -math.inf
         self._fused_at = self._remembered_at = -math.inf
         self._doubts = Doubts(self.locals, config.patience_s, gate.threshold(3))
+        self._kept: set[str] = set()  # isolated sensors of which no filter holds anything false
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
@@ -142,7 +142,8 @@ class Federated:
         self._state, self._draft = state, state.copy()
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
         self.realignment.begin(initial.t)
-        self._doubts.fixes.begin(initial.t)
+        self._doubts.begin(initial.t)
+        self._kept.clear()
 
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
@@ -324,13 +325,10 @@ class Federated:
         decision, changed = monitor.judge(nu_judged, filter_.as_judged(part, sample, S_judged), t)
         if changed:
             self._note(t, filter_, sample.sensor, part, monitor)
-            if changed is Change.READMITTED and part == "gnss_position":
-                self._doubts.readmitted(sample)
+            if changed is Change.READMITTED:
+                self._kept.discard(sample.sensor)
             if changed is Change.ISOLATED:
-                if self.config.recall_s is None:
-                    self._start_again(state, filter_, sample.sensor)
-                else:
-                    self._recall(state, filter_)
+                self._take_back(state, filter_, sample, monitor)
                 again = filter_.measure(self._reference, state, filter_.aids[sample.sensor], part, sample)
                 assert again is not None  # as there was one
                 measurement = again
@@ -368,10 +366,12 @@ class Federated:
         """Innovation and covariance of a measurement against the fused solution of the healthy filters.
 
         What its own filter knows of the sensor's error given the common states goes with it. With a recall all filters
-        are healthy: then its own was put back to what it knew before the fault.
+        are healthy: then its own was put back to what it knew before the fault. So they are where its own holds nothing
+        of the fault (`_take_back`).
         """
         everyone = np.ones(len(self.locals))
-        healthy = everyone if self.config.recall_s is not None else self._healthy()
+        kept = self.config.recall_s is not None or sample.sensor in self._kept
+        healthy = everyone if kept else self._master.sound(state)
         master = self._master.combine(state, healthy if healthy.any() else everyone)
         measurement = filter_.measure_at_nominal(self._reference, state, filter_.aids[sample.sensor], part, sample)
         assert measurement is not None
@@ -382,34 +382,21 @@ class Federated:
         change += x
         return measurement.nu - measurement.H @ change, measurement.H @ P @ measurement.H.T + np.diag(measurement.R)
 
-    def _healthy(self) -> Array:
-        """1 for each local filter without an isolated part, 0 for the others."""
-        return np.array([not any(w.suspect for w in f.monitors.values()) for f in self.locals], dtype=float)
-
     def _note(self, t: float, filter_: LocalFilter, sensor: str, part: str, monitor: Monitor) -> None:
         name = self.config.locals[filter_.row].name
         self.events.append(Isolation(t, name, sensor, part, tuple(map(bool, monitor.isolated))))
 
-    def _start_again(self, state: State, faulty: LocalFilter, sensor: str) -> None:
-        """Every filter from the fused solution of the healthy ones, so that nothing stays of what the sensor told."""
-        healthy = self._healthy()
-        if not healthy.any():
-            return
-        master = self._master.combine(state, healthy)
-        row, model = faulty.row, faulty.model
-        shares = self._master.reset_shares()
-        if self.config.combination == "information":
-            shares = np.where(healthy > 0, shares, 0.0)
-            shares = np.where(
-                healthy > 0, shares / shares.sum() * (1 - LEAST_SHARE * np.sum(healthy == 0)), LEAST_SHARE
-            )
-        for name in faulty.aids[sensor].states:
-            if name in model.slices and model.decay_rate[model.slices[name].start] > 0:
-                where = model.slices[name]
-                state.x[row, where] = 0.0
-                forget(state.P[row], where.start, model.sigma[where] ** 2)
-        for i, share in enumerate(shares):
-            self._master.reset(state, i, master.x, master.P / share)
+    def _take_back(self, state: State, faulty: LocalFilter, sample: Sample, monitor: Monitor) -> None:
+        """Take out of the filters what a sensor told that is isolated now.
+
+        That is nothing where it was far off at once, and was refused since: where others know much less they stay.
+        """
+        if monitor.sudden and self._master.rests_on(state, faulty.row):
+            self._kept.add(sample.sensor)
+        elif self.config.recall_s is None:
+            self._master.start_again(state, faulty, sample.sensor)
+        else:
+            self._recall(state, faulty)
 
     def _remember(self, state: State) -> None:
         """The younger shadows become the older ones, and the filters the younger."""
@@ -430,10 +417,9 @@ class Federated:
         It is the one whose own filter suspected it most of late: by its velocities, where it has some, for slow errors
         of positions make suspicions of their own.
         """
-        against = np.zeros(len(healthy := self._healthy()))
+        against = np.zeros(len(healthy := self._master.healthy()))
         if healthy.sum() >= 2:
-            positions = state.P[: len(healthy), range(POS, POS + 3), range(POS, POS + 3)]  # not those of shadows
-            for i in np.flatnonzero((healthy > 0) & (positions.max(axis=1) < LOST_M**2)):
+            for i in np.flatnonzero((healthy > 0) & ~self._master.lost(state)):
                 others = self._master.combine(state, np.where(np.arange(len(healthy)) == i, 0.0, healthy))
                 S = state.P[i, VEL:MOTION, VEL:MOTION] + others.P[VEL:MOTION, VEL:MOTION]
                 against[i] = whiten(state.x[i, VEL:MOTION] - others.x[VEL:MOTION], S)[1]
@@ -451,7 +437,7 @@ class Federated:
             if name == sensor:
                 monitor.isolate()
                 self._note(t, filter_, sensor, part, monitor)
-        self._start_again(state, filter_, sensor)
+        self._master.start_again(state, filter_, sensor)
 
     def _give_in(self, state: State, sample: Sample) -> None:
         """Believe the fixes: receivers are sound from now on, positions and velocities are given up."""
@@ -462,6 +448,7 @@ class Federated:
                     filter_.monitor(monitored, self.config.patience)
                     for part, monitor in zip(monitored.aid.parts, filter_.of_sensor[monitored.aid.sensor], strict=True):
                         self._note(sample.t, filter_, monitored.aid.sensor, part[0], monitor)
+        self._kept.clear()
         self._widen(state, sample)
 
     def _widen(self, state: State, sample: Sample) -> None:
@@ -478,8 +465,9 @@ class Federated:
             if part == "gnss_velocity" and nis <= filter_.gate.threshold(3):
                 continue
             off, variance, alone = (nu, np.diag(S), True) if part == "gnss_position" else (off, variance, False)
+            there = nu + state.x[filter_.row, start : start + 3]  # as another filter may be elsewhere
             for i, share in enumerate(np.tile(self._master.reset_shares(), self._copies)):
-                forget(state.P[i], start, (nu**2 + np.diag(S)) / share)
+                forget(state.P[i], start, ((there - state.x[i, start : start + 3]) ** 2 + np.diag(S)) / share)
             if part == "gnss_velocity":
                 for local in self.locals:
                     local.forget_air(state)

@@ -20,7 +20,9 @@ Faults
     again from the fused solution of those without an isolated part, P_i = P_g / beta_i: nothing of the faulty sensor
     stays in any of them, nothing is counted twice, and the Markov errors of its aid go back to their first variance.
     Filters with an isolated part get next to no share of the information, as it is lost when another part is isolated.
-    When all filters have an isolated part, they are left as they are.
+    When all filters have an isolated part, they are left as they are. So they are where the sensor was far off at once
+    (`Monitor.sudden`) and the position is known by its filter alone, which nobody contradicts: nothing of the fault was
+    used, and all would be lost with it (`nav.master.MasterFilter.rests_on`). It is then judged by all of them.
 
     When every position was refused for ``patience_s``, the filters' covariances were too small: their positions and
     velocities are given up as in `nav.ins`, and the next fixes are believed. So they are, as there, after 4 s of fixes

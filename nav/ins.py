@@ -168,9 +168,9 @@ class Ins:
         """Begin at a given state instead of aligning."""
         self._state = self._reference.start(initial, [self._alignment.names])
         self._draft = self._state.copy()
+        self._fix_doubt.begin(initial.t, self._monitor)
         self.t = self._monitor.last_fused = initial.t
         self.realignment.begin(initial.t)
-        self._fix_doubt.begin(initial.t)
         self._filter.claim_as_told(self._reference, self._state)
         if self._smoother is not None:
             self._smoother.begin(self.t, self._state)
@@ -423,7 +423,7 @@ class Ins:
         verdict = self._monitor.judge(fix, v_n, sigma_v, inside, odds, both)
         if verdict is not Verdict.PROBATION:
             self._filter.heard(self._reference, state, "gnss_position", sample, nis, 3)
-        self._fix_doubt.contradict(nu, v_n - state.v_n, self._monitor.contradicted)
+        self._fix_doubt.heard(nu, v_n - state.v_n, self._monitor)
         if verdict is Verdict.RECOVER:
             self._give_up_position(state, sample, aid, nu, S, use_velocity)
         ruling = RULINGS[verdict]

@@ -5,16 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
 from nav.columns import Estimates
+from nav.detection import chi_square_threshold, whiten
+from nav.error_model import POS
 from nav.federation import Config
 from nav.fusion import Master, blend, combine, information, reset, weights_by_covariance
 from nav.local_filter import LocalFilter
-from nav.reference import REPORTED, Reference, described, spread, turned
+from nav.reference import REPORTED, Reference, described, forget, spread, turned
 from nav.samples import Array, Status
 from nav.state import State, inject, known, parts
 
+LOST_M = 1e4  # 1-sigma of a position that tells nothing any more, neither does its error model: it is not compared
+MUCH_LESS = 9.0  # times the variance of a position, and less is known of it
+CONTRADICTED = 1e-3  # a probability
 LEAST_SHARE = 0.02  # of a filter with an isolated part, or when shares follow the covariances: it must come back
 
 
@@ -55,6 +61,56 @@ class MasterFilter:
     def reset_shares(self) -> Array:
         """The shares of a fused covariance, for each filter: ones when the combination does not add information up."""
         return self.shares if self._config.combination == "information" else self._everyone
+
+    def healthy(self) -> Array:
+        """1 for each local filter without an isolated part, 0 for the others."""
+        return np.array([not any(w.suspect for w in f.monitors.values()) for f in self._filters], dtype=float)
+
+    def lost(self, state: State) -> npt.NDArray[np.bool_]:
+        """Which filters know nothing of their position any more (filters,)."""
+        variances = state.P[: len(self._filters), range(POS, POS + 3), range(POS, POS + 3)]  # not those of shadows
+        lost: npt.NDArray[np.bool_] = variances.max(axis=1) >= LOST_M**2
+        return lost
+
+    def sound(self, state: State) -> Array:
+        """1 for each filter that is healthy and not lost, 0 for the others."""
+        return np.where(self.lost(state), 0.0, self.healthy())
+
+    def rests_on(self, state: State, row: int) -> bool:
+        """Whether the position is known by one filter, which has an isolated part, and no sound one contradicts it."""
+        sound, place = self.sound(state), slice(POS, POS + 3)
+        if not sound.any():
+            return True
+        others, everyone = self.combine(state, sound), self.combine(state, self._everyone)
+        P = others.P[place, place]
+        if np.trace(P) < MUCH_LESS * np.trace(everyone.P[place, place]):
+            return False
+        off = state.x[row, place] - others.x[place]
+        return whiten(off, P + self.charted(state, row)[place, place])[1] <= chi_square_threshold(CONTRADICTED, 3)
+
+    def start_again(self, state: State, faulty: LocalFilter, sensor: str) -> None:
+        """Every filter from the fused solution of the sound ones, so that nothing stays of what the sensor told.
+
+        Where there is none they stay as they are.
+        """
+        healthy = self.sound(state)
+        if not healthy.any():
+            return
+        master = self.combine(state, healthy)
+        row, model = faulty.row, faulty.model
+        shares = self.reset_shares()
+        if self._config.combination == "information":
+            shares = np.where(healthy > 0, shares, 0.0)
+            shares = np.where(
+                healthy > 0, shares / shares.sum() * (1 - LEAST_SHARE * np.sum(healthy == 0)), LEAST_SHARE
+            )
+        for name in faulty.aids[sensor].states:
+            if name in model.slices and model.decay_rate[model.slices[name].start] > 0:
+                where = model.slices[name]
+                state.x[row, where] = 0.0
+                forget(state.P[row], where.start, model.sigma[where] ** 2)
+        for i, share in enumerate(shares):
+            self.reset(state, i, master.x, master.P / share)
 
     def combine(self, state: State, members: Array) -> Master:
         """The fused solution of the ``members`` (filters,), one or zero each."""

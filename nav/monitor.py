@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from nav.aids.base import Aid
-from nav.detection import ChiSquare, Decision, Detector, LongRunVariance, Mask, chi_square_threshold
+from nav.detection import ChiSquare, Decision, Detector, LongRunVariance, Mask, chi_square_threshold, whiten
 from nav.samples import Array
 from nav.weighting import Policy, split
 
 PATIENT, ALONE_FALSE_ALARM = 10, 1e-3  # see `Monitor`
+SUDDEN = 4.0  # times a gate
 LATELY_S = 5.0  # in which a suspicion is forgotten
 ROUNDING = 1e-6  # of times [s]
 SAME = 1e-6  # between two statistics, relative
@@ -87,9 +88,10 @@ class Monitor:
     nothing estimates its slow errors, its innovations are correlated, and a detector that gathers them might never let
     it go. The detector begins anew then; what was learned of the colour of its innovations is kept.
 
-    ``suspect`` says that some axis is isolated, ``out`` that every one is. ``suspicion`` is the statistic of the latest
-    measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement [s];
-    ``suspected`` the largest suspicion of late, those before with a factor of exp(-age / `LATELY_S`).
+    ``suspect`` says that some axis is isolated, ``out`` that every one is. ``sudden`` says that what was refused last
+    began far outside the gate: no more of a fault was used before than a gate lets pass. ``suspicion`` is the statistic
+    of the latest measurement over its threshold, infinite when there is none; ``judged`` the time of that measurement
+    [s]; ``suspected`` the largest suspicion of late, those before with a factor of exp(-age / `LATELY_S`).
     """
 
     def __init__(
@@ -99,7 +101,7 @@ class Monitor:
         self.noise, self.policy = split(policy)
         self._patience, self._variance = patience, LongRunVariance() if coloured else None
         self.isolated: Mask = np.full(size, False)
-        self.suspect = self.out = False
+        self.suspect = self.out = self.sudden = False
         self.suspicion, self.suspected, self.judged = 0.0, 0.0, -math.inf
         self._bad, self._good, self._alone = np.zeros(size), np.zeros(size), np.zeros(size)
         self._bad_since = np.full(size, math.inf)  # time of the first of those in a row
@@ -131,6 +133,8 @@ class Monitor:
         if not decision.alarm and self._clean:
             return decision, Change.NONE
         sound, before = decision.axis_mask, self.isolated
+        if decision.alarm and not self._bad.any():
+            self.sudden = whiten(nu, S)[1] > SUDDEN * chi_square_threshold(ALONE_FALSE_ALARM, len(nu))
         self._bad = np.where(sound, 0.0, self._bad + 1.0)
         self._bad_since = np.where(sound, math.inf, np.minimum(self._bad_since, t))
         self._good = np.where(sound, self._good + 1.0, 0.0)

@@ -54,8 +54,8 @@ class GnssMonitor:
     patience_s: float
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
-    moved: Array = field(default_factory=lambda: np.zeros(3))  # by how much the streak is off the fixes before it [m]
     contradicted: bool = False  # by the latest fixes, which agree with each other and lie outside the gate
+    believed: Array | None = None  # of the latest fix, if it was fused: by how much it had `moved`
     unexplained: bool = False  # the last recovery: nothing but the fixes speaks against the filter
     _streak_start: float = math.nan
     _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
@@ -65,6 +65,7 @@ class GnssMonitor:
     _begun: GnssSample | None = None  # the first of the streak, or the last fused
     _moved: Array = field(default_factory=lambda: np.zeros(3))  # since then, by velocities [m]
     _jumped: Array | None = None  # by how much the latest one is off the one before (3,), if they don't agree [m]
+    _jumps: Array = field(default_factory=lambda: np.zeros(3))  # the sum of these, none being used between [m]
     _strayed: float = -math.inf  # when one last did not agree with its first, or two in a row jumped alike
     _turned: float = 0.0  # and what turns may add to that, over `TURN_ERROR`: the sum of dt^3 [s^3]
 
@@ -87,15 +88,16 @@ class GnssMonitor:
             before, self._jumped = self._jumped, self._off(fix, v_n)
             # One that stands still falls behind time and again. One that jumps, or jumps back, may be sound again.
             self._strayed = fix.t if before is not None and before @ self._jumped > 0 else -math.inf
+            gap = self._previous is None or fix.t - self._previous[0].t > max(PROBATION_S, 2 * self._interval)
+            used = self.last_fused >= self._streak_start
+            self._jumps = np.zeros(3) if gap else self._jumped if used else self._jumps + self._jumped
             self._begin(fix)
-            self.moved = self._jumped
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         else:
             self._jumped = None
             if self._strays(fix, sigma_v):
                 self._begin(fix)
                 self._strayed = fix.t
-                self.moved = np.zeros(3)
         self._previous = (fix, v_n)
         lasted = fix.t - max(self._streak_start, self.last_fused)
         alone = self._was_aided and odds < SURE and not (both and odds > -SURE)
@@ -111,6 +113,7 @@ class GnssMonitor:
         self.contradicted = verdict is Verdict.REJECT and lasted >= self.probation_s
         if verdict is Verdict.RECOVER:
             self.unexplained = alone
+        self.believed = self.moved if verdict is Verdict.FUSE else None
         if verdict in (Verdict.FUSE, Verdict.RECOVER):
             self.last_fused = fix.t
             self._was_aided = True
@@ -121,6 +124,11 @@ class GnssMonitor:
     def since(self) -> float:
         """When the streak of the latest fix began [s]."""
         return self._streak_start
+
+    @property
+    def moved(self) -> Array | None:
+        """By how much (3,) [m] its fixes have jumped, if they have and none was used since."""
+        return self._jumps if self.last_fused < self._streak_start and self._jumps.any() else None
 
     def sure(self, t: float, before: float) -> bool:
         """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""

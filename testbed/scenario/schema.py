@@ -226,23 +226,15 @@ class Scenario(Section):
         if not isinstance(path_or_name, str | Path):
             raise UserError(f"Scenario.load: {shown(str(path_or_name))} is neither a file nor a shipped name")
         path = _find(path_or_name)
-        if isinstance(overrides, Mapping):
-            overrides = [keypath.override(str(key), value) for key, value in overrides.items()]
-        elif isinstance(overrides, str) or not isinstance(overrides, Iterable):
-            overrides = [overrides]
-        overrides = [*overrides]
-        if not all(isinstance(one, str) for one in overrides):
-            wanted = 'give values by key, such as {"duration_s": 60}, or a list such as ["duration_s=60"]'
-            raise UserError(f"Scenario.load: overrides: {wanted}, not {shown(str(overrides))}")
-        return cls._parsed(_read(path), overrides, path, {"options": path.parent})
+        return cls._parsed(_read(path), _texts(overrides, "load"), path, {"options": path.parent})
 
     @classmethod
-    def parse(cls, text: str, overrides: Sequence[str] = (), path: Path | None = None) -> Scenario:
-        """The scenario that ``text`` describes; ``path`` is where it came from. Raises UserError as `load` does.
+    def parse(cls, text: str, overrides: Sequence[str] | Mapping[str, Any] = (), path: Path | None = None) -> Scenario:
+        """The scenario that ``text`` describes; ``path`` is where it came from; all else as in `load`.
 
         The keys of an estimator of the user's are left to its class, which may be another one by now.
         """
-        return cls._parsed(text, overrides, path, {})
+        return cls._parsed(text, _texts(overrides, "parse"), path, {})
 
     @classmethod
     def _parsed(cls, text: str, overrides: Sequence[str], path: Path | None, context: Mapping[str, Path]) -> Scenario:
@@ -346,6 +338,18 @@ def shipped() -> dict[str, Path]:
 
 
 # --- reading
+
+
+def _texts(overrides: Any, method: str) -> list[str]:
+    """Overrides of a method as ``key=value`` strings. Raises UserError when they are none."""
+    if isinstance(overrides, Mapping):
+        return [keypath.override(str(key), value) for key, value in overrides.items()]
+    single = isinstance(overrides, str) or not isinstance(overrides, Iterable)
+    texts: list[str] = [overrides] if single else [*overrides]
+    if not all(isinstance(one, str) for one in texts):
+        wanted = 'give values by key, such as {"duration_s": 60}, or a list such as ["duration_s=60"]'
+        raise UserError(f"Scenario.{method}: overrides: {wanted}, not {shown(str(texts))}")
+    return texts
 
 
 def _find(path_or_name: str | Path) -> Path:

@@ -457,6 +457,12 @@ def test_what_a_caller_gets_wrong_is_told(options: dict[str, Any], says: str) ->
 def test_overrides_that_are_none_are_told(overrides: Any) -> None:
     with pytest.raises(UserError, match=r"Scenario\.load: overrides: give values by key"):
         Scenario.load("u_turn", overrides)
+    with pytest.raises(UserError, match=r"Scenario\.parse: overrides: give values by key"):
+        Scenario.parse(Scenario.load("u_turn").text, overrides)
+
+
+def test_a_text_takes_values_by_key_as_a_file_does() -> None:
+    assert Scenario.parse(Scenario.load("u_turn").text, {"duration_s": 3}).duration_s == 3
 
 
 def test_overrides_may_be_made_as_they_are_read() -> None:

@@ -8,6 +8,7 @@ import pytest
 from worlds.ins import CONSUMER, FIELD_N, barometer, feed, flight, gnss, imu, magnetometer
 
 from nav.aids import BarometerAid, GnssAid, MagnetometerAid
+from nav.detection import GnssMonitor
 from nav.doubts import FixDoubt
 from nav.earth import displacement_n
 from nav.error_model import POS
@@ -18,6 +19,7 @@ from nav.ins import Ins, InsConfig
 from nav.monitor import MonitoredAid
 
 AIDS = (GnssAid(), BarometerAid(), MagnetometerAid())
+POOR = replace(CONSUMER, gyro_noise=300 * CONSUMER.gyro_noise, accel_noise=300 * CONSUMER.accel_noise)
 JUMPED_S, NORTH = 40.0, 300.0  # when positions jump, and by how much [s, m]
 
 
@@ -28,12 +30,12 @@ def jumped(fix, back_s):
     return replace(fix, lat=lat, lon=lon, h=h)
 
 
-def estimator(kind):
+def estimator(kind, model=CONSUMER):
     if kind == "ins":
-        return Ins(InsConfig(CONSUMER, AIDS), lambda *_: FIELD_N)
+        return Ins(InsConfig(model, AIDS), lambda *_: FIELD_N)
     parts = {"gnss": AIDS[:2], "field": AIDS[2:]}
     locals_ = tuple(Local(name, tuple(MonitoredAid(aid) for aid in aids)) for name, aids in parts.items())
-    return Federated(Config(CONSUMER, locals_), lambda *_: FIELD_N)
+    return Federated(Config(model, locals_), lambda *_: FIELD_N)
 
 
 def flown(kind, back_s):
@@ -43,6 +45,11 @@ def flown(kind, back_s):
     fixes = [jumped(one, back_s) for one in gnss(truth, rng, 5.0)]
     samples = fixes + magnetometer(truth, rng) + barometer(truth, rng, 5.0)
     estimates, _ = feed(FusionHorizon(estimator(kind)), increments, samples)
+    return against(truth, estimates)
+
+
+def against(truth, estimates):
+    """Times [s], errors to the north and their claims [m]."""
     t = np.array([one.t for one in estimates])
     k = np.searchsorted(truth.t, t - 1e-9)
     errors = [
@@ -94,8 +101,28 @@ def test_what_is_claimed_falls_with_time_and_is_forgotten_where_the_filter_was_w
     off = doubt.off(t)
     assert not off[:, POS].any()  # within what is known
     assert off[:, POS + 1] == pytest.approx(-40.0 * np.sqrt(2.0 * 100.0 / t))
-    doubt.contradict(np.array([0.0, 0.0, 90.0]), np.zeros(3), contradicted=True)
+    receiver = GnssMonitor(10.0, 1.0, 4.0, 30.0, 16.0, contradicted=True)
+    doubt.heard(np.array([0.0, 0.0, 90.0]), np.zeros(3), receiver)
     assert doubt.off(t)[:, POS + 2] == pytest.approx(np.full(3, 90.0))  # the larger counts
-    doubt.contradict(np.zeros(3), np.zeros(3), contradicted=False)
+    doubt.heard(np.zeros(3), np.zeros(3), replace(receiver, contradicted=False))
     doubt.gave_in(200.0, np.array([0.0, 500.0, 0.0]), np.zeros(3), alone=False)
     assert not doubt.off(t + 200.0).any()
+
+
+@pytest.mark.ci
+def test_a_lone_receiver_that_jumps_takes_nothing_of_the_position_with_it():
+    """Others know no position: to start again from them would be kilometres off. What it gives in to, they hear of."""
+    truth, rng = flight(120.0), np.random.default_rng(56103)
+    increments, *_ = imu(truth, POOR, rng)
+    samples = [jumped(one, 85.0) for one in gnss(truth, rng, 5.0)] + magnetometer(truth, rng)
+    samples += barometer(truth, rng, 5.0)
+    federated = estimator("federated", POOR)
+    estimates, _ = feed(FusionHorizon(federated), increments, samples)
+    t, north, _ = against(truth, estimates)
+    assert np.abs(north[(t > 5.0) & (t < JUMPED_S + 10.0)]).max() < 30.0
+    assert np.abs(north[t > 5.0]).max() < 1.2 * NORTH
+    assert np.abs(north[-1]) < 5.0
+    (x, _), (away, P) = federated.local("gnss"), federated.local("field")
+    place = slice(POS, POS + 3)
+    assert np.linalg.norm(away[place]) > 1000.0  # as it knows no position
+    assert (np.abs(away[place] - x[place]) < 5.0 * np.sqrt(np.diag(P)[place])).all()
