@@ -110,7 +110,8 @@ def _kept(index: Any, key: object) -> object:
 def is_kept(kernel: Callable[..., Any]) -> bool:
     """Whether a kernel, as it is now, has been compiled before and can be loaded."""
     compiled: Any = kernel
-    return bool(compiled._cache._cache_file._load_index())
+    index = getattr(compiled._cache, "_cache_file", None)
+    return index is not None and bool(index._load_index())
 
 
 def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
@@ -122,7 +123,10 @@ def _compiled(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     try:
         compiled: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # nowhere to keep it: neither beside the source nor in the user's home
-        _keep_for_now()
+        try:
+            _keep_for_now()
+        except OSError:  # nor anywhere: each process compiles for itself
+            return cast("Callable[P, R]", numba.njit(**options)(function))
         compiled = numba.njit(cache=True, **options)(function)
     index = compiled._cache._cache_file
     index._source_stamp = index._source_stamp, _sources(function.__module__)

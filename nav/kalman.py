@@ -149,19 +149,13 @@ def is_critical(P: Array, H: Array, R: Array) -> bool:
     return False
 
 
-@njit
-def is_positive(P: Array, share: float) -> bool:
+@lean
+def _is_positive(P: Array, share: float, work: Array) -> bool:
     """Whether ``P`` (n, n), each variance raised by a ``share`` of itself, is positive definite by a `MARGIN`.
 
     By Cholesky on ``P`` scaled to a unit diagonal: the units of the states differ by 1e12. Rows of zeros, states that
-    are not in use, are left out.
+    are not in use, are left out. ``work`` (n + 1, n) or larger is scratch.
     """
-    return _is_positive(P, share, np.empty((len(P) + 1, len(P))))
-
-
-@lean
-def _is_positive(P: Array, share: float, work: Array) -> bool:
-    """`is_positive`; ``work`` (n + 1, n) or larger is scratch."""
     n = len(P)
     L, scale = work[1:], work[0]
     for i in range(n):

@@ -9,6 +9,7 @@ import io
 import math
 import os
 import re
+import shlex
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -150,7 +151,7 @@ def check(
         raise UserError(f"--junit {junit}: there is no folder {junit.parent}: make it first")
     if junit is not None and junit.is_dir():
         raise UserError(f"--junit {junit}: is a folder: name the file in it")
-    if junit is not None and junit.is_file() and junit.read_bytes()[: len(checks.XML)] not in (b"", checks.XML):
+    if junit is not None and junit.is_file() and not checks.is_junit(junit.read_bytes()):
         raise UserError(f"--junit {junit}: is there already, and is no report: give it another name")
     folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
     if folder is None and update:
@@ -195,8 +196,9 @@ def report(run_file: RunFile, force: Force = False) -> None:
     for text in remarks(dataset, computed):
         remark(text)
     kept = run_file.parent / METRICS
-    if not kept.exists():  # the run was killed
-        metrics.save(computed, kept)
+    with held(run_file.parent):
+        if not kept.exists() or not dataset.attrs["complete"]:  # the run was killed, perhaps since they were written
+            metrics.save(computed, kept)
     conclude(dataset, computed, run_file, True, force)
 
 
@@ -318,7 +320,7 @@ def init(
 
     for path in make_project(folder):
         print(printable(str(path)))
-    print(printable(f"Now: cd {folder} && testbed run first.toml"))
+    print(printable(f"Now: cd {shlex.quote(str(folder))} && testbed run first.toml"))
 
 
 def parse_vary(texts: Sequence[str]) -> dict[str, list[str]]:

@@ -72,14 +72,14 @@ def heeded() -> Iterator[None]:
     mine = [one for one in SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
     heard, tell = os.pipe()
     os.set_blocking(tell, False)
-    interrupted = False
+    interrupted = 0  # the signal
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         nonlocal interrupted
         if _in_callback(frame):
             threading.Timer(AGAIN_S, os.kill, (os.getpid(), number)).start()
             return
-        interrupted = True
+        interrupted = number
         for one in mine:
             signal.signal(one, signal.SIG_IGN)
         if _held:
@@ -98,9 +98,11 @@ def heeded() -> Iterator[None]:
             yield
     except SystemExit as end:
         if interrupted:  # nothing is left to be closed, and to take everything down in order can take seconds
+            if not _announced:  # what was raised was lost, and the command went on to its end
+                _tell()
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(end.code if isinstance(end.code, int) else 0)
+            os._exit(end.code if isinstance(end.code, int) and end.code else 128 + interrupted)
         raise
     finally:
         if not interrupted:  # otherwise the watch goes on until the process has ended

@@ -47,8 +47,8 @@ def require_own(folder: Path, names: Collection[str], force: bool = False) -> No
         enter(folder, foreign)
     elif foreign:
         raise UserError(
-            f"{folder}: there is {', '.join(foreign)} already, not made by an earlier command: move it away or choose"
-            " another folder (run, report and export take --force to replace it)"
+            f"{folder}: there is {', '.join(foreign)} already, not made by an earlier command: move it away, choose"
+            " another folder, or add --force if the command takes it"
         )
 
 
@@ -64,6 +64,17 @@ def enter(folder: Path, names: Iterable[str]) -> None:
     before = _listed(folder)
     if not before.issuperset(names):
         _list(folder, before.union(names))
+
+
+def withdraw(path: Path) -> None:
+    """Remove a file that was written and shows nothing, and what is said of it."""
+    with suppress(OSError, UserError):
+        path.unlink()
+        rest = _listed(path.parent) - {path.name}
+        if rest:
+            _list(path.parent, rest)
+        else:
+            (path.parent / MANIFEST).unlink()
 
 
 def start_anew(folder: Path, names: Iterable[str] = ()) -> None:

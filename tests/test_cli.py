@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import os
 import re
@@ -30,6 +31,7 @@ from testbed.loop import links, loop
 from testbed.many import progress
 from testbed.motion import flight
 from testbed.record import reader as record
+from testbed.results import held
 from testbed.scenario import Scenario
 
 QUICK = ["--set", "duration_s=3", "--no-report"]
@@ -238,6 +240,42 @@ def test_a_junit_report_goes_over_a_report_and_nothing_else(testbed: Testbed, tm
     assert ended.code == 2
     assert "--junit mine.toml: is there already, and is no report: give it another name" in ended.err
     assert (tmp_path / "mine.toml").read_text() == "seed = 1\n"
+    (tmp_path / "aircraft.xml").write_text('<?xml version="1.0"?>\n<fdm_config/>\n')
+    assert testbed("check", "static_bench", "--junit", "aircraft.xml").code == 2
+    assert "fdm_config" in (tmp_path / "aircraft.xml").read_text()
+
+
+def test_a_telemetry_log_of_somebody_else_is_kept(testbed: Testbed, tmp_path: Path) -> None:
+    """One elsewhere than the results went, and one that another run was writing."""
+    run = ["run", "static_bench", *QUICK, "--set", "duration_s=5", "--out", "a", "--mavlink"]
+    assert testbed(*run, "tlog:flown.tlog").code == 0
+    before = (tmp_path / "flown.tlog").read_bytes()
+    ended = testbed(*run, "tlog:flown.tlog", "--set", "duration_s=3")
+    assert ended.code == 2
+    assert "tlog:flown.tlog: flown.tlog is there already: give the log another name, or add --force" in ended.err
+    assert (tmp_path / "flown.tlog").read_bytes() == before
+    assert testbed(*run, "tlog:flown.tlog", "--set", "duration_s=3", "--force").code == 0
+    assert testbed(*run, "tlog:a/run.tlog").code == 0
+    assert testbed(*run, "tlog:a/run.tlog").code == 0  # which is of the run before
+    before = (tmp_path / "a" / "run.tlog").read_bytes()
+    assert before
+    with held(tmp_path / "a"):
+        assert "another run is writing here" in testbed(*run, "tlog:a/run.tlog").err
+    assert (tmp_path / "a" / "run.tlog").read_bytes() == before
+
+
+def test_metrics_are_those_of_the_whole_record_that_a_killed_run_left(testbed: Testbed, tmp_path: Path) -> None:
+    assert testbed("run", "static_bench", *QUICK, "--set", "duration_s=70", "--out", "a").code == 0
+    whole = (tmp_path / "a" / "metrics.json").read_bytes()
+    with h5py.File(tmp_path / "a" / "run.nc", "r+") as file:
+        file.attrs["complete"] = 0
+    (tmp_path / "a" / "metrics.json").write_text("{}")
+    with held(tmp_path / "a"):
+        assert "another run is writing here" in testbed("report", "a/run.nc").err
+    assert (tmp_path / "a" / "metrics.json").read_text() == "{}"
+    assert testbed("report", "a/run.nc").code == 0
+    now = json.loads((tmp_path / "a" / "metrics.json").read_bytes())
+    assert now == {key: value for key, value in json.loads(whole).items() if not key.startswith("run.")}
 
 
 def test_a_drafted_scenario_goes_over_a_scenario_and_nothing_else(testbed: Testbed, tmp_path: Path) -> None:

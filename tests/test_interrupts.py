@@ -16,6 +16,7 @@ from worlds.programs import free_port
 
 from testbed import Scenario, run
 from testbed.commands.run import _has_rows
+from testbed.results import MANIFEST, METRICS, RECORD, withdraw, write_result
 
 COMMANDS = {
     "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
@@ -150,3 +151,31 @@ def test_a_record_without_rows_is_none_to_be_shown(tmp_path: Path) -> None:
     assert not _has_rows(tmp_path / "run.nc")
     run(Scenario.load("u_turn", {"duration_s": 2, "expect": {}}), out=tmp_path / "flown")
     assert _has_rows(tmp_path / "flown/run.nc")
+
+
+SWALLOWED = """
+import os, signal, sys
+from testbed import interrupts
+with interrupts.heeded():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(100):
+            pass
+    except BaseException:
+        pass
+    sys.exit(0)
+"""
+
+
+def test_one_that_somebody_swallowed_is_told_at_the_end() -> None:
+    ended = subprocess.run([sys.executable, "-c", SWALLOWED], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
+
+
+def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:
+    write_result(tmp_path / RECORD, b"")
+    write_result(tmp_path / METRICS, b"{}")
+    withdraw(tmp_path / RECORD)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([METRICS, MANIFEST])
+    withdraw(tmp_path / METRICS)
+    assert not [*tmp_path.iterdir()]

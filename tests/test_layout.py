@@ -7,6 +7,8 @@ import nav
 import testbed
 
 LONGEST_FILE, LONGEST_FUNCTION = 500, 80  # lines
+HARNESS = ("testbed/feeds/", "testbed/loop/")  # where no function has more parameters than this, without a record
+MOST_PARAMETERS = 6
 # Compiled loops, which calls in between would slow down.
 KERNELS = {
     "nav/ahrs/state.py:propagate",
@@ -15,6 +17,18 @@ KERNELS = {
     "nav/strapdown.py:step",
     "testbed/sensors/increments.py:accumulate",
 }
+
+
+def test_functions_of_the_harness_have_few_parameters() -> None:
+    many = set()
+    room = Path(testbed.__file__).parent
+    for path in room.rglob("*.py"):
+        name = path.relative_to(room.parent).as_posix()
+        for node in ast.walk(ast.parse(path.read_text())) if name.startswith(HARNESS) else ():
+            if isinstance(node, ast.FunctionDef):
+                given = [one.arg for one in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+                many |= {f"{name}:{node.name}"} if len({*given} - {"self", "cls"}) > MOST_PARAMETERS else set()
+    assert not many
 
 
 def test_files_and_functions_are_short() -> None:

@@ -25,7 +25,7 @@ from testbed.commands.shared import (
     remark,
 )
 from testbed.errors import UserError
-from testbed.results import MANIFEST, METRICS, RECORD, REPORT, require_own
+from testbed.results import MANIFEST, METRICS, RECORD, REPORT, held, require_own, withdraw
 
 if TYPE_CHECKING:
     from testbed.bridges.gps_input import GpsInput
@@ -113,20 +113,23 @@ def run(
     if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with output_folder(folder):
-        _require_own(loaded, folder, report, force)
-        links = _connect(
-            mavlink or [],
-            loaded,
-            folder,
-            estimator,
-            identity=mavlink_identity,
-            vehicles=mavlink_vehicles,
-            readonly=mavlink_readonly,
-            key=mavlink_key,
-        )
+        with held(folder):  # a log that another run is writing is not to be begun anew
+            _require_own(loaded, folder, report, force)
+            links = _connect(
+                mavlink or [],
+                loaded,
+                folder,
+                estimator,
+                force,
+                identity=mavlink_identity,
+                vehicles=mavlink_vehicles,
+                readonly=mavlink_readonly,
+                key=mavlink_key,
+            )
         far_end = flown or _far_end(loaded, px4, ardupilot, gps_input, pilot)
         result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
-        conclude(result.dataset, result.metrics, folder / RECORD, report, force)
+        with interrupts.leaving(lambda: _shows(folder / RECORD, "the record is")):
+            conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
         raise typer.Exit(EXIT_FAILED)
 
@@ -209,11 +212,12 @@ def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) ->
 
 
 def _connect(
-    urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, **options: Any
+    urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, force: bool, **options: Any
 ) -> list[Publisher]:
     """Open the links, once it is sure that there is something to show and that no log would overwrite a result.
 
-    ``options`` are those of `testbed.mavlink.MavlinkPublisher`.
+    Nor, without ``force``, one that is elsewhere than the results. ``options`` are those of
+    `testbed.mavlink.MavlinkPublisher`.
     """
     if not urls:
         if any(options.values()):
@@ -229,6 +233,8 @@ def _connect(
         results = (RECORD, METRICS, REPORT, MANIFEST)
         if path is not None and path.resolve().parent == folder.resolve() and path.name in results:
             raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
+        if path is not None and path.resolve().parent != folder.resolve() and path.is_file() and not force:
+            raise UserError(f"{url}: {path.name} is there already: give the log another name, or add --force")
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
 
@@ -283,7 +289,7 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
     record, before = folder / RECORD, _stamp(folder / RECORD)
     with (
         interrupts.leaving(
-            lambda: _kept(record) if _stamp(record) != before and _has_rows(record) else "nothing was recorded"
+            lambda: _kept(record) if _stamp(record) != before and _has_rows(record) else _nothing(record, before)
         ),
         keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(console(stderr=True), scenario.title) as tell,
@@ -323,8 +329,19 @@ def _has_rows(record: Path) -> bool:
     return False
 
 
+def _nothing(record: Path, before: tuple[int, int] | None) -> str:
+    """That there is no record, once one without a row is gone."""
+    if _stamp(record) != before:
+        withdraw(record)
+    return "nothing was recorded"
+
+
 def _kept(record: Path) -> str:
-    return f"the record so far is {record}: `testbed report {shlex.quote(str(record))}` shows it"
+    return _shows(record, "the record so far is")
+
+
+def _shows(record: Path, what: str) -> str:
+    return f"{what} {record}: `testbed report {shlex.quote(str(record))}` shows it"
 
 
 def _lost(result: RunResult) -> bool:

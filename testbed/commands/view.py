@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -28,7 +29,8 @@ def view(run: Viewed, live: AsItGoes = False, port: Port = 0) -> None:
         raise UserError("--port: a page that is a file has none: add --live, or leave it out")
     page = run if run.suffix == ".html" else (run if run.is_dir() else run.parent) / REPORT
     if not page.is_file():
-        raise UserError(f"{page}: no such file: `testbed report {run if run.suffix else run / RECORD}` makes it")
+        record = run if run.suffix == ".nc" else page.parent / RECORD
+        raise UserError(f"{page}: no such file: `testbed report {shlex.quote(str(record))}` makes it")
     if not webbrowser.open(page.resolve().as_uri()):
         raise UserError(f"{page}: there is no browser to open it in here: open it in one")
     print(printable(f"report: {page}"))

@@ -10,7 +10,7 @@ from testbed.errors import UserError
 from testbed.feeds.doubted import contradicted
 from testbed.feeds.log import Log
 from testbed.feeds.samples import newly
-from testbed.feeds.table import known_motion, load, quantities
+from testbed.feeds.table import Tables, known_motion, load, quantities
 from testbed.motion.logged import Stream
 
 
@@ -39,7 +39,7 @@ def judged_by(log: Log, columns: Mapping[str, Stream]) -> Log:
         raise UserError(f"truth.columns.{name}.time: {told}")
     zero, pace = (log.utc, 1.0) if dated and log.utc is not None else (0.0, log.pace)
     heard = float(imu.t[0]) * pace + zero, float(imu.t[-1]) * pace + zero
-    t, values = quantities(tables, path, name, "reference", stream, heard, notes)
+    t, values = quantities(Tables(tables, path), name, "reference", stream, heard, notes)
     if not len(t):
         raise UserError(f"truth.columns.{name}: {path} has no row with a time and anything else")
     found = known_motion(*newly(name, (t - zero) / pace, values, log.imus, notes), notes)

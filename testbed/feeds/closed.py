@@ -9,6 +9,7 @@ from testbed.feeds.autopilot import Autopilot
 from testbed.feeds.feed import Turn
 from testbed.feeds.simulated import Simulated
 
+CLOSED, NEVER = "loop_closed", "never"  # an attribute of records, and what it is at the end of such
 NEVER_CLOSED = "the autopilot flew on truth to the end: what it was to fly on was never ready"
 
 
@@ -17,7 +18,7 @@ class Closed:
 
     def __init__(self, simulated: Simulated, autopilot: Autopilot) -> None:
         self.rate_hz, self.source = simulated.rate_hz, simulated.source
-        self.faults, self.receptions, self.origin = simulated.faults, simulated.receptions, simulated.origin
+        self.faults, self.receptions = simulated.faults, simulated.receptions
         self._autopilot, self._simulated = autopilot, simulated
 
     @property
@@ -41,6 +42,11 @@ class Closed:
     def take_events(self, until: float = math.inf) -> list[tuple[float, str, str]]:
         """Remove and give the autopilot's events up to a time."""
         return self._autopilot.take_events(until)
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What the record says of where the motion came from, and whether the loop was ever closed."""
+        return self._simulated.origin | {CLOSED: "yes" if self._autopilot.closed else NEVER}
 
     def remark(self) -> str:
         """That the loop was never closed, if it was not."""

@@ -100,6 +100,13 @@ class Table(NamedTuple):
     dates: frozenset[str] = frozenset()
 
 
+class Tables(NamedTuple):
+    """What was read of each file, and the one that columns are in unless they name another."""
+
+    of_files: Mapping[Path, Table]
+    main: Path
+
+
 def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a table, and those of sensors and of quantities that have their own, by their ``columns``.
 
@@ -125,7 +132,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = quantities(of_files, path, name, kind, stream, heard, notes)
+        t, values = quantities(Tables(of_files, path), name, kind, stream, heard, notes)
         if kind == "imu":
             t, values = _whole(name, t, values, stream, notes)
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
@@ -298,13 +305,11 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def quantities(
-    tables: Mapping[Path, Table], main: Path, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None,
-    notes: list[str],
-) -> tuple[Array, dict[str, Array]]:  # fmt: skip
+    tables: Tables, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None, notes: list[str]
+) -> tuple[Array, dict[str, Array]]:
     """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs.
 
-    They are in the ``main`` one of the tables, or in those that are named. ``heard`` is when the inertial unit was, as
-    of `ordered`.
+    ``heard`` is when the inertial unit was, as of `ordered`.
     """
     where = f"truth.columns.{name}"
     if kind not in NEEDED:
@@ -321,7 +326,7 @@ def quantities(
             raise UserError(f"{where}.{keys[1]}: is given beside {keys[0]}: say one of {' and '.join(keys)} only")
     values = {}
     for key, column in (given | {"time": stream.time}).items():
-        table = tables[Path(column.file or stream.file or main)]
+        table = tables.of_files[Path(column.file or stream.file or tables.main)]
         values[key] = _quantity(table, f"{where}.{key}", key, column, notes)
     stamps = values.pop("time")
     for key, array in values.items():

@@ -38,7 +38,7 @@ from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
-from testbed.results import require_own
+from testbed.results import REPORT, require_own
 from testbed.scenario import Scenario
 from testbed.score import accuracy, metrics
 
@@ -112,12 +112,6 @@ class Progress:
     def fraction(self) -> float:
         """The share of the campaign that is done."""
         return (self.done + self.failed + self.flying) / self.total
-
-    @property
-    def remaining_s(self) -> float:
-        """Wall time still to go at the pace so far, NaN as long as there is none."""
-        flown = self.fraction - self.before / self.total
-        return self.elapsed_s / flown * (1.0 - self.fraction) if flown > 0 else math.nan
 
     def __str__(self) -> str:
         parts = [f"{self.done}/{self.total} runs", f"{self.failed} failed" if self.failed else "", self.activity]
@@ -274,6 +268,7 @@ def fly(
 ) -> CampaignResult:  # fmt: skip
     """The same, for whoever shows by itself how far it is, and what there is to say before it begins."""
     from testbed.report import campaign as campaign_report
+    from testbed.report import campaign_figures
 
     combinations = _combinations(plan)
     if plan.runs < 1:
@@ -282,7 +277,8 @@ def fly(
     remarks = seeds.remarks([one.scenario for one in combinations], plan.runs, plan.draw)
     total = sum(len(plan.seeds(one.scenario)) for one in combinations)
     folder = plan.out.absolute()
-    require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY])
+    figures = campaign_figures.files(combinations[0].values)
+    require_own(folder, [campaign_report.TABLE, campaign_report.SUMMARY, REPORT, *figures])
     mine = own([one.scenario for one in combinations])
     claim(folder, "runs", "campaign", _setup([one.scenario for one in combinations], plan, mine))
     stored = _load_all(folder, combinations, plan)

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 from testbed import measures
 from testbed.data import data_dir, write_file
 from testbed.errors import UserError
-from testbed.feeds.closed import NEVER_CLOSED
+from testbed.feeds.closed import CLOSED, NEVER, NEVER_CLOSED
 from testbed.loop import loop
 from testbed.many import given, pool, progress
 from testbed.report import page as report
@@ -276,7 +276,7 @@ def fly(task: Task, tell: Callable[[float], None] = lambda share: None) -> Outco
     started = time.perf_counter()
     try:
         result = loop.run(task.scenario, out=task.folder, progress=lambda now: tell(now.t / now.duration))
-        wrong = [NEVER_CLOSED] if NEVER_CLOSED in result.remarks else []
+        wrong = [NEVER_CLOSED] if result.dataset.attrs.get(CLOSED) == NEVER else []
         if result.failure:
             t = column(result.dataset, "truth/time")[-1]
             wrong = [f"the flight ended after {t:.0f} s: {result.failure}"]
@@ -401,8 +401,12 @@ def _change(row: Row) -> str:
     return "" if row.now is None or not golden else f"{100 * (row.now / golden - 1):+.1f} %"
 
 
-XML = b"<?xml"  # with which a report begins
 _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def is_junit(content: bytes) -> bool:
+    """Whether a file is a report of `junit`, or empty."""
+    return not content or b"<testsuites" in content[:200]
 
 
 def junit(outcomes: Sequence[Outcome]) -> bytes:

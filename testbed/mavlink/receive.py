@@ -7,7 +7,6 @@ come from pymavlink's ``all`` dialect; its parser is not used, because it stumbl
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -128,9 +127,3 @@ class Reader:
 def whole_number(value: float) -> int | None:
     """``value`` as an integer; None when it is none that a message means (NaN, infinite, fractional, beyond 2^53)."""
     return int(value) if abs(value) < 2.0**53 and value == int(value) else None
-
-
-def as_float(raw: bytes) -> float:
-    """A little-endian float32."""
-    value: float = struct.unpack("<f", raw)[0]
-    return value

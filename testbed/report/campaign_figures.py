@@ -7,7 +7,7 @@ of varied values that share a panel are told apart by a scale of colours that no
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 NEES_DOF = 3  # north, east, down
 CONFIDENCE = (0.025, 0.975)
+DISTRIBUTION = "distribution"
 WHISKERS = (5, 95)  # percentiles of the runs
 LINEAR_UP_TO = 30.0  # times the smallest error; a wider distribution gets a logarithmic axis
 MOST_COLUMNS = 3  # more combinations than this share a panel
@@ -71,11 +72,19 @@ def figures(result: CampaignResult) -> dict[str, Drawn]:
     )
     keys = list(result.combinations[0].values)
     for key in keys:
-        name = "distribution_" + re.sub(r"\W+", "_", key).strip("_")
-        made[name] = Drawn(caption, _distribution(result, key, lambda c, key=key: c.values[key]))  # type: ignore[misc]
+        made[_distribution_of(key)] = Drawn(caption, _distribution(result, key, lambda c, key=key: c.values[key]))  # type: ignore[misc]
     if not keys:
-        made["distribution"] = Drawn(caption, _distribution(result, "", lambda _: "all runs"))
+        made[DISTRIBUTION] = Drawn(caption, _distribution(result, "", lambda _: "all runs"))
     return made
+
+
+def files(keys: Iterable[str]) -> list[str]:
+    """The files that figures of a campaign with these varied keys may go to."""
+    return [f"{name}.png" for name in ("errors", "nees", DISTRIBUTION, *map(_distribution_of, keys))]
+
+
+def _distribution_of(key: str) -> str:
+    return f"{DISTRIBUTION}_" + re.sub(r"\W+", "_", key).strip("_")
 
 
 # --- numbers

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from testbed.report import interactive
-from testbed.report.differences import Block, cells, told
+from testbed.report.differences import Block, cells, with_cells
 from testbed.report.interactive.contents import events
 from testbed.report.page import render, script_of
 from testbed.report.run import Run
@@ -51,7 +51,7 @@ def write_comparison(
         "title": title,
         "contents": contents,
         "script": script_of(contents),
-        "blocks": told(found),
+        "blocks": with_cells(found),
         "left_out": [one.name for one in shown if one not in kept],
         "events": [(t, f"{t:.1f} s", how, what) for t, how, what in events(kept[0].run)],
     }

@@ -62,7 +62,7 @@ def blocks(cases: Sequence[Case]) -> list[Block]:
     return [block for block in found if block.rows]
 
 
-def told(found: Sequence[Block]) -> list[tuple[Block, list[tuple[Difference, list[str]]]]]:
+def with_cells(found: Sequence[Block]) -> list[tuple[Block, list[tuple[Difference, list[str]]]]]:
     """Tables as pages have them: each row with its cells."""
     return [(block, [(row, cells(row)) for row in block.rows]) for block in found]
 

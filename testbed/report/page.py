@@ -70,7 +70,7 @@ def write_report(dataset: xarray.DataTree, metrics: Mapping[str, float], folder:
                 write_result(folder / f"{name}.png", picture, force)
                 if plot.pictured:
                     shown.append(Shown(title, caption, picture))
-        write_result(page, render("run.html", figures=shown, **told(run, metrics)).encode(), force)
+        write_result(page, render("run.html", figures=shown, **content(run, metrics)).encode(), force)
     return page
 
 
@@ -86,7 +86,7 @@ def files(subjects: Iterable[str]) -> list[str]:
     return [REPORT, *(f"{name}.png" for name in names)]
 
 
-def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
+def content(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
     """What the page says beside its figures."""
     attributes = run.dataset.attrs
     contents = interactive.contents([interactive.Shown("", run)])
@@ -101,7 +101,7 @@ def told(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "complete": bool(attributes.get("complete", 1)),
         "remarks": remarks(run.dataset, metrics),
         "summary": summary,
-        "against": differences.told(differences.blocks([beside])),
+        "against": differences.with_cells(differences.blocks([beside])),
         "faults": tables.faults(run.faults, metrics),
         "seen": tables.seen(run.seen),
         "events": [(t, f"{t:.1f} s", how, what) for t, how, what in events(run)],

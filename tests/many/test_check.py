@@ -300,7 +300,7 @@ def test_estimates_that_are_no_numbers_fail_unless_they_are_expected(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """They are in no error: a filter that is dead for most of a run kept all bounds."""
-    dead = SimpleNamespace(metrics={LOST: 799.0}, failure="", dataset={}, remarks=(), ended={})
+    dead = SimpleNamespace(metrics={LOST: 799.0}, failure="", dataset=SimpleNamespace(attrs={}), ended={})
     monkeypatch.setattr(loop, "run", lambda *_, **__: dead)
     monkeypatch.setattr(report, "write_report", lambda *_: None)
     loaded = Scenario.load("static_bench", {"expect": expected, "estimator": [{"name": "mine", "aids": ["gnss"]}]})

@@ -38,7 +38,7 @@ def tab() -> Iterator[Page]:
 def write(dataset: Any, path: Path) -> Path:
     """The page of a run, without its figures."""
     run = Run(dataset)
-    path.write_text(report.render("run.html", figures=[], **report.told(run, {})), "utf-8")
+    path.write_text(report.render("run.html", figures=[], **report.content(run, {})), "utf-8")
     return path
 
 

@@ -314,7 +314,7 @@ def test_a_page_tells_which_estimator_is_better_than_the_first() -> None:
     worse, better = "position_horizontal_rms_m", "heading_rms_deg"
     found = {f"ins.{worse}": 1.0, f"other.{worse}": 3.0, f"ins.{better}": 2.0, f"other.{better}": 1.0}
     case = Case("", ["ins", "other"], [(0, found)])
-    ((block, rows),) = differences.told(differences.blocks([case]))
+    ((block, rows),) = differences.with_cells(differences.blocks([case]))
     assert block.head[1:3] == ("ins", "other")
     assert (block.count("better"), block.count("worse")) == (1, 1)
     assert [cells[3:5] for _, cells in rows] == [["+200.0 %", "worse"], ["-50.0 %", "better"]]
