@@ -29,7 +29,7 @@ class Doubts:
     """How long every position was refused, one `GnssMonitor` for each receiver, and the wind that is remembered.
 
     The filters give in when every position was refused for ``patience_s``, or when the wind that the first filter with
-    airspeed remembers speaks for the fixes. What fixes say until then, ``fixes``, says no receiver without velocity.
+    airspeed remembers speaks for the fixes. ``fixes`` is what those with velocities say against the filters.
     """
 
     def __init__(self, filters: Sequence[LocalFilter], patience_s: float, limit: float) -> None:
