@@ -188,6 +188,22 @@ def run_line(line: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     assert not ended.value.code, command
 
 
+PARTS = [block.text for _, block in ALL if block.language == "text" and block.text.startswith("[")]
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_of_a_scenario_is_one(part: str) -> None:
+    """Of files that are not there, or beside what the reader has already."""
+    head = 'title = "Part"\nduration_s = 60\n'
+    rest = '[sensors.imu]\n[sensors.gnss]\n[[estimator]]\nname = "ins"\nkind = "ins"\naids = ["gnss"]\n'
+    if "[truth]" not in part:
+        head += '[truth]\nsource = "log"\nfile = "imu.csv"\n'
+    if "source" not in part and "[truth]" in part:
+        part = part.replace("[truth]", '[truth]\nsource = "flight"')
+        rest += '[[plan]]\nleg = "straight"\nlength_m = 500\n'
+    Scenario.parse(f"{head}{part}\n{rest}")
+
+
 @pytest.mark.parametrize("text", [block.text for _, block in ALL if is_whole(block) and not block.title])
 def test_scenario_without_a_name_flies(text: str) -> None:
     scenario = Scenario.parse(text, ["duration_s=20", "sensors.gnss.denied=[[12, 15]]"])
