@@ -98,11 +98,13 @@ def heeded() -> Iterator[None]:
             yield
     except SystemExit as end:
         if interrupted:  # nothing is left to be closed, and to take everything down in order can take seconds
+            code = end.code if isinstance(end.code, int) else 0
             if not _announced:  # what was raised was lost, and the command went on to its end
                 _tell()
+                code = code or 128 + interrupted
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(end.code if isinstance(end.code, int) and end.code else 128 + interrupted)
+            os._exit(code)
         raise
     finally:
         if not interrupted:  # otherwise the watch goes on until the process has ended
@@ -162,6 +164,12 @@ def lastly(do: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         _last.remove(do)
+
+
+def taken() -> None:
+    """An interrupt is how a command ends that goes on until then: it is in order, and needs no line."""
+    global _announced
+    _announced = True
 
 
 def _tell() -> None:

@@ -168,7 +168,10 @@ with interrupts.heeded():
 
 
 def test_one_that_somebody_swallowed_is_told_at_the_end() -> None:
-    ended = subprocess.run([sys.executable, "-c", SWALLOWED], capture_output=True, text=True, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", SWALLOWED], capture_output=True, text=True, check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # that in the background of a shell is ignored
+    )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
 
 

@@ -25,8 +25,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from testbed import interrupts
 from testbed.errors import UserError, printable
-from testbed.interrupts import Interrupted
 from testbed.mavlink.link import CONNECT_TIMEOUT_S, in_use, log_path, resolve
 
 Turn: TypeAlias = tuple[float, list[Any]]  # a clock [s] and the messages that have come up to then
@@ -73,8 +73,11 @@ def watch(source: str, console: Console, speed: float) -> None:
         speed, turns = 1.0, _live(source)
     else:
         turns = _replay(path, speed if console.is_terminal else math.inf)
-    with contextlib.closing(turns), contextlib.suppress(KeyboardInterrupt, Interrupted):
-        (_draw if console.is_terminal else _write)(picture, turns, console, speed)
+    with contextlib.closing(turns):
+        try:
+            (_draw if console.is_terminal else _write)(picture, turns, console, speed)
+        except interrupts.INTERRUPTS:
+            interrupts.taken()
     if not console.is_terminal:
         console.print(picture.render())
 

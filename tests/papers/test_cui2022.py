@@ -198,7 +198,7 @@ def test_claims_can_fail(draw: Draw) -> None:
         score = star.scores[fault]
         assert score.detection is not None
         star.scores[fault] = score._replace(detection=replace(score.detection, delay=delay))  # type: ignore[index]
-    star.scores["latitude"] = star.scores["latitude"]._replace(most=False)  # type: ignore[index]
+    star.scores["latitude"] = star.scores["latitude"]._replace(isolated=False)  # type: ignore[index]
     star.largest["velocity"][2] = 0.6
     sound = spoilt.healthy[WITH_STAR]._replace(refused=4, isolated=3)
     spoilt = spoilt._replace(kept=0.5, healthy={WITH_STAR: sound})
