@@ -109,22 +109,24 @@ class FixDoubt:
     def __init__(self) -> None:
         self._refused = np.zeros(MOTION)  # by how much fixes that agree with each other contradict the estimate
         self._off, self._variance = np.zeros(3), np.zeros(3)  # of this place from the first
-        self._since = self._lasted = 0.0
+        self._since, self._lasted = math.nan, 0.0
 
     def begin(self, t: float, *receivers: GnssMonitor) -> None:
-        """There is one place, since ``t`` [s], or another where one of the ``receivers`` was before it jumped."""
-        self._refused[:], self._off[:], self._variance[:] = 0.0, 0.0, 0.0
-        before, self._since, self._lasted = self._since, t, 0.0
-        for receiver in receivers:
-            if (moved := receiver.moved) is not None:
-                self._since = before
-                self.gave_in(receiver.since, moved, np.zeros(3), alone=True)
-                return
+        """A filter begins at ``t`` [s], where one of the ``receivers`` may have jumped to.
+
+        What was doubted before still is, when it begins anew: it is the same receivers that tell it where.
+        """
+        self._refused[:] = 0.0
+        if not math.isfinite(self._since):
+            self._since = t
+        moved = [receiver for receiver in receivers if receiver.moved is not None]
+        if moved and (jump := moved[0].moved) is not None:
+            self.gave_in(moved[0].since, *jump, alone=True)
 
     def heard(self, position: Array, velocity: Array, receiver: GnssMonitor) -> None:
         """The latest fix of a receiver, which has judged it, is off the filter by so much (3,) [m, m/s]."""
         if self.pending and receiver.believed is not None:  # the filter's own position became less sure than that
-            self.gave_in(receiver.since, receiver.believed, np.zeros(3), alone=True)
+            self.gave_in(receiver.since, *receiver.believed, alone=True)
         self._refused[:] = 0.0
         if receiver.contradicted:
             self._refused[POS : POS + 3], self._refused[VEL : VEL + 3] = position, velocity
@@ -137,14 +139,16 @@ class FixDoubt:
     def gave_in(self, t: float, off: Array, variance: Array, alone: bool) -> None:
         """Fixes are believed that lay ``off`` (3,) [m], known to a ``variance`` (3,) [m^2], and from ``t`` [s] on.
 
-        They did ``alone``, or the filter's velocity or the wind said so as well, which leaves no doubt. Nor does one
-        that has come back to the first place.
+        They did ``alone``, or the filter's velocity or the wind said so as well, which adds no doubt. Those that have
+        come back to the first place leave none. One much smaller than those before leaves the time that they have had.
         """
-        if not alone:
-            self.begin(t)
-        elif t > self._since:  # else it knows of these
-            self._off += off
-            self._variance += variance
+        self._refused[:] = 0.0
+        back = np.sum((self._off + off) ** 2) < 0.25 * np.sum(self._off**2)
+        if not (alone or back) or not t > self._since:  # it knows of these
+            return
+        self._off += off
+        self._variance += variance
+        if not self._lasted or np.sum(off**2) > 0.25 * np.sum(self._off**2):
             self._since, self._lasted = t, t - self._since
 
     def off(self, t: Array) -> Array:

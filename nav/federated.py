@@ -88,7 +88,6 @@ class Federated:
         self._last_bad = self._last_unsound = self._last_fused = -math.inf
         self._fused_at = self._remembered_at = -math.inf
         self._doubts = Doubts(self.locals, config.patience_s, gate.threshold(3))
-        self._kept: set[str] = set()  # isolated sensors of which no filter holds anything false
         self._aligning = self._alignment_aids()
         used = [monitored.aid for local in config.locals for monitored in local.sensors]
         self._alignment = Alignment.from_aids(config.imu, [*self._aligning.values(), *used], config.alignment_s)
@@ -143,7 +142,7 @@ class Federated:
         self.t = self._last_fused = self._fused_at = self._remembered_at = initial.t
         self.realignment.begin(initial.t)
         self._doubts.begin(initial.t)
-        self._kept.clear()
+        self._master.kept.clear()
 
     def propagate(self, imu: ImuSamples) -> None:
         """Advance by a block of increments; a non-finite or impossible one is bridged with the last sound rates."""
@@ -325,8 +324,8 @@ class Federated:
         decision, changed = monitor.judge(nu_judged, filter_.as_judged(part, sample, S_judged), t)
         if changed:
             self._note(t, filter_, sample.sensor, part, monitor)
-            if changed is Change.READMITTED:
-                self._kept.discard(sample.sensor)
+            if changed is Change.READMITTED and not any(w.suspect for w in monitors):
+                self._master.kept.discard(sample.sensor)
             if changed is Change.ISOLATED:
                 self._take_back(state, filter_, sample, monitor)
                 again = filter_.measure(self._reference, state, filter_.aids[sample.sensor], part, sample)
@@ -370,7 +369,7 @@ class Federated:
         of the fault (`_take_back`).
         """
         everyone = np.ones(len(self.locals))
-        kept = self.config.recall_s is not None or sample.sensor in self._kept
+        kept = self.config.recall_s is not None or sample.sensor in self._master.kept
         healthy = everyone if kept else self._master.sound(state)
         master = self._master.combine(state, healthy if healthy.any() else everyone)
         measurement = filter_.measure_at_nominal(self._reference, state, filter_.aids[sample.sensor], part, sample)
@@ -391,8 +390,9 @@ class Federated:
 
         That is nothing where it was far off at once, and was refused since: where others know much less they stay.
         """
-        if monitor.sudden and self._master.rests_on(state, faulty.row):
-            self._kept.add(sample.sensor)
+        kept = self._master.kept
+        if sample.sensor in kept or (monitor.sudden and self._master.rests_on(state, faulty.row)):
+            kept.add(sample.sensor)
         elif self.config.recall_s is None:
             self._master.start_again(state, faulty, sample.sensor)
         else:
@@ -448,7 +448,7 @@ class Federated:
                     filter_.monitor(monitored, self.config.patience)
                     for part, monitor in zip(monitored.aid.parts, filter_.of_sensor[monitored.aid.sensor], strict=True):
                         self._note(sample.t, filter_, monitored.aid.sensor, part[0], monitor)
-        self._kept.clear()
+        self._master.kept.clear()
         self._widen(state, sample)
 
     def _widen(self, state: State, sample: Sample) -> None:

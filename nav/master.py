@@ -36,6 +36,7 @@ class MasterFilter:
         self.shares = config.shares
         self._config, self._filters, self._reference, self._copies = config, filters, reference, copies
         self._everyone = np.ones(len(filters))
+        self.kept: set[str] = set()  # isolated sensors of which no filter holds anything false
         self._extra = self._extras()
         common = filters[0].model.slices.items()
         self._common = [(name, at) for name, at in common if at.start < reference.common and name not in REPORTED]
@@ -63,8 +64,11 @@ class MasterFilter:
         return self.shares if self._config.combination == "information" else self._everyone
 
     def healthy(self) -> Array:
-        """1 for each local filter without an isolated part, 0 for the others."""
-        return np.array([not any(w.suspect for w in f.monitors.values()) for f in self._filters], dtype=float)
+        """1 for each local filter without an isolated part, but of sensors that are `kept`, 0 for the others."""
+        isolated = [
+            any(w.suspect and sensor not in self.kept for (sensor, _), w in f.monitors.items()) for f in self._filters
+        ]
+        return 1.0 - np.array(isolated, dtype=float)
 
     def lost(self, state: State) -> npt.NDArray[np.bool_]:
         """Which filters know nothing of their position any more (filters,)."""
@@ -79,6 +83,7 @@ class MasterFilter:
     def rests_on(self, state: State, row: int) -> bool:
         """Whether the position is known by one filter, which has an isolated part, and no sound one contradicts it."""
         sound, place = self.sound(state), slice(POS, POS + 3)
+        sound[row] = 0.0
         if not sound.any():
             return True
         others, everyone = self.combine(state, sound), self.combine(state, self._everyone)

@@ -198,6 +198,7 @@ def report(run_file: RunFile, force: Force = False) -> None:
     kept = run_file.parent / METRICS
     with held(run_file.parent):
         if not kept.exists() or not dataset.attrs["complete"]:  # the run was killed, perhaps since they were written
+            require_own(run_file.parent, [METRICS], force)
             metrics.save(computed, kept)
     conclude(dataset, computed, run_file, True, force)
 

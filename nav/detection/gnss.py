@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,16 @@ class Verdict(Enum):
     RECOVER = auto()  # outside the gate, but consistent for so long that the filter must be wrong
 
 
+class Moved(NamedTuple):
+    """By how much fixes have moved, along n (3,) [m], and the variance that it is known to (3,) [m^2]."""
+
+    off: Array
+    variance: Array
+
+
+NOT_MOVED = Moved(np.zeros(3), np.zeros(3))
+
+
 @dataclass
 class GnssMonitor:
     """Decides on each GNSS fix so that a good receiver is never shut out for ever and a bad fix never pulls the filter.
@@ -55,7 +66,7 @@ class GnssMonitor:
     consistency_gate: float  # chi-square limit for the jump between two fixes, three degrees of freedom
     last_fused: float = -math.inf
     contradicted: bool = False  # by the latest fixes, which agree with each other and lie outside the gate
-    believed: Array | None = None  # of the latest fix, if it was fused: by how much it had `moved`
+    believed: Moved | None = None  # of the latest fix, if it was fused: by how much it had `moved`
     unexplained: bool = False  # the last recovery: nothing but the fixes speaks against the filter
     _streak_start: float = math.nan
     _interval: float = math.inf  # the shortest between two epochs, with a fix or without: what the receiver can do
@@ -65,7 +76,7 @@ class GnssMonitor:
     _begun: GnssSample | None = None  # the first of the streak, or the last fused
     _moved: Array = field(default_factory=lambda: np.zeros(3))  # since then, by velocities [m]
     _jumped: Array | None = None  # by how much the latest one is off the one before (3,), if they don't agree [m]
-    _jumps: Array = field(default_factory=lambda: np.zeros(3))  # the sum of these, none being used between [m]
+    _jumps: Moved = NOT_MOVED  # the sum of these, none being used between
     _strayed: float = -math.inf  # when one last did not agree with its first, or two in a row jumped alike
     _turned: float = 0.0  # and what turns may add to that, over `TURN_ERROR`: the sum of dt^3 [s^3]
 
@@ -88,14 +99,14 @@ class GnssMonitor:
             before, self._jumped = self._jumped, self._off(fix, v_n)
             # One that stands still falls behind time and again. One that jumps, or jumps back, may be sound again.
             self._strayed = fix.t if before is not None and before @ self._jumped > 0 else -math.inf
-            gap = self._previous is None or fix.t - self._previous[0].t > max(PROBATION_S, 2 * self._interval)
-            used = self.last_fused >= self._streak_start
-            self._jumps = np.zeros(3) if gap else self._jumped if used else self._jumps + self._jumped
+            self._add(fix, self._jumped, sigma_v)
             self._begin(fix)
             self._was_aided = fix.t - self.last_fused <= self._longest_gap()
         else:
             self._jumped = None
             if self._strays(fix, sigma_v):
+                if self.last_fused >= self._streak_start:
+                    self._jumps = NOT_MOVED
                 self._begin(fix)
                 self._strayed = fix.t
         self._previous = (fix, v_n)
@@ -111,8 +122,8 @@ class GnssMonitor:
         else:
             verdict = Verdict.RECOVER if lasted >= wait else Verdict.REJECT
         self.contradicted = verdict is Verdict.REJECT and lasted >= self.probation_s
-        if verdict is Verdict.RECOVER:
-            self.unexplained = alone
+        if verdict is Verdict.RECOVER:  # a jump is none of the filter's, though an outlier has come since
+            self.unexplained = alone or (self.moved is not None and odds < SURE and not both)
         self.believed = self.moved if verdict is Verdict.FUSE else None
         if verdict in (Verdict.FUSE, Verdict.RECOVER):
             self.last_fused = fix.t
@@ -126,9 +137,11 @@ class GnssMonitor:
         return self._streak_start
 
     @property
-    def moved(self) -> Array | None:
-        """By how much (3,) [m] its fixes have jumped, if they have and none was used since."""
-        return self._jumps if self.last_fused < self._streak_start and self._jumps.any() else None
+    def moved(self) -> Moved | None:
+        """By how much its fixes have jumped, all together, if they have and none was used since."""
+        off, variance = self._jumps
+        known = self.last_fused < self._streak_start and off.any()
+        return self._jumps if known and np.sum(off**2 / variance) > self.consistency_gate else None
 
     def sure(self, t: float, before: float) -> bool:
         """Whether a fix at ``t`` [s] inside the gate is to be fused whatever it is, if that at ``before`` was."""
@@ -172,6 +185,17 @@ class GnssMonitor:
         self._moved += moved
         self._turned += dt**3
         return jump(before, fix, moved, dt * sigma_v, dt**3) <= self.consistency_gate
+
+    def _add(self, fix: GnssSample, off: Array, sigma_v: Array) -> None:
+        """Add a jump to those before, if none of their fixes was used; one in a gap is none that anybody knows."""
+        before = self._previous[0] if self._previous is not None else fix
+        dt = fix.t - before.t
+        if self._previous is None or dt > max(PROBATION_S, 2 * self._interval):
+            self._jumps = NOT_MOVED
+            return
+        variance = fix.sigma_position_n**2 + before.sigma_position_n**2 + (dt * sigma_v) ** 2 + JUMP_FLOOR**2
+        sum_ = NOT_MOVED if self.last_fused >= self._streak_start else self._jumps
+        self._jumps = Moved(sum_.off + off, sum_.variance + variance)
 
     def _off(self, fix: GnssSample, v_n: Array) -> Array:
         """Where ``fix`` is, seen from where the one before it and the mean of both velocities say (3,) [m]."""

@@ -113,6 +113,7 @@ def run(
     if (folder / RECORD).resolve() == Path(scenario).resolve():
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with output_folder(folder):
+        far_end = flown or _far_end(loaded, px4, ardupilot, gps_input, pilot)
         with held(folder):  # a log that another run is writing is not to be begun anew
             _require_own(loaded, folder, report, force)
             links = _connect(
@@ -126,7 +127,6 @@ def run(
                 readonly=mavlink_readonly,
                 key=mavlink_key,
             )
-        far_end = flown or _far_end(loaded, px4, ardupilot, gps_input, pilot)
         result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
         with interrupts.leaving(lambda: _shows(folder / RECORD, "the record is")):
             conclude(result.dataset, result.metrics, folder / RECORD, report, force)

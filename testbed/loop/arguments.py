@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
@@ -53,13 +53,15 @@ class Setup:
         )
 
 
-def require_sound(scenario: Any, out: Any, progress: Any, links: Sequence[Any]) -> None:
-    """Raise UserError where an argument of `run` is of no type that it could have."""
+def require_sound(scenario: Any, out: Any, progress: Any, others: Mapping[str, Any]) -> None:
+    """Raise UserError where an argument of `run` is of no type that it could have, TypeError where it has none so."""
+    for name in others.keys() - Others.__annotations__.keys():
+        raise TypeError(f"run() got an unexpected keyword argument {name!r}")
     if not isinstance(scenario, Scenario):
         raise UserError(f"run: give a Scenario, such as Scenario.load({str(scenario)!r})")
     if not isinstance(out, str | Path | None) or out == "":
         raise UserError(f"run: out: give a folder, not {repr(out) if isinstance(out, str) else type(out).__name__}")
-    if not all(callable(getattr(link, "publish", None)) for link in links):
+    if not all(callable(getattr(link, "publish", None)) for link in others.get("links", ())):
         raise UserError("run: links: give publishers, such as testbed.mavlink.MavlinkPublisher(addresses, scenario)")
     if progress is not None and not callable(progress):
         raise UserError(f"run: progress: give a function that is told how far it is, not {type(progress).__name__}")

@@ -99,7 +99,7 @@ def run(
     end; when it fails the run ends. Same scenario, seed and requests, same bits. Raises UserError when the folder
     can't be written, the motion can't be started, or the seed or ``shown`` is none.
     """
-    require_sound(scenario, out, progress, others.get("links", ()))
+    require_sound(scenario, out, progress, others)
     with ExitStack() as ending:
         for link in others.get("links", ()):
             ending.callback(link.close)

@@ -39,11 +39,12 @@ def estimator(kind, model=CONSUMER):
     return Federated(Config(model, locals_), lambda *_: FIELD_N)
 
 
-def flown(kind, back_s):
+def flown(kind, back_s, outlier_s=np.inf):
     """Errors to the north and their claims [m] at each second [s]."""
     truth, rng = flight(120.0), np.random.default_rng(56101)
     increments, *_ = imu(truth, CONSUMER, rng)
     fixes = [jumped(one, back_s) for one in gnss(truth, rng, 5.0)]
+    fixes = [replace(one, h=one.h + 60.0) if outlier_s <= one.t < outlier_s + 0.3 else one for one in fixes]
     samples = fixes + magnetometer(truth, rng) + barometer(truth, rng, 5.0)
     estimates, _ = feed(FusionHorizon(estimator(kind)), increments, samples)
     return against(truth, estimates)
@@ -72,6 +73,26 @@ def test_hundreds_of_metres_are_not_claimed_as_one(kind):
 
 @pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_an_outlier_after_it_takes_nothing_of_the_doubt(kind):
+    """It begins a streak that would be one after an outage; and adds nothing: the jump is as large as it was."""
+    t, error, claim = flown(kind, np.inf, outlier_s=52.0)
+    led = (t > JUMPED_S + 2.0) & (np.abs(error) > 100.0)
+    assert led.sum() > 40
+    assert (np.abs(error[led]) < 3.0 * claim[led]).all()
+    assert (claim[led] < 1.1 * NORTH).all()
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_a_short_jump_that_nobody_gave_in_to_leaves_none(kind):
+    t, error, claim = flown(kind, JUMPED_S + 5.0)
+    _, _, undisturbed = flown(kind, 0.0)
+    assert np.abs(error[t > 5.0]).max() < 5.0
+    assert claim[-1] == pytest.approx(undisturbed[-1], rel=0.05)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("kind", ["ins", "federated"])
 def test_one_that_came_back_leaves_no_doubt(kind):
     t, error, claim = flown(kind, 85.0)
     assert np.abs(error[(t > 75.0) & (t < 84.0)]).min() > 250.0  # it had given in
@@ -94,7 +115,7 @@ def test_how_likely_the_place_before_is_right():
     assert wrong == pytest.approx(after / (after + before), abs=0.03)
 
 
-def test_what_is_claimed_falls_with_time_and_is_forgotten_where_the_filter_was_wrong():
+def test_what_is_claimed_falls_with_time_and_lasts_until_the_receiver_comes_back():
     doubt, t = FixDoubt(), np.array([100.0, 130.0, 400.0])
     doubt.begin(0.0)
     assert not doubt.off(t).any()
@@ -106,8 +127,14 @@ def test_what_is_claimed_falls_with_time_and_is_forgotten_where_the_filter_was_w
     doubt.heard(np.array([0.0, 0.0, 90.0]), np.zeros(3), receiver)
     assert doubt.off(t)[:, POS + 2] == pytest.approx(np.full(3, 90.0))  # the larger counts
     doubt.heard(np.zeros(3), np.zeros(3), replace(receiver, contradicted=False))
+    before = doubt.off(t)
     doubt.gave_in(200.0, np.array([0.0, 500.0, 0.0]), np.zeros(3), alone=False)
-    assert not doubt.off(t + 200.0).any()
+    doubt.begin(210.0)
+    assert np.array_equal(doubt.off(t), before)  # the receiver is where it was
+    doubt.gave_in(220.0, np.array([0.0, 1.0, 0.0]), np.zeros(3), alone=True)
+    assert doubt.off(t)[1] == pytest.approx(before[1], abs=2.0)  # nor has it had less time for that
+    doubt.gave_in(300.0, np.array([-3.0, 39.0, 0.0]), np.ones(3), alone=False)
+    assert not doubt.off(t + 300.0).any()  # it has come back
 
 
 def poor_flight(last_s, back_s):
