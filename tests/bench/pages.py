@@ -31,7 +31,7 @@ def _page(what: str, dataset: xarray.DataTree, opens_s: float, effort: Effort) -
         path = Path(folder) / "report.html"
 
         def make() -> None:
-            path.write_text(page.render("run.html", figures=[], **page.told(Run(dataset), {})), "utf-8")
+            path.write_text(page.render("run.html", figures=[], **page.content(Run(dataset), {})), "utf-8")
 
         yield Row(f"page of {what}: to make, CPU", tuple(cpu_seconds(make) for _ in range(effort.rounds)), "s")
         yield Row(f"page of {what}: size", (path.stat().st_size / 1e6,), "MB", at_most=8.0)
