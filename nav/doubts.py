@@ -156,7 +156,8 @@ class FixDoubt:
 
         That is by fixes that are refused now, or by the place before, if that is farther.
         """
-        off = np.tile(self._refused, (len(t), 1))
+        off = np.empty((len(t), MOTION))
+        off[:] = self._refused
         if self._lasted > 0.0:
             wrong = self._lasted / (self._lasted + t - self._since)
             way = np.sqrt(np.maximum(self._off**2 - self._variance, 0.0)) * np.sign(self._off)
