@@ -151,6 +151,8 @@ def test_a_record_without_rows_is_none_to_be_shown(tmp_path: Path) -> None:
     assert not _has_rows(tmp_path / "run.nc")
     run(Scenario.load("u_turn", {"duration_s": 2, "expect": {}}), out=tmp_path / "flown")
     assert _has_rows(tmp_path / "flown/run.nc")
+    (tmp_path / "damaged.nc").write_bytes((tmp_path / "flown/run.nc").read_bytes()[:1000])
+    assert _has_rows(tmp_path / "damaged.nc")  # nobody knows, so that it must not be removed
 
 
 SWALLOWED = """

@@ -321,12 +321,16 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 
 
 def _has_rows(record: Path) -> bool:
-    """Whether there is a row of truth in a record, without which it shows nothing."""
+    """Whether there is a row of truth in a record, without which it shows nothing; one that can't be read may have."""
     from h5py import File
 
-    with suppress(OSError, KeyError, ValueError), File(record, "r") as file:
-        return math.isfinite(file["truth/time"][0])
-    return False
+    try:
+        with File(record, "r") as file:
+            return math.isfinite(file["truth/time"][0])
+    except (KeyError, ValueError):
+        return False
+    except OSError:
+        return record.is_file() and record.stat().st_size > 0
 
 
 def _nothing(record: Path, before: tuple[int, int] | None) -> str:
