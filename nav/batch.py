@@ -97,7 +97,10 @@ class Taker(Protocol):
         ...
 
     def took(self, sample: Sample) -> None:
-        """A sample was used, at least the first part of it, or said that there is no fix."""
+        """A sample was used, at least the first part of it, or said that there is no fix.
+
+        Of what is no fix it is told the last of many.
+        """
         ...
 
     def finish(self, sample: Sample, first: int) -> list[UpdateReport]:
@@ -175,23 +178,13 @@ class Batch:
             for filter_, silence in zip(listening, silences, strict=True):
                 filter_.silence = silence
             listening = []
-        first, then = steps.next, iter(when.tolist())
-        status: list[Status] = []
-        for sample, what in zip(steps.samples[first : first + done.steps], plan[:, WHAT].tolist(), strict=False):
-            if sample is not None:
-                taker.took(sample)
-                if what >= 0:
-                    taker.realignment.took(sample.sensor)
-                    for filter_ in listening:
-                        filter_.stand_in(sample)
-            elif what == ESTIMATE:
-                status.append(taker.status(*next(then)))
+        status = self._tell(taker, steps, plan[: done.steps, WHAT], when.tolist(), listening)
         if status:
             drafted = len(status)
             estimates.append(taker.told(wholes[:drafted], when[:drafted, 0], status))
         if not done.parts:
             return done.steps, done.last_bad
-        sample = steps.samples[first + done.steps]
+        sample = steps.samples[steps.next + done.steps]
         assert sample is not None
         taker.took(sample)
         further = taker.finish(sample, done.parts)
@@ -200,6 +193,37 @@ class Batch:
         for filter_ in self._listening:
             filter_.stand_in(sample)
         return done.steps + 1, done.last_bad
+
+    @staticmethod
+    def _tell(
+        taker: Taker, steps: Steps, what: Array, when: Sequence[Sequence[float]], listening: Sequence[LocalFilter]
+    ) -> list[Status]:
+        """Tell of the samples of the next steps, of which ``what`` was done; the status at each estimate on the way.
+
+        Of fixes and estimates in their order; of another sensor's samples the last, as one says what all do.
+        """
+        first, stop = steps.next, steps.next + len(what)
+        turns: list[int] = (np.flatnonzero(what == ESTIMATE) + first).tolist()
+        for sensor, own in steps.plan.of.items():
+            own = own[bisect_left(own, first) : bisect_left(own, stop)]
+            if any(what[k - first] >= 0 for k in own):
+                taker.realignment.took(sensor)
+            if own and isinstance(sample := steps.samples[own[-1]], GnssSample):
+                turns += own
+            elif own:
+                taker.took(sample)
+        status, then = [], iter(when)
+        for k in sorted(turns):
+            sample = steps.samples[k]
+            if sample is None:
+                status.append(taker.status(*next(then)))
+            else:
+                taker.took(sample)
+        used = (np.flatnonzero(what >= 0) + first).tolist() if listening else []
+        for k in used:
+            for filter_ in listening:
+                filter_.stand_in(cast(Sample, steps.samples[k]))
+        return status
 
     def _reports(self, plan: Array, rows: Array) -> FusedReports:
         """The reports on what was just done, of which monitors are told, too."""

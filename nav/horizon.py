@@ -98,6 +98,8 @@ class FusionHorizon:
         had not arrived.
         """
         lag_s, queue = self.lag_s, self._queue
+        if not self.estimator.listening:
+            samples = ()
         for count, sample in enumerate(samples, self._count):
             t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
             known = sample.t_arrival - lag_s  # not before, however early it is handed over
@@ -151,18 +153,21 @@ class FusionHorizon:
         lag = self.lag_s if self.estimator.listening else 0.0
         queue, accepts, due = self._queue, self.estimator.accepts, 0
         all_times = [*times, float(self._ahead.imu.t[-1])]
-        told: list[tuple[float, float, Sample | None]] = []
+        steps = Steps()
+        t_of, horizons, samples = steps.t, steps.horizon, steps.samples
         for t, end in zip(all_times, self._ahead.ends_by(all_times), strict=True):
             horizon = end - lag
             while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
                 turn, _, _, sample = queue[due]
                 if accepts(sample):
-                    told.append((sample.t, turn, sample))
+                    t_of.append(sample.t)
+                    horizons.append(turn)
+                    samples.append(sample)
                 due += 1
-            told.append((t, horizon, None))
+            t_of.append(t)
+            horizons.append(horizon)
+            samples.append(None)
         del queue[:due]
-        t_of, horizons, samples = zip(*told, strict=True)
-        steps = Steps([*t_of], [*horizons], [*samples])
         steps.t[-1] = math.nan
         while steps.next < len(steps.t):
             taken = estimator.take(steps, self._ahead, reports, estimates)

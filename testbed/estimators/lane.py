@@ -94,7 +94,9 @@ class Lane:
         if self.commanded is not None:
             self.commanded(commanded)
         increments, votes = self.increments(imu)
-        handed = [sample for aid in self.sensors for sample in self._thinned(aid, samples[aid])]
+        handed: list[Sample] = []
+        for aid in self.sensors:
+            handed += self._thinned(aid, samples[aid])
         if self.standing is not None:
             handed += self.standing.heard(increments, handed)
         reports, estimates = self.horizon.track(increments, handed, times)

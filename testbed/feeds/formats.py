@@ -45,6 +45,7 @@ OTHERS = (
     ((b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00", b"\x28\xb5\x2f\xfd", b"7z\xbc\xaf"), "is compressed: unpack it first"),
     ((b"\xff\xfe", b"\xfe\xff"), "is text in UTF-16: save it as UTF-8"),
     ((b"MATLAB 7.3 MAT-file",), "is a MATLAB file of version 7.3: save it with -v7"),
+    ((b"{", b"[{", b"[\n"), "is JSON: write it as a table, as CSV say, or give the log that it was made of"),
     ((b"version https://git-lfs",), "is a pointer of Git LFS in place of the log: fetch that with `git lfs pull`"),
 )
 
@@ -107,13 +108,13 @@ def known(path: Path) -> Format:
     for one in FORMATS:
         if head.startswith(one.begins) or (one.line and b"\n" + one.line in head):
             return one
+    for begins, told in OTHERS:
+        if head.startswith(begins):
+            raise UserError(f"{path}: {told}")
     if is_table(head):
         return CSV
     if head[8:9] in (b"\xfd", b"\xfe"):
         what = "a telemetry log, which has no inertial data at their rate"
         raise UserError(f"{path}: is {what}: give the log that the autopilot kept on board")
-    for begins, told in OTHERS:
-        if head.startswith(begins):
-            raise UserError(f"{path}: {told}")
     names = ", ".join(one.name for one in (*FORMATS, CSV))
     raise UserError(f"{path}: is no log of a known format: these are {names}")

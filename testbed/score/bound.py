@@ -169,24 +169,28 @@ def variances(P: Array, Phi: Array, decay: Array, variance: Array, H: Array) -> 
     found, work = np.empty((steps, moving)), np.empty((moving, n))
     W = np.empty((measured, n))  # P h of each measurement, after those before it, over the root of its variance
     minus = np.empty((measured, n))
+    sees = np.empty(n, np.int64)  # the states that a measurement is of, which are few
     for k in range(steps):
         predict(P, Phi[k], decay[k], 0.5 * variance[k], work)
         seen = 0
         for h in H[k]:
+            few = 0
             w = W[seen]
             w[:] = 0.0
             s = 1.0
             for i in range(n):
                 if h[i] != 0.0:
+                    sees[few] = i
+                    few += 1
                     for j in range(n):
                         w[j] += h[i] * P[i, j]
             for before in W[:seen]:
                 told = 0.0
-                for i in range(n):
+                for i in sees[:few]:
                     told += before[i] * h[i]
                 for j in range(n):
                     w[j] -= told * before[j]
-            for i in range(n):
+            for i in sees[:few]:
                 s += h[i] * w[i]
             if s > 1.0:
                 for j in range(n):

@@ -172,6 +172,14 @@ def compressed(path: Path) -> None:
     path.write_bytes(gzip.compress(b"t,a\n0.1,2\n"))
 
 
+def json_lines(path: Path) -> None:
+    path.write_text('{"type": "IMU", "data": {"TimeUS": 1, "GyrX": 0.1}}\n{"type": "IMU", "data": {"TimeUS": 2}}\n')
+
+
+def json_list(path: Path) -> None:
+    path.write_text('[\n  {"t": 0.1, "gyro_x": 0.2}\n]\n')
+
+
 def wide_text(path: Path) -> None:
     path.write_text("t,a\n0.1,2\n", encoding="utf-16")
 
@@ -191,6 +199,8 @@ def pointer(path: Path) -> None:
         (pointer, "is a pointer of Git LFS in place of the log"),
         (matlab_7_3, "is a MATLAB file of version 7.3: save it with -v7"),
         (compressed, "is compressed: unpack it first"),
+        (json_lines, "is JSON: write it as a table"),
+        (json_list, "is JSON: write it as a table"),
         (wide_text, "is text in UTF-16: save it as UTF-8"),
         (words, "is no log of a known format"),
         (picture, "is no log of a known format"),
