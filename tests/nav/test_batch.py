@@ -188,6 +188,8 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         assert all(map(same, estimates, told))
         assert np.array_equal(ins._state.whole, other._state.whole)
         assert same(ins._monitor, other._monitor)
+        assert same(ins._refusals, other._refusals)
+        assert same(ins.realignment._heading._refusals, other.realignment._heading._refusals)
 
 
 def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
