@@ -48,7 +48,7 @@ from nav.monitor import shown_limits
 from nav.realignment import Realignment, tilt_is_lost
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
 from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
-from nav.state import State, absorb, parts, propagate
+from nav.state import State, absorb, draft, parts, propagate
 
 SPLIT = -3  # of a step, in place of the number of an aid: it only ends an increment
 WIDTH = NUMBERS + 12
@@ -366,7 +366,7 @@ def follow(
         if stop > row or settle:
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
-                dtheta[row:stop], dv[row:stop], dt[row:stop], settle and not split,
+                dtheta[row:stop], dv[row:stop], dt[row:stop], settle and not split, n,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, t[row + bad])
@@ -380,20 +380,20 @@ def follow(
             further = 0.0 if abs(time - now) <= COINCIDENT else time - max(t[stop - 1], now)
             if further > longest + COINCIDENT:
                 return k, 0, row, now, last_bad, written, drafted
-            draft, bad_then, then = estimates[drafted], last_bad, now if stop == row else t[stop - 1]
-            for i in range(len(whole)):
-                draft[i] = whole[i]
+            drawn, bad_then, then = estimates[drafted], last_bad, now if stop == row else t[stop - 1]
+            draft(drawn, whole, common, filters, n)
             bad = propagate(
-                draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
+                drawn, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
                 period * PREDICTED_PERIODS, dtheta[row:stop], dv[row:stop], dt[row:stop], further <= COINCIDENT,
+                common,
             )  # fmt: skip
             if bad >= 0:
                 bad_then = max(bad_then, t[row + bad])
             if further > COINCIDENT:
                 share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
                 bad = propagate(  # not with a literal, for which it would be compiled anew
-                    draft, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
-                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, further > COINCIDENT,
+                    drawn, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
+                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, further > COINCIDENT, common,
                 )  # fmt: skip
                 then = time
                 if bad >= 0:
@@ -406,7 +406,7 @@ def follow(
             take_off(one_dt, one_angle, one_push, dt, dtheta, dv, row)
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
-                one_push, one_dt, settle,
+                one_push, one_dt, settle, n,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, time)

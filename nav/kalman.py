@@ -19,28 +19,30 @@ MARGIN = 1e-14  # by which a covariance scaled to a unit diagonal must be positi
 
 
 @inlined
-def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array) -> None:
+def predict(P: Array, Phi: Array, decay: Array, half_noise: Array, work: Array, first: int) -> None:
     """P <- T P T' + Q, where T = [Phi 0; 0 diag(decay)] in place on ``P`` (n, n).
 
     ``Phi`` (r, c) holds the first r rows, zero beyond column c; ``decay`` (n,) the diagonal of the others (its first r
     entries are not used); ``half_noise`` (n,) is half the variance that each state's white noise adds over the step.
     Adding one half before and one half after is the trapezoid of the integral that defines Q; ``work`` (r, n) or larger
-    is scratch. At least eight states.
+    is scratch. Of the states beyond the ``first`` (at least eight and c; n for all) only the variances are found.
     """
     n = len(P)
     rows, columns = Phi.shape
     for i in range(n):
         P[i, i] += half_noise[i]
-    multiply(work[:rows], Phi, P, 0, columns, work[:0], P, n)
+    multiply(work[:rows], Phi, P, 0, columns, work[:0], P, first)
     for i in range(rows):
         for j in range(i, rows):
             total = 0.0
             for k in range(columns):
                 total += work[i, k] * Phi[j, k]
             P[i, j] = P[j, i] = total
-        for j in range(rows, n):
+        for j in range(rows, first):
             P[i, j] = work[i, j] * decay[j]
-    take_rest(P, decay, rows, n)
+    take_rest(P, decay, rows, first)
+    for i in range(first, n):
+        P[i, i] = P[i, i] * decay[i] * decay[i]
     for i in range(n):
         P[i, i] += half_noise[i]
 

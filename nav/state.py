@@ -110,6 +110,21 @@ def parts(
 
 
 @inlined
+def draft(into: Array, whole: Array, common: int, filters: int, n: int) -> None:
+    """Copy of a ``whole`` what an estimate is made of: all but the covariances of what is not common."""
+    P = FIXED + common + filters * n
+    for i in range(P):
+        into[i] = whole[i]
+    for f in range(filters):
+        for i in range(common):
+            row = P + (f * n + i) * n
+            for j in range(row, row + common):
+                into[j] = whole[j]
+        for i in range(common, n):
+            into[P + (f * n + i) * n + i] = whole[P + (f * n + i) * n + i]
+
+
+@inlined
 def working(room: Array, common: int, n: int) -> tuple[Array, Array, Array, Array]:
     """Where a covariance step works in: two matrices of `transition`, decay and half noise of each state."""
     matrix = MOTION * common
@@ -158,9 +173,12 @@ def inject(q_nb: Array, v_n: Array, lla: Array, imu: Array, correction: Array) -
 def _covariance_step(
     v_n: Array, lla: Array, imu: Array, x: Array, P: Array, errors: Array, sums: Array, elapsed: Array,
     shaking: Array, driven: Indices, decay_rate: Array, variance_rate: Array, in_motion: Array, Phi: Array, FT: Array,
-    decay: Array, half_noise: Array, work: Array,
+    decay: Array, half_noise: Array, work: Array, first: int,
 ) -> None:  # fmt: skip
-    """Take every filter's covariance and states over the time in ``elapsed``, and empty the integrals."""
+    """Take every filter's covariance and states over the time in ``elapsed``, and empty the integrals.
+
+    For ``first`` see `kalman.predict`.
+    """
     T = elapsed[0]
     transition(Phi, FT, driven, v_n, lla[0], lla[2], sums, T)
     common = len(imu)
@@ -185,7 +203,7 @@ def _covariance_step(
         if f == 0:
             for i in range(MOTION, common):
                 imu[i] *= decay[i]
-        predict(P[f], Phi, decay, half_noise, work)
+        predict(P[f], Phi, decay, half_noise, work, first)
     sensor_errors(errors, imu, driven)
     _empty(sums, elapsed)
 
@@ -282,11 +300,12 @@ def sigma_step(
 def propagate(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
     in_motion: Array, room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
+    first: int,
 ) -> int:  # fmt: skip
     """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
 
     A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
-    since it is long to compile.
+    since it is long to compile. Of a `draft` it finds what there is, if ``first`` is ``common``; otherwise that is n.
     """
     q_nb, v_n, lla, imu, x, P, errors, sums, elapsed, rates, shaking, acceleration = parts(whole, common, filters, n)
     Phi, FT, decay, half_noise = working(room, common, n)
@@ -334,7 +353,7 @@ def propagate(
         if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
             _covariance_step(
                 v_n, lla, imu, x, P, errors, sums, elapsed, shaking,
-                driven, decay_rate, variance_rate, in_motion, Phi, FT, decay, half_noise, work,
+                driven, decay_rate, variance_rate, in_motion, Phi, FT, decay, half_noise, work, first,
             )  # fmt: skip
     return bad
 

@@ -171,7 +171,7 @@ def variances(P: Array, Phi: Array, decay: Array, variance: Array, H: Array) -> 
     minus = np.empty((measured, n))
     sees = np.empty(n, np.int64)  # the states that a measurement is of, which are few
     for k in range(steps):
-        predict(P, Phi[k], decay[k], 0.5 * variance[k], work)
+        predict(P, Phi[k], decay[k], 0.5 * variance[k], work, n)
         seen = 0
         for h in H[k]:
             few = 0

@@ -130,7 +130,7 @@ def test_markov_variance_is_stationary_and_its_estimate_decays():
     decay = np.exp(-0.05 * model.decay_rate)
     P, Phi, work = np.diag(model.sigma**2), np.eye(MOTION, model.mixing), np.zeros((MOTION, model.size))
     for _ in range(2000):
-        predict(P, Phi, decay, 0.5 * 0.05 * model.density**2, work)
+        predict(P, Phi, decay, 0.5 * 0.05 * model.density**2, work, model.size)
     for name in ("gust", "gyro_drift", "accel_drift"):
         where = model.slices[name]
         np.testing.assert_allclose(np.diag(P)[where], model.sigma[where] ** 2, rtol=2e-4)
@@ -149,7 +149,7 @@ def test_noise_of_long_steps_is_that_of_short_ones():
         error_model.transition(Phi, FT, model.driven, np.array([20.0, 5.0, 0.0]), 0.8, 500.0, sums, T)
         P = np.zeros((model.size, model.size))
         for _ in range(round(2 / T)):
-            predict(P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, np.zeros((MOTION, model.size)))
+            predict(P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, np.zeros((MOTION, model.size)), model.size)
         return P
 
     coarse, fine = covariance(0.05), covariance(0.0005)

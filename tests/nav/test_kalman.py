@@ -26,7 +26,7 @@ def test_predict_is_the_dense_equation(n, columns):
     T[:9, :columns] = Phi
     P = positive(rng, n)
     expected = T @ (P + np.diag(half_noise)) @ T.T + np.diag(half_noise)
-    predict(P, Phi, decay, half_noise, np.empty((9, n)))
+    predict(P, Phi, decay, half_noise, np.empty((9, n)), n)
     np.testing.assert_allclose(P, expected, rtol=1e-12, atol=1e-12)
     assert (P == P.T).all()
 
@@ -78,7 +78,7 @@ def test_positive_after_ten_thousand_sharp_updates():
     Phi = np.eye(9, 15) + 1e-3 * rng.normal(size=(9, 15)) * np.outer(scale[:9], 1 / scale[:15])
     half_noise = (1e-7 * scale) ** 2
     for _ in range(10_000):
-        predict(P, Phi, np.ones(n), half_noise, np.empty((9, n)))
+        predict(P, Phi, np.ones(n), half_noise, np.empty((9, n)), n)
         H = rng.normal(size=(3, n)) / scale
         R = np.full(3, 1e-6)
         nu = rng.normal(size=3)
