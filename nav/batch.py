@@ -45,14 +45,12 @@ from nav.increments import (
 from nav.kalman import scratch
 from nav.local_filter import LocalFilter, own_innovation
 from nav.monitor import shown_limits
+from nav.plan import ANY, SPLIT, Plan, planned
 from nav.realignment import Realignment, tilt_is_lost
 from nav.reference import PREDICTED_PERIODS, Reference, is_near
 from nav.samples import Array, GnssSample, Sample, Status, UpdateReport
 from nav.state import State, absorb, draft, parts, propagate
 
-SPLIT = -3  # of a step, in place of the number of an aid: it only ends an increment
-WIDTH = NUMBERS + 12
-ANY, OTHERWISE = -1, -2  # in place of an aid: no sample, and one that is not plain
 LIMITS = 10  # where the limits of an aid's two parts are among its numbers
 REPORT = 16  # step, part, nis, statistic, innovation (3,), S (9,)
 
@@ -69,17 +67,6 @@ class Done(NamedTuple):
     last_bad: float
     reports: int
     estimates: int
-
-
-class Plan(NamedTuple):
-    """All steps (N, WIDTH) as `follow` takes them; the rows of their aids in the tables (N,), or `ANY`, `OTHERWISE`;
-    which of them are fixes, and which are samples of each sensor.
-    """
-
-    rows: Array
-    aid: npt.NDArray[np.int64]
-    fixes: list[int]
-    of: dict[str, list[int]]
 
 
 class Taker(Protocol):
@@ -202,27 +189,31 @@ class Batch:
 
         Of fixes and estimates in their order; of another sensor's samples the last, as one says what all do.
         """
-        first, stop = steps.next, steps.next + len(what)
+        first, plan = steps.next, steps.plan
+        stop = first + len(what)
         turns: list[int] = (np.flatnonzero(what == ESTIMATE) + first).tolist()
-        for sensor, own in steps.plan.of.items():
-            own = own[bisect_left(own, first) : bisect_left(own, stop)]
-            if any(what[k - first] >= 0 for k in own):
+        for sensor in plan.of:
+            own = plan.own(sensor, first, stop)
+            if not len(own):
+                continue
+            if (what[own - first] >= 0).any():
                 taker.realignment.took(sensor)
-            if own and isinstance(sample := steps.samples[own[-1]], GnssSample):
-                turns += own
-            elif own:
+            sample = cast(Sample, steps.samples[own[-1]])
+            if isinstance(sample, GnssSample):
+                turns += own.tolist()
+            else:
                 taker.took(sample)
         status, then = [], iter(when)
         for k in sorted(turns):
-            sample = steps.samples[k]
-            if sample is None:
+            fix = steps.samples[k]
+            if fix is None:
                 status.append(taker.status(*next(then)))
             else:
-                taker.took(sample)
-        used = (np.flatnonzero(what >= 0) + first).tolist() if listening else []
-        for k in used:
-            for filter_ in listening:
-                filter_.stand_in(cast(Sample, steps.samples[k]))
+                taker.took(fix)
+        for filter_ in listening:  # of the others nothing was to stand in for it
+            assert filter_.silence is not None
+            own = plan.own(filter_.silence.sensor, first, stop)
+            filter_.silence.hear(plan.rows[own[what[own - first] >= 0], TIME].tolist())
         return status
 
     def _reports(self, plan: Array, rows: Array) -> FusedReports:
@@ -252,41 +243,13 @@ class Batch:
                 known[row] = True
         return known
 
-    def _planned(self, steps: Steps) -> Plan:
-        """All ``steps`` as rows for `follow`."""
-        t, horizon = np.array(steps.t), np.array(steps.horizon)
-        rows, aid = np.zeros((len(t), WIDTH)), np.full(len(t), ANY)
-        rows[:, TIME], rows[:, HORIZON], rows[:, WHAT] = t, horizon, np.where(np.isnan(t), ADVANCE, ESTIMATE)
-        of: dict[str, list[int]] = {}
-        for k, sample in enumerate(steps.samples):
-            if sample is not None:
-                of.setdefault(sample.sensor, []).append(k)
-        fixes: list[int] = []
-        for sensor, where in of.items():
-            if sensor not in self._aids:
-                aid[where] = OTHERWISE
-                continue
-            row, plain, _ = self._aids[sensor]
-            on_time = [k for k in where if steps.t[k] == steps.horizon[k]]  # not too late, nor not known when
-            aid[where], aid[on_time] = OTHERWISE, row
-            rows[where, WHAT] = SPLIT
-            telling = [k for k in on_time if _tells(steps.samples[k])]
-            if not telling:
-                continue
-            numbers = plain.numbers([steps.samples[k] for k in telling])
-            rows[telling, NUMBERS : NUMBERS + numbers.shape[1]] = numbers
-            rows[telling, WHAT] = row
-            if isinstance(steps.samples[telling[0]], GnssSample):
-                fixes += telling
-        return Plan(rows, aid, sorted(fixes), of)
-
     def _plan(self, taker: Taker, steps: Steps, last_fix: float) -> tuple[Array, list[Silence]]:
         """The next of the ``steps`` that look plain, as rows for `follow`; the silences once these have been heard.
 
         Whether samples are sound, `follow` finds out itself.
         """
         if steps.plan is None:
-            steps.plan = self._planned(steps)
+            steps.plan = planned(steps, {sensor: (row, aid) for sensor, (row, aid, _) in self._aids.items()})
         plan: Plan = steps.plan
         first, known = steps.next, self._known()[plan.aid[steps.next :]]
         stop = first + (len(known) if known.all() else int(known.argmin()))
@@ -313,8 +276,7 @@ class Batch:
             return stop, silences
         until = plan.rows[first:stop, HORIZON].max()
         for silence in silences:
-            own = plan.of.get(silence.sensor, [])
-            times = [steps.t[k] for k in own[bisect_left(own, first) : bisect_left(own, stop)]]
+            times = plan.rows[plan.own(silence.sensor, first, stop), TIME].tolist()
             if not silence.hears(times, until):
                 break
         else:
@@ -329,11 +291,6 @@ class Batch:
 
     def _silences(self) -> list[Silence]:
         return [copy(filter_.silence) for filter_ in self._listening if filter_.silence is not None]
-
-
-def _tells(sample: Sample | None) -> bool:
-    """Whether there is anything in a sample to be used: there is not in one without a fix."""
-    return not isinstance(sample, GnssSample) or sample.has_fix
 
 
 @njit

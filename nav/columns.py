@@ -1,6 +1,6 @@
-"""Estimates and reports as columns: many at once, from the kernel that made them to the record.
+"""Samples, estimates and reports as columns: many at once, from what made them to the record.
 
-Both are sequences of the single ones (`nav.samples`), for whoever looks at few of them.
+All are sequences of the single ones (`nav.samples`), for whoever looks at few of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,62 @@ from typing import Any, TypeAlias, overload
 import numpy as np
 import numpy.typing as npt
 
-from nav.samples import Array, Estimate, Outcome, Status, UpdateReport
+from nav.samples import Array, Estimate, Outcome, Sample, Status, UpdateReport
+
+MANY = 8  # samples from which on columns take less time than one by one
+
+
+@dataclass(frozen=True, slots=True)
+class Samples(Sequence[Sample]):
+    """Samples of one sensor one after the other: the fields of a ``kind`` of sample, with a row for each of N.
+
+    ``columns`` are in the order of the fields, the sensor being the last. A single one is made when it is asked for.
+    """
+
+    kind: type[Any]
+    sensor: str
+    columns: Mapping[str, Array]
+
+    @property
+    def t(self) -> Array:
+        """When each was true (N,) [s]."""
+        return self.columns["t"]
+
+    @property
+    def t_arrival(self) -> Array:
+        """When each could first have been known (N,) [s]."""
+        return self.columns["t_arrival"]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __iter__(self) -> Iterator[Sample]:
+        for row in zip(*(x.tolist() if x.ndim == 1 else x for x in self.columns.values()), strict=True):
+            yield self.kind(*row, self.sensor)
+
+    @overload
+    def __getitem__(self, which: int) -> Sample: ...
+    @overload
+    def __getitem__(self, which: slice | npt.NDArray[np.bool_]) -> Samples: ...
+
+    def __getitem__(self, which: int | slice | npt.NDArray[np.bool_]) -> Sample | Samples:
+        """One of them, or those of a slice or a mask."""
+        if isinstance(which, slice | np.ndarray):
+            return Samples(self.kind, self.sensor, {name: x[which] for name, x in self.columns.items()})
+        row = (x.item(which) if x.ndim == 1 else x[which] for x in self.columns.values())
+        one: Sample = self.kind(*row, self.sensor)
+        return one
+
+
+def delivered(kind: type[Any], sensor: str, t: Array, latency: float, **columns: Array) -> Sequence[Sample]:
+    """What a sensor measured at ``t`` (N,) [s] and tells ``latency`` [s] later: few samples one by one."""
+    samples = Samples(kind, sensor, {"t": t, "t_arrival": t + latency, **columns})
+    return samples if len(t) >= MANY else [*samples]
+
+
+def column(samples: Sequence[Any], name: str) -> Array:
+    """One field of N samples of one sensor, a row of each."""
+    return samples.columns[name] if isinstance(samples, Samples) else np.array([getattr(one, name) for one in samples])
 
 
 @dataclass(frozen=True, slots=True)

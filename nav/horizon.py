@@ -9,14 +9,21 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Protocol, cast
+from operator import itemgetter
+from typing import Protocol, TypeAlias, cast, overload
 
-from nav.columns import Estimated, Estimates, Reported, Reports
+import numpy as np
+import numpy.typing as npt
+
+from nav.columns import Estimated, Estimates, Reported, Reports, Samples, column
 from nav.increments import COINCIDENT, Increments, Steps, joined, share_of
-from nav.samples import Estimate, ImuSamples, Sample, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
+
+Handed: TypeAlias = Sequence[Sample | Samples]  # one by one, or many of a sensor at once
 
 
 class Estimator(Protocol):
@@ -84,28 +91,21 @@ class FusionHorizon:
         self.coning = coning
         self._raw: ImuSamples | None = None  # last raw increment, for the compensation of the next
         self._ahead = Increments()
-        self._queue: list[tuple[float, str, int, Sample]] = []
+        self._queue: list[tuple[float, str, int, Sample]] = []  # when it is its turn, and who comes first at one time
         self._count = 0
 
-    def push(self, imu: ImuSamples, samples: Sequence[Sample] = ()) -> list[UpdateReport]:
+    def push(self, imu: ImuSamples, samples: Handed = ()) -> list[UpdateReport]:
         """Add consecutive increments and the samples that arrived with them; what became of the samples applied now."""
         return [*self.track(imu, samples, ())[0]]
 
-    def track(self, imu: ImuSamples, samples: Sequence[Sample], times: Sequence[float]) -> tuple[Reports, Estimates]:
+    def track(self, imu: ImuSamples, samples: Handed, times: Sequence[float]) -> tuple[Reports, Estimates]:
         """`push`, and the estimates at ``times`` [s] on the way, ascending, the last less than an increment ahead.
 
         Each is the one that would have been had at its time: it knows no sample younger than ``lag_s``, and none that
         had not arrived.
         """
-        lag_s, queue = self.lag_s, self._queue
         if not self.estimator.listening:
             samples = ()
-        for count, sample in enumerate(samples, self._count):
-            t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
-            known = sample.t_arrival - lag_s  # not before, however early it is handed over
-            queue.append((known if known > t + COINCIDENT else t, sample.sensor, count, sample))
-        self._count += len(samples)
-        queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
         if len(imu):
             ready = compensate(imu, self._raw) if self.coning else imu
             self._raw = ImuSamples(imu.t[-1:], imu.dt[-1:], imu.dtheta[-1:], imu.dv[-1:])
@@ -114,15 +114,27 @@ class FusionHorizon:
         estimates: Estimated = []
         estimator = self.estimator
         if getattr(estimator, "in_steps", False) and self._ahead.next:
-            self._take(cast(TakesSteps, estimator), times, reports, estimates)
+            self._take(cast(TakesSteps, estimator), samples, times, reports, estimates)
             told = Reports(reports)
             return Reports.joined([told]) if len(reports) > 1 else told, Estimates.of(estimates)
+        self._wait(samples)
         for t in times:
             self._use(t, reports)
             estimates.append(self.estimate_at(t))
         if len(self._ahead.imu):
             self._use(float(self._ahead.imu.t[-1]), reports)
         return Reports(reports), Estimates.of(estimates)
+
+    def _wait(self, samples: Handed) -> None:
+        """Let samples wait for their turn."""
+        lag_s, queue = self.lag_s, self._queue
+        for piece in samples:
+            for sample in piece if isinstance(piece, Samples) else (piece,):
+                t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
+                known = sample.t_arrival - lag_s  # not before, however early it is handed over
+                queue.append((known if known > t + COINCIDENT else t, sample.sensor, self._count, sample))
+                self._count += 1
+        queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
 
     def estimate_at(self, t: float) -> Estimate:
         """The state at ``t`` [s], predicted with the increments pushed so far; the estimator itself does not move.
@@ -148,18 +160,37 @@ class FusionHorizon:
             front = joined(front, share_of(last, further / last.dt[0], t))
         return self.estimator.predict(front)
 
-    def _take(self, estimator: TakesSteps, times: Sequence[float], reports: Reported, estimates: Estimated) -> None:
+    def _take(
+        self, estimator: TakesSteps, samples: Handed, times: Sequence[float], reports: Reported, estimates: Estimated
+    ) -> None:
         """`track` of an estimator that takes steps, each that it can't take with others by itself."""
         lag = self.lag_s if self.estimator.listening else 0.0
-        queue, accepts, due = self._queue, self.estimator.accepts, 0
         all_times = [*times, float(self._ahead.imu.t[-1])]
-        steps = Steps()
-        t_of, horizons, samples = steps.t, steps.horizon, steps.samples
-        for t, end in zip(all_times, self._ahead.ends_by(all_times), strict=True):
+        ends = self._ahead.ends_by(all_times)
+        many = [piece for piece in samples if isinstance(piece, Samples)]
+        self._wait([piece for piece in samples if not isinstance(piece, Samples)] if many else samples)
+        steps = self._many_steps(all_times, ends, lag, many) if many else self._steps(all_times, ends, lag)
+        while steps.next < len(steps.t):
+            taken = estimator.take(steps, self._ahead, reports, estimates)
+            if not taken:
+                self._go(steps, reports, estimates)
+            steps.next += max(taken, 1)
+
+    def _steps(self, times: Sequence[float], ends: Sequence[float], lag: float) -> Steps:
+        """What to do up to the ``ends`` of the increments by the ``times``, less the ``lag``."""
+        queue, accepts, due = self._queue, self.estimator.accepts, 0
+        t_of: list[float] = []
+        horizons: list[float] = []
+        samples: list[Sample | None] = []
+        groups: dict[str, tuple[list[int], list[Sample]]] = {}
+        for t, end in zip(times, ends, strict=True):
             horizon = end - lag
             while due < len(queue) and queue[due][0] <= horizon + COINCIDENT:
-                turn, _, _, sample = queue[due]
+                turn, sensor, _, sample = queue[due]
                 if accepts(sample):
+                    where, own = groups.setdefault(sensor, ([], []))
+                    where.append(len(t_of))
+                    own.append(sample)
                     t_of.append(sample.t)
                     horizons.append(turn)
                     samples.append(sample)
@@ -168,16 +199,33 @@ class FusionHorizon:
             horizons.append(horizon)
             samples.append(None)
         del queue[:due]
-        steps.t[-1] = math.nan
-        while steps.next < len(steps.t):
-            taken = estimator.take(steps, self._ahead, reports, estimates)
-            if not taken:
-                self._go(steps, reports, estimates)
-            steps.next += max(taken, 1)
+        t_of[-1] = math.nan
+        return Steps(t_of, horizons, samples, [(sensor, *group) for sensor, group in groups.items()])
+
+    def _many_steps(self, times: Sequence[float], ends: Sequence[float], lag: float, many: list[Samples]) -> Steps:
+        """`_steps` with ``many`` samples more, in arrays."""
+        horizons = np.array(ends) - lag
+        last = float(horizons[-1]) + COINCIDENT
+        due = _Due(self._queue, last, self.estimator.accepts)
+        for own in many:
+            t = np.where(np.isfinite(own.t), own.t, own.t_arrival)
+            known = own.t_arrival - self.lag_s
+            turn = np.where(known > t + COINCIDENT, known, t)
+            count = self._count + np.arange(len(own))
+            self._count += len(own)
+            waits = ~(turn <= last)
+            if waits.any():
+                rest = zip(turn[waits].tolist(), count[waits].tolist(), own[waits], strict=True)
+                self._queue += [(when, own.sensor, number, sample) for when, number, sample in rest]
+                turn, count, own = turn[~waits], count[~waits], own[~waits]
+            if len(own) and self.estimator.accepts(own[0]):
+                due.add(own.sensor, own, turn, count)
+        self._queue.sort()
+        return due.steps(np.array(times), horizons)
 
     def _go(self, steps: Steps, reports: Reported, estimates: Estimated) -> None:
         """Take one step by itself."""
-        t, horizon, sample = steps.t[steps.next], steps.horizon[steps.next], steps.samples[steps.next]
+        t, horizon, sample = float(steps.t[steps.next]), float(steps.horizon[steps.next]), steps.samples[steps.next]
         if sample is not None:
             self._apply(horizon, sample, reports)
             return
@@ -219,3 +267,75 @@ class FusionHorizon:
         whole = self._ahead.whole(t)
         if whole is not None:
             reports += self.estimator.propagate(whole) or ()
+
+
+class _Due:
+    """Samples whose turn has come, by sensor, on their way among the steps that ask for an estimate."""
+
+    def __init__(self, queue: list[tuple[float, str, int, Sample]], last: float, accepts: Callable[[Sample], bool]):
+        """Begin with those of a sorted ``queue``, out of which they are taken, whose turn comes by ``last``."""
+        self._groups: list[tuple[str, Sequence[Sample], Array, npt.NDArray[np.int64]]] = []
+        stop = bisect_right(queue, last, key=itemgetter(0))
+        by_sensor: dict[str, list[tuple[float, str, int, Sample]]] = {}
+        for entry in queue[:stop]:
+            if accepts(entry[3]):
+                by_sensor.setdefault(entry[1], []).append(entry)
+        del queue[:stop]
+        for sensor, own in by_sensor.items():
+            turns, _, counts, samples = zip(*own, strict=True)
+            self.add(sensor, samples, np.array(turns), np.array(counts))
+
+    def add(self, sensor: str, samples: Sequence[Sample], turn: Array, count: npt.NDArray[np.int64]) -> None:
+        """Samples of one sensor, when it is their turn (N,) [s], and their numbers (N,)."""
+        self._groups.append((sensor, samples, turn, count))
+
+    def steps(self, times: Array, horizons: Array) -> Steps:
+        """All of these in their turn, and to go on to ``horizons`` (M,) and say what is known of ``times`` (M,)."""
+        sizes = [len(samples) for _, samples, _, _ in self._groups]
+        asked, total = np.arange(len(times)), sum(sizes) + len(times)
+        t, horizon = np.empty(total), np.empty(total)
+        group, row = np.full(total, -1), np.zeros(total, np.int64)
+        place = np.empty(0, np.int64)  # of each sample, group by group
+        if self._groups:
+            names = sorted({sensor for sensor, _, _, _ in self._groups})
+            turn = np.concatenate([turn for _, _, turn, _ in self._groups])
+            first = np.repeat([names.index(sensor) for sensor, _, _, _ in self._groups], sizes)
+            order = np.lexsort((np.concatenate([count for _, _, _, count in self._groups]), first, turn))
+            before = np.searchsorted(horizons + COINCIDENT, turn[order])  # so many that ask for an estimate
+            place = np.empty(len(order), np.int64)
+            place[order] = before + np.arange(len(order))
+            asked = asked + np.searchsorted(before, asked, side="right")
+            t[place] = np.concatenate([column(samples, "t") for _, samples, _, _ in self._groups])
+            horizon[place] = turn
+            group[place] = np.repeat(np.arange(len(sizes)), sizes)
+            row[place] = np.concatenate([np.arange(size) for size in sizes])
+        t[asked], horizon[asked] = times, horizons
+        t[asked[-1]] = math.nan
+        where = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
+        groups = [(sensor, own, samples) for (sensor, samples, _, _), own in zip(self._groups, where, strict=True)]
+        return Steps(t, horizon, _Merged([samples for _, _, samples in groups], group, row), groups)
+
+
+class _Merged(Sequence[Sample | None]):
+    """The samples of several sensors in the order of the steps that use them, of which some use none."""
+
+    def __init__(
+        self, several: Sequence[Sequence[Sample]], which: npt.NDArray[np.int64], row: npt.NDArray[np.int64]
+    ) -> None:
+        """Of each step ``which`` of the ``several`` its sample is in, -1 for none, and where."""
+        self._several, self._which, self._row = several, which, row
+
+    def __len__(self) -> int:
+        return len(self._which)
+
+    @overload
+    def __getitem__(self, step: int) -> Sample | None: ...
+    @overload
+    def __getitem__(self, step: slice) -> list[Sample | None]: ...
+
+    def __getitem__(self, step: int | slice) -> Sample | list[Sample | None] | None:
+        """The sample of a step, or of those of a slice."""
+        if isinstance(step, slice):
+            return [self[k] for k in range(len(self))[step]]
+        which = int(self._which[step])
+        return None if which < 0 else self._several[which][int(self._row[step])]

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import inlined, njit
 from nav.samples import Array, ImuSamples, Sample
@@ -24,13 +25,14 @@ class Steps:
     """What an estimator is to do, step by step, from the ``next`` one on; those before it are done.
 
     Each time to go on to the ``horizon`` [s] and say what it knows of ``t`` [s], later or the same. With a sample it is
-    to use that, which is valid at ``t``; a ``t`` of NaN asks for nothing. ``plan`` is room for what an estimator makes
-    of all of them at once.
+    to use that, which is valid at ``t``; a ``t`` of NaN asks for nothing. ``groups`` are samples of one sensor each,
+    with the steps that they are used in. ``plan`` is room for what an estimator makes of all of them at once.
     """
 
-    t: list[float] = field(default_factory=list)
-    horizon: list[float] = field(default_factory=list)
-    samples: list[Sample | None] = field(default_factory=list)
+    t: Sequence[float] | Array
+    horizon: Sequence[float] | Array
+    samples: Sequence[Sample | None]
+    groups: Sequence[tuple[str, Sequence[int] | npt.NDArray[np.int64], Sequence[Sample]]]
     next: int = 0
     plan: Any = None
 

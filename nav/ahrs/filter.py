@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import islice
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from nav.ahrs import steps as kernels
 from nav.ahrs.any_motion import AnyMotionLevelling
 from nav.ahrs.config import KINDS, LEVEL, MAGNETIC_HEADING, AhrsConfig, limited
 from nav.ahrs.further import RIGHT, FurtherStates
+from nav.ahrs.plan import planned
 from nav.ahrs.reports import fuse, refused
 from nav.ahrs.state import (
     BIAS,
@@ -30,8 +30,8 @@ from nav.ahrs.state import (
 from nav.columns import Estimated, Estimates, FusedReports, Reported
 from nav.detection import Mask
 from nav.earth import earth_rate_n, gravity
-from nav.increments import ADVANCE, COINCIDENT, ESTIMATE, WHAT, Increments, Steps
-from nav.motion import TrueAirspeed, true_over_equivalent
+from nav.increments import COINCIDENT, ESTIMATE, WHAT, Increments, Steps
+from nav.motion import TrueAirspeed
 from nav.rotation import quat_from_euler, quat_multiply, quat_rotate
 from nav.samples import (
     AirspeedSample,
@@ -178,23 +178,12 @@ class Ahrs:
 
     def _plan(self, steps: Steps) -> Array:
         """The next of the ``steps`` that look plain, as rows for `nav.ahrs.steps.follow`."""
-        flat: list[float] = []
-        nothing = 0.0, 0.0, 0.0, 0.0
-        for t, horizon, sample in islice(zip(steps.t, steps.horizon, steps.samples, strict=True), steps.next, None):
-            if sample is None:
-                flat += (t, horizon, ADVANCE if t != t else ESTIMATE, *nothing)
-                continue
-            if t != horizon or aids.problem(sample):  # too late, or not sound
-                break
-            match sample:
-                case MagnetometerSample():
-                    flat += (t, t, kernels.MAGNETIC, *sample.field_b.tolist(), self._kind(sample.sensor))
-                case AirspeedSample():
-                    eas = sample.eas if sample.eas >= self.config.airspeed_min else math.nan
-                    flat += (t, t, kernels.AIRSPEED, eas, *nothing[1:])
-                case BarometerSample():
-                    flat += (t, t, kernels.DENSITY, true_over_equivalent(sample.pressure), *nothing[1:])
-        return np.array(flat).reshape(-1, kernels.WIDTH)
+        if steps.plan is None:
+            steps.plan = planned(steps, self._kind, self.config.airspeed_min)
+        rows, plain = steps.plan
+        left: Array = rows[steps.next :]
+        others = ~plain[steps.next :]
+        return left[: int(others.argmax())] if others.any() else left
 
     def _kind(self, sensor: str) -> int:
         """The place of a magnetometer's reports among the kinds."""

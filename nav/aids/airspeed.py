@@ -11,6 +11,7 @@ import numpy as np
 
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, Ruling, range_problem
+from nav.columns import column
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.error_model import PHI, POS, VEL, Block, markov
 from nav.rotation import cross, dcm_from_quat, dot
@@ -76,7 +77,7 @@ class AirspeedAid:
 
     def numbers(self, samples: Sequence[AirspeedSample]) -> Array:
         """See `PlainAid`."""
-        return np.array([[one.eas] for one in samples])
+        return column(samples, "eas")[:, None]
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""
@@ -125,6 +126,11 @@ class Silence:
         self._heard, self._interval = heard, interval
         return True
 
+    def hear(self, times: Sequence[float]) -> None:
+        """Hear samples of the sensor at ``times`` [s], whatever was silent meanwhile."""
+        for t in times:
+            self._interval, self._heard = t - self._heard, t
+
     def stand_in(self, sample: Sample) -> AirspeedSample | None:
         """What stands in for the tube, given the newest ``sample`` of any sensor: nothing unless it has fallen silent.
 
@@ -132,7 +138,7 @@ class Silence:
         """
         t = sample.t
         if sample.sensor == self.sensor:
-            self._interval, self._heard = t - self._heard, t
+            self.hear([t])
             return None
         since = t - self._heard
         if not since > SILENT_S or not since > SILENT_INTERVALS * self._interval:

@@ -12,6 +12,7 @@ import numpy as np
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.claims import Following
+from nav.columns import column
 from nav.earth import PRESSURE_EXPONENT, SEA_LEVEL_PRESSURE, TROPOPAUSE_PRESSURE, pressure_altitude
 from nav.error_model import POS, Block, markov
 from nav.samples import Array, BarometerSample, Sample
@@ -72,7 +73,7 @@ class BarometerAid:
 
     def numbers(self, samples: Sequence[BarometerSample]) -> Array:
         """See `PlainAid`."""
-        return np.array([[one.pressure] for one in samples])
+        return column(samples, "pressure")[:, None]
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

@@ -14,6 +14,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
 from nav.error_model import PHI, Block
@@ -183,6 +184,13 @@ def well_within(value: float, limits: tuple[float, float]) -> bool:
     """Whether `range_problem` surely has nothing against a value: one at the edge could be rounded over it."""
     edge = 1e-9 * (limits[1] - limits[0])
     return limits[0] + edge < value < limits[1] - edge
+
+
+def all_within(values: Array, limits: tuple[float, float]) -> npt.NDArray[np.bool_]:
+    """`well_within` of each of N values."""
+    edge = 1e-9 * (limits[1] - limits[0])
+    found: npt.NDArray[np.bool_] = (limits[0] + edge < values) & (values < limits[1] - edge)
+    return found
 
 
 def position_problem(lat: float, lon: float, h: float) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from nav._jit import njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.claims import Following
+from nav.columns import column
 from nav.error_model import PHI, Block, markov
 from nav.rotation import dcm_from_quat
 from nav.samples import Array, MagnetometerSample, Sample
@@ -78,7 +79,7 @@ class MagnetometerAid:
 
     def numbers(self, samples: Sequence[MagnetometerSample]) -> Array:
         """See `PlainAid`."""
-        return np.array([one.field_b for one in samples])
+        return column(samples, "field_b")
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

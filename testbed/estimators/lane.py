@@ -11,10 +11,10 @@ import numpy as np
 
 from nav._jit import njit
 from nav.alignment import InitialState
-from nav.columns import Estimates, Reports
+from nav.columns import Estimates, Reports, Samples
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
-from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
+from nav.samples import Array, Estimate, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
 from nav.standing import Standing
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
@@ -94,11 +94,12 @@ class Lane:
         if self.commanded is not None:
             self.commanded(commanded)
         increments, votes = self.increments(imu)
-        handed: list[Sample] = []
+        handed: list[Sample | Samples] = []
         for aid in self.sensors:
-            handed += self._thinned(aid, samples[aid])
+            own = self._thinned(aid, samples[aid])
+            handed += [own] if isinstance(own, Samples) else own
         if self.standing is not None:
-            handed += self.standing.heard(increments, handed)
+            handed += self.standing.heard(increments, [one for one in handed if isinstance(one, GnssSample)])
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from nav.columns import Samples
 from nav.samples import GnssSample, Sample, UpdateReport
 from testbed.motion.logged import LogTruth
 from testbed.motion.table import ON_GROUND, OUTSIDE
@@ -53,12 +54,16 @@ class EventWatch:
         """Whether no GNSS receiver has a fix, or says so; one that has said nothing yet doesn't count."""
         return bool(self.fix) and not any(has and name not in self.silent for name, has in self.fix.items())
 
-    def sample(self, sample: Sample) -> None:
-        """A sample has arrived: it may end a silence or a denial, or begin one."""
-        if sample.sensor in self.silent:
-            self.silent.remove(sample.sensor)
-            self.emit(sample.t_arrival, "info", f"{sample.sensor} heard again")
-        self.heard[sample.sensor] = sample.t_arrival
+    def sample(self, t: float, samples: Sequence[Sample], which: int) -> None:
+        """One of several samples of a sensor has arrived at ``t``: it may end a silence or a denial, or begin one."""
+        sensor = samples.sensor if isinstance(samples, Samples) else samples[which].sensor
+        if sensor in self.silent:
+            self.silent.remove(sensor)
+            self.emit(t, "info", f"{sensor} heard again")
+        self.heard[sensor] = t
+        if isinstance(samples, Samples) and samples.kind is not GnssSample:
+            return
+        sample = samples[which]
         if not isinstance(sample, GnssSample):
             return
         before = self.fix.get(sample.sensor)

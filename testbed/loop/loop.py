@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 from nav.columns import Estimates
-from nav.samples import Sample, Status
+from nav.samples import Status
 from testbed import interrupts
 from testbed.errors import UserError
 from testbed.estimators import registry
@@ -33,7 +33,7 @@ from testbed.loop.events import EventWatch, legs_unflown, plan_flown
 from testbed.loop.links import Listeners, Progress
 from testbed.loop.rehearsal import Rehearsal
 from testbed.loop.settings import Parts
-from testbed.loop.showing import Arrivals, Backlog, Showing
+from testbed.loop.showing import Arrival, Arrivals, Backlog, Showing
 from testbed.motion.ahead import Ahead
 from testbed.motion.logged import LogTruth
 from testbed.record.recorder import Recorder
@@ -252,7 +252,7 @@ class _Passage:
         plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)
         director.begin(Executor(scenario, plant), self.recorder, self.told.emit, self.told.say, self.told.settings)
         self.arrivals = Arrivals()
-        self.arrived: deque[Sample] = deque()  # not looked at for events
+        self.arrived: deque[Arrival] = deque()  # not looked at for events
         behind = {name: self._behind(one) for name, one in self.lanes.items()}
         self.backlog = {name: Backlog(one) for name, one in behind.items()}
         self.showing = Showing(setup.links, publish, behind[setup.shown] if setup.shown else 0.0)
@@ -352,8 +352,9 @@ class _Passage:
         """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
             self._emit(*event)
-        while self.arrived and self.arrived[0].t_arrival <= t:
-            self.watch.sample(self.arrived.popleft())
+        while self.arrived and self.arrived[0][0] <= t:
+            when, _, samples, which = self.arrived.popleft()
+            self.watch.sample(when, samples, which)
         self.watch.row(t, leg, self.leg_names)
         for name, one in told.items():
             if one.news and k in one.at:

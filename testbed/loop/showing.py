@@ -7,33 +7,38 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import itemgetter
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from nav.columns import Estimates, FusedReports, Reports
+from nav.columns import Estimates, FusedReports, Reports, Samples
 from nav.samples import ImuSamples, Sample, UpdateReport
 from testbed.loop.links import Beside, Publisher, Stretch
 from testbed.motion.table import COLUMNS, TruthBlock
+
+# When it arrives, its number among all, and which it is of whose samples: most are never looked at.
+Arrival: TypeAlias = tuple[float, int, Sequence[Sample], int]
 
 
 class Arrivals:
     """Samples in the order of their arrival, however far ahead the sensors were computed."""
 
     def __init__(self) -> None:
-        self._pending: list[tuple[float, int, Sample]] = []
+        self._pending: list[Arrival] = []
         self._count = 0
 
     def add(self, samples: Sequence[Sample]) -> None:
         """Some more of them."""
-        self._pending += [(one.t_arrival, count, one) for count, one in enumerate(samples, self._count)]
+        times = samples.t_arrival.tolist() if isinstance(samples, Samples) else [one.t_arrival for one in samples]
+        self._pending += [(t, self._count + k, samples, k) for k, t in enumerate(times)]
         self._count += len(samples)
 
-    def until(self, t: float) -> list[Sample]:
+    def until(self, t: float) -> list[Arrival]:
         """Remove and give those that arrive up to ``t``."""
-        self._pending.sort()
+        self._pending.sort(key=itemgetter(0, 1))
         due = bisect_right(self._pending, t, key=itemgetter(0))
-        arrived = [sample for _, _, sample in self._pending[:due]]
+        arrived = self._pending[:due]
         del self._pending[:due]
         return arrived
 
@@ -118,10 +123,10 @@ class Showing:
         self._rows = range(0)  # of the turn, not handed out
         self._turn: tuple[int, TruthBlock, Estimates, ImuSamples, list[Beside]] | None = None
 
-    def hear(self, samples: Sequence[Sample], reports: Reports) -> None:
+    def hear(self, arrived: Sequence[Arrival], reports: Reports) -> None:
         """Samples in the order of their arrival, and reports of the shown estimator."""
         if self._every:
-            self._samples += samples
+            self._samples += [samples[k] for _, _, samples, k in arrived]
             self._reports.add(reports)
 
     def begin(

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import numpy as np
 
-from nav.columns import Estimates, FusedReports
+from nav.columns import Estimates, FusedReports, Samples
 from nav.samples import ImuSamples, Sample, UpdateReport
 from testbed import interrupts
 from testbed.errors import UserError
@@ -129,8 +129,14 @@ class Recorder:
 
     def samples(self, name: str, samples: Sequence[Sample]) -> None:
         """Take aiding samples as delivered."""
-        if samples:
-            self._table(f"sensors/{name}", tables.pack_samples).objects.extend(samples)
+        if not samples:
+            return
+        table = self._table(f"sensors/{name}", tables.pack_samples)
+        if isinstance(samples, Samples):
+            table.pack()  # those before
+            table.add(*tables.sample_columns(samples))
+        else:
+            table.objects.extend(samples)
 
     def estimates(self, name: str, estimates: Estimates) -> None:
         """Take estimates of one estimator."""

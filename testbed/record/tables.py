@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from nav.columns import VECTORS, Estimates, FusedReports
+from nav.columns import VECTORS, Estimates, FusedReports, Samples
 from nav.samples import Outcome, Sample, UpdateReport
 from testbed import interrupts
 from testbed.record.columns import (
@@ -186,6 +186,11 @@ def pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]]
         variable = variables.setdefault(f.name, _own(f, getattr(samples[0], f.name)))
         block[f.name] = _vectors(samples, f.name) if variable.dims else _scalars(samples, f.name, variable.dtype)
     return block, variables
+
+
+def sample_columns(samples: Samples) -> tuple[Block, Mapping[str, Variable]]:
+    """Many samples of one sensor."""
+    return {"time": samples.t} | {name: x for name, x in samples.columns.items() if name != "t"}, SAMPLE
 
 
 def _own(f: Field[Any], value: Any) -> Variable:

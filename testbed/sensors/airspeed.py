@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from nav.columns import delivered
 from nav.earth import SEA_LEVEL_DENSITY
-from nav.samples import AirspeedSample
+from nav.samples import AirspeedSample, Sample
 from testbed.motion.table import FLYING_MPS, TruthBlock
 from testbed.noise import Process, stream
 from testbed.sensors.barometer import exposure, position_error
@@ -139,7 +141,7 @@ class Airspeed:
         self._position = position_error(name, 0.0, config.sideslip_percent, seed)
         self._blown = Process.gauss_markov(stream(seed, name, "blown"), [config.blown_pa], BLOWN_S, 1 / config.rate_hz)
 
-    def sense(self, truth: TruthBlock) -> list[AirspeedSample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The samples that fall inside this block."""
         rows = self._schedule.rows(truth)
         n = len(rows)
@@ -154,8 +156,5 @@ class Airspeed:
             q -= self._position @ exposure(truth, due)
         standing = (truth.airspeed[due] < FLYING_MPS) & (np.linalg.norm(truth.v_n[due], axis=1) < FLYING_MPS)
         q += np.where(standing, np.abs(self._blown.take(n)[:, 0]), 0.0)
-        speeds = np.sqrt(2 * np.maximum(q, 0.0) / SEA_LEVEL_DENSITY).tolist()
-        return [
-            AirspeedSample(t, t + self._schedule.latency, eas, self.name)
-            for t, eas in zip(truth.t[due].tolist(), speeds, strict=True)
-        ]
+        eas = np.sqrt(2 * np.maximum(q, 0.0) / SEA_LEVEL_DENSITY)
+        return delivered(AirspeedSample, self.name, truth.t[due].copy(), self._schedule.latency, eas=eas)

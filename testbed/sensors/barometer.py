@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from nav.samples import Array, BarometerSample
+from nav.columns import delivered
+from nav.samples import Array, BarometerSample, Sample
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
@@ -130,7 +132,7 @@ class Barometer:
         )
         self._position = position_error(name, config.dynamic_percent, config.sideslip_percent, seed)
 
-    def sense(self, truth: TruthBlock) -> list[BarometerSample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The samples that fall inside this block."""
         rows = self._schedule.rows(truth)
         n = len(rows)
@@ -141,8 +143,5 @@ class Barometer:
         due = slice(rows.start, None, rows.step)
         if self._position.any():
             error += self._position @ exposure(truth, due)
-        pressures = (truth.pressure[due] + error).tolist()
-        return [
-            BarometerSample(t, t + self._schedule.latency, pressure, self.name)
-            for t, pressure in zip(truth.t[due].tolist(), pressures, strict=True)
-        ]
+        pressure = truth.pressure[due] + error
+        return delivered(BarometerSample, self.name, truth.t[due].copy(), self._schedule.latency, pressure=pressure)

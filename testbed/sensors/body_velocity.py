@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from nav.samples import Array, BodyVelocitySample
+from nav.columns import delivered
+from nav.samples import Array, BodyVelocitySample, Sample
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
@@ -112,7 +114,7 @@ class BodyVelocity:
         self._white = Process.white(stream(seed, name, "white"), np.full(3, e.noise))
         self._unmeasured = [axis for axis in range(3) if axis not in e.axes]
 
-    def sense(self, truth: TruthBlock) -> list[BodyVelocitySample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The samples that fall inside this block and come through."""
         rows = self._schedule.rows(truth)
         n = len(rows)
@@ -123,10 +125,8 @@ class BodyVelocity:
         v_b += v_b * self._scale + self._correlated.take(n) + self._white.take(n)
         v_b[:, self._unmeasured] = np.nan
         t = truth.t[due]
-        return [
-            BodyVelocitySample(float(t[k]), float(t[k]) + self._schedule.latency, v_b[k].copy(), self.name)
-            for k in np.flatnonzero(self._interruptions.kept(t))
-        ]
+        kept = self._interruptions.kept(t)
+        return delivered(BodyVelocitySample, self.name, t[kept], self._schedule.latency, v_b=v_b[kept])
 
 
 def _in_body_axes(q_nb: Array, v_n: Array) -> Array:

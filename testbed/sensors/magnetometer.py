@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -13,8 +14,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from nav._jit import njit
+from nav.columns import delivered
 from nav.rotation import quat_conjugate, quat_rotate
-from nav.samples import Array, MagnetometerSample
+from nav.samples import Array, MagnetometerSample, Sample
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
@@ -229,7 +231,7 @@ class Magnetometer:
         self._white = Process.white(stream(seed, name, "white"), np.full(3, e.noise))
         self._limit = (config.range_ut or math.inf) * MICROTESLA
 
-    def sense(self, truth: TruthBlock) -> list[MagnetometerSample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The samples that fall inside this block."""
         rows = self._schedule.rows(truth)
         n = len(rows)
@@ -252,10 +254,7 @@ class Magnetometer:
             self._limit,
             measured,
         )
-        return [
-            MagnetometerSample(t, t + self._schedule.latency, measured[i], self.name)
-            for i, t in enumerate(truth.t[due].tolist())
-        ]
+        return delivered(MagnetometerSample, self.name, truth.t[due].copy(), self._schedule.latency, field_b=measured)
 
 
 @njit

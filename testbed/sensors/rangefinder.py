@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from nav.samples import RangeSample
+from nav.columns import delivered
+from nav.samples import RangeSample, Sample
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.sensors.grades import with_grade
@@ -75,7 +77,7 @@ class Rangefinder:
         self._scale = float(stream(seed, name, "scale").standard_normal()) * e.scale
         self._white = Process.white(stream(seed, name, "white"), [e.noise])
 
-    def sense(self, truth: TruthBlock) -> list[RangeSample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The samples that fall inside this block and come through."""
         rows = self._schedule.rows(truth)
         n = len(rows)
@@ -89,7 +91,5 @@ class Rangefinder:
         with np.errstate(invalid="ignore"):
             kept = (measured >= self._limits[0]) & (measured <= self._limits[1])
         t = truth.t[due]
-        return [
-            RangeSample(float(t[k]), float(t[k]) + self._schedule.latency, float(measured[k]), self.name)
-            for k in np.flatnonzero(self._interruptions.kept(t) & kept)
-        ]
+        kept &= self._interruptions.kept(t)
+        return delivered(RangeSample, self.name, t[kept], self._schedule.latency, range=measured[kept])

@@ -149,7 +149,14 @@ def test_noise_of_long_steps_is_that_of_short_ones():
         error_model.transition(Phi, FT, model.driven, np.array([20.0, 5.0, 0.0]), 0.8, 500.0, sums, T)
         P = np.zeros((model.size, model.size))
         for _ in range(round(2 / T)):
-            predict(P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, np.zeros((MOTION, model.size)), model.size)
+            predict(
+                P,
+                Phi,
+                np.exp(-T * model.decay_rate),
+                0.5 * T * model.density**2,
+                np.zeros((MOTION, model.size)),
+                model.size,
+            )
         return P
 
     coarse, fine = covariance(0.05), covariance(0.0005)

@@ -275,7 +275,7 @@ def test_small_errors_take_the_linear_step():
     decay, half = np.exp(-model.decay_rate), 0.5 * (1e-2 * scale) ** 2
     P = positive(rng, n, scale)
     P_linear = P.copy()
-    kalman.predict(P_linear, Phi, decay, half, np.empty((9, n)))
+    kalman.predict(P_linear, Phi, decay, half, np.empty((9, n)), n)
     mean = unscented.predict(
         P, Phi, decay, half, unscented.scratch(n), sums[2].sum(axis=1), 1.0, ONE.spread, ONE.excess
     )
@@ -324,7 +324,7 @@ def test_time_update_is_a_strapdown_of_every_point(level):
 
     linear = P.copy()
     none, still = np.zeros(n), np.ones(n)
-    kalman.predict(linear, Phi, still, none, np.empty((9, n)))
+    kalman.predict(linear, Phi, still, none, np.empty((9, n)), n)
     shift = unscented.predict(P, Phi, still, none, unscented.scratch(n), push_n, 1.0, scaling.spread, scaling.excess)
     sigma = np.sqrt(np.diag(expected))
     beyond = np.abs((expected - linear) / np.outer(sigma, sigma)).max()
@@ -351,7 +351,7 @@ class Filter:
         Phi = transition(model, self.state, sums, T)
         step = (self.P, Phi, np.exp(-T * model.decay_rate), 0.5 * T * model.density**2, unscented.scratch(n))
         if self.engine == "linear":
-            kalman.predict(*step)
+            kalman.predict(*step, n)
         else:
             shift = unscented.predict(*step, sums[2].sum(axis=1), T, ONE.spread, ONE.excess)
             unscented.remove(*self.state, self.x, shift)
