@@ -17,15 +17,15 @@ from typing import NamedTuple, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from nav._jit import inlined, njit
+from nav._jit import lean, njit
 from nav.aids import MagnetometerAid
-from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, airspeed, is_slow, sideslip, widened
-from nav.aids.barometer import PRESSURE_LIMITS, barometer, thinness
+from nav.aids.airspeed import AIRSPEED_LIMITS, Silence, is_slow, put_airspeed, put_sideslip, widened
+from nav.aids.barometer import PRESSURE_LIMITS, put_barometer, thinness
 from nav.aids.base import Kind, PlainAid, well_within
-from nav.aids.gnss import gnss_position, gnss_velocity, is_whole, white
-from nav.aids.magnetometer import FIELD_LIMITS, magnetometer
+from nav.aids.gnss import is_whole, put_gnss_position, put_gnss_velocity, put_white
+from nav.aids.magnetometer import FIELD_LIMITS, put_magnetometer
 from nav.columns import Estimated, Estimates, FusedReports, Reported
-from nav.detection import whiten
+from nav.detection.base import whiten_in
 from nav.earth import pressure_altitude
 from nav.error_model import Indices
 from nav.increments import (
@@ -42,8 +42,8 @@ from nav.increments import (
     share,
     take_off,
 )
-from nav.kalman import scratch
-from nav.local_filter import LocalFilter, own_innovation
+from nav.kalman import innovate_in, scratch
+from nav.local_filter import LocalFilter, from_nominal
 from nav.monitor import shown_limits
 from nav.plan import ANY, SPLIT, Plan, planned
 from nav.realignment import Realignment, tilt_is_lost
@@ -309,9 +309,28 @@ def follow(
     increment may be why a tilt is lost. Into ``reports`` (_, `REPORT`), ``estimates`` (_, whole) and ``when`` (_, 2):
     of each of these its time and that of the last bad increment.
     """
-    q_nb, v_n, lla, _, x, P, errors, _, _, rates, _, _ = parts(whole, common, filters, n)
+    nu, H, R = np.empty(3), np.empty((3, n)), np.empty(3)
+    S, S_one, (_, inverses, updating) = np.empty((3, 3)), np.empty((1, 1)), scratch(3, n)
     one_dt, one_angle, one_push = np.empty(1), np.empty((1, 3)), np.empty((1, 3))
-    S_one, (S_three, inverses, updating) = np.empty((1, 1)), scratch(3, n)
+    return _follow(
+        whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
+        t, dt, dtheta, dv, row, now, longest, last_bad, steps, kinds, told, field, closed, own, since, reports,
+        estimates, when, nu, H, R, S, S_one, inverses, updating, one_dt, one_angle, one_push,
+    )  # fmt: skip
+
+
+@lean
+def _follow(
+    whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
+    in_motion: Array, room: Array, work: Array, period: int,
+    t: Array, dt: Array, dtheta: Array, dv: Array, row: int, now: float, longest: float, last_bad: float,
+    steps: Array, kinds: Indices, told: Array, field: Array, closed: bool, own: int, since: float,
+    reports: Array, estimates: Array, when: Array,
+    nu_of: Array, H_of: Array, R_of: Array, S_three: Array, S_one: Array, inverses: Array, updating: Array,
+    one_dt: Array, one_angle: Array, one_push: Array,
+) -> tuple[int, int, int, float, float, int, int]:  # fmt: skip
+    """`follow` with room for what it finds on the way."""
+    q_nb, v_n, lla, _, x, P, errors, _, _, rates, _, _ = parts(whole, common, filters, n)
     written = drafted = 0
     for k in range(len(steps)):
         time, what = steps[k, TIME], int(steps[k, WHAT])
@@ -323,10 +342,10 @@ def follow(
         if stop > row or settle:
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period,
-                dtheta[row:stop], dv[row:stop], dt[row:stop], settle and not split, n,
+                dtheta, dv, dt, row, stop, settle and not split, n,
             )  # fmt: skip
             if bad >= 0:
-                last_bad = max(last_bad, t[row + bad])
+                last_bad = max(last_bad, t[bad])
             row, now = stop, reached
         if what == ADVANCE:
             continue
@@ -341,16 +360,16 @@ def follow(
             draft(drawn, whole, common, filters, n)
             bad = propagate(
                 drawn, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
-                period * PREDICTED_PERIODS, dtheta[row:stop], dv[row:stop], dt[row:stop], further <= COINCIDENT,
-                common,
+                period * PREDICTED_PERIODS, dtheta, dv, dt, row, stop, further <= COINCIDENT, common,
             )  # fmt: skip
             if bad >= 0:
-                bad_then = max(bad_then, t[row + bad])
+                bad_then = max(bad_then, t[bad])
             if further > COINCIDENT:
                 share(one_dt, one_angle, one_push, dt, dtheta, dv, stop - 1, further / dt[stop - 1])
                 bad = propagate(  # not with a literal, for which it would be compiled anew
                     drawn, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work,
-                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, further > COINCIDENT, common,
+                    period * PREDICTED_PERIODS, one_angle, one_push, one_dt, 0 * row, len(one_dt), further > COINCIDENT,
+                    common,
                 )  # fmt: skip
                 then = time
                 if bad >= 0:
@@ -363,7 +382,7 @@ def follow(
             take_off(one_dt, one_angle, one_push, dt, dtheta, dv, row)
             bad = propagate(
                 whole, common, filters, n, driven, decay_rate, variance_rate, in_motion, room, work, period, one_angle,
-                one_push, one_dt, settle, n,
+                one_push, one_dt, 0 * row, len(one_dt), settle, n,
             )  # fmt: skip
             if bad >= 0:
                 last_bad = max(last_bad, time)
@@ -374,17 +393,19 @@ def follow(
             return k, 0, row, now, last_bad, written, drafted
         for part in range(kinds[what, 1]):
             f, limit = kinds[what, 7], told[what, LIMITS + part]
-            plain, nu, H, R = _measure(
-                kinds[what], part, told[what], steps[k, NUMBERS:], q_nb, v_n, lla, x[f], rates, errors, driven, field
-            )
+            plain, m = _measure(
+                kinds[what], part, told[what], steps[k, NUMBERS:], q_nb, v_n, lla, x[f], rates, errors, driven, field,
+                nu_of, H_of, R_of,
+            )  # fmt: skip
             if not plain:
                 return k, part, row, now, last_bad, written, drafted
+            nu, H, R, S = nu_of[:m], H_of[:m], R_of[:m], S_three if m == 3 else S_one  # no plain part has two axes
             if not closed:
-                nu, S, statistic = own_innovation(P[f], x[f], common, H, R, nu)
-                statistic = whiten(nu, S)[1]
+                from_nominal(nu, H, x[f], common)
+                innovate_in(P[f], H, R, nu, S, updating[:m], inverses)
+                statistic = whiten_in(inverses[:m], inverses[m:], nu, S)
                 if not statistic <= limit:
                     return k, part, row, now, last_bad, written, drafted
-            S = S_three if len(nu) == 3 else S_one  # no plain part has two axes
             threshold = limit if closed else math.inf
             nis = absorb(
                 whole, common, filters, n, f, driven, nu, H, R, threshold, closed, S, inverses, updating
@@ -411,7 +432,7 @@ def _is_sound(kind: int, numbers: Array) -> bool:
     return is_whole(numbers)
 
 
-@njit
+@lean
 def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float, statistic: float) -> None:
     """Write down what became of a part."""
     m = len(nu)
@@ -422,35 +443,47 @@ def _report(report: Array, k: int, part: int, nu: Array, S: Array, nis: float, s
             report[7 + m * i + j] = S[i, j]
 
 
-@inlined
+@lean
 def _measure(
     kind: Indices, part: int, told: Array, numbers: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, rates: Array,
-    errors: Array, driven: Indices, field: Array,
-) -> tuple[bool, Array, Array, Array]:  # fmt: skip
-    """Whether one part of a sample is plain, and its innovation (m,), Jacobian (m, n), variances (m,).
+    errors: Array, driven: Indices, field: Array, nu: Array, H: Array, R: Array,
+) -> tuple[bool, int]:  # fmt: skip
+    """Whether one part of a sample is plain, and how many axes m it has; its innovation (m,), Jacobian (m, n) and
+    variances (m,) into ``nu``, ``H`` and ``R``.
 
     ``kind`` (8,) has what it is, how many parts there are, where states begin (5,), and whose filter's it is; ``told``
     (12,) the numbers of the aid and the limits of its parts, ``numbers`` (12,) those of the sample.
     """
+    m = 3 if kind[0] == Kind.GNSS or kind[0] == Kind.MAGNETOMETER else 1
+    for i in range(m):
+        for j in range(H.shape[1]):
+            H[i, j] = 0.0
     if kind[0] == Kind.BAROMETER:
-        nu, H = barometer(lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))
+        put_barometer(nu, H, lla, x, kind[2], kind[3], pressure_altitude(numbers[0]))
         thin = thinness(numbers[0])
-        return True, nu, H, told[:1] * (thin * thin)
+        R[0] = told[0] * (thin * thin)
+        return True, m
     if kind[0] == Kind.MAGNETOMETER:
-        nu, H = magnetometer(q_nb, x, kind[2], kind[4], kind[3], kind[5], field[3:], numbers[:3])
-        return is_near(lla, field), nu, H, told[:3]
+        put_magnetometer(nu, H, q_nb, x, kind[2], kind[4], kind[3], kind[5], field[3:], numbers[:3])
+        for i in range(3):
+            R[i] = told[i]
+        return is_near(lla, field), m
     if kind[0] == Kind.AIRSPEED:
         plain = not is_slow(numbers[0], v_n, told[2])
         if part == 0:
-            nu, H = airspeed(q_nb, v_n, lla, x, kind[2], kind[3], kind[4], numbers[0])
-            return plain, nu, H, told[:1] * widened(numbers[0])
-        nu, H = sideslip(q_nb, v_n, x, kind[2], kind[3])
-        return plain, nu, H, told[1:2]
+            put_airspeed(nu, H, q_nb, v_n, lla, x, kind[2], kind[3], kind[4], numbers[0])
+            R[0] = told[0] * widened(numbers[0])
+            return plain, m
+        put_sideslip(nu, H, q_nb, v_n, x, kind[2], kind[3])
+        R[0] = told[1]
+        return plain, m
     arm = told[6:9]
     if part == 0:
-        nu, H = gnss_position(q_nb, lla, x, arm, kind[2], numbers[0], numbers[1], numbers[2])
-        return True, nu, H, white(numbers[6:9], told[:3])
+        put_gnss_position(nu, H, q_nb, lla, x, arm, kind[2], numbers[0], numbers[1], numbers[2])
+        put_white(R, numbers[6:9], told[:3])
+        return True, m
     swings = arm[0] != 0.0 or arm[1] != 0.0 or arm[2] != 0.0
     known = rates[0, 0] != 0.0 or rates[0, 1] != 0.0 or rates[0, 2] != 0.0
-    nu, H = gnss_velocity(q_nb, v_n, lla, x, rates[0], errors, driven, arm, kind[3], numbers[3:6])
-    return known or not swings, nu, H, white(numbers[9:12], told[3:6])
+    put_gnss_velocity(nu, H, q_nb, v_n, lla, x, rates[0], errors, driven, arm, kind[3], numbers[3:6])
+    put_white(R, numbers[9:12], told[3:6])
+    return known or not swings, m

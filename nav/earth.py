@@ -88,7 +88,13 @@ def gravity_of(sin2: Scalar, h: Scalar) -> Scalar:
 @njit
 def earth_rate_n(lat: float) -> Array:
     """Angular rate (3,) of e relative to i in n [rad/s] (Groves 2.123)."""
-    return np.array([OMEGA_IE * math.cos(lat), 0.0, -OMEGA_IE * math.sin(lat)])
+    return np.array(earth_rate_components(lat))
+
+
+@njit
+def earth_rate_components(lat: float) -> Three:
+    """`earth_rate_n` without an array, for long loops."""
+    return OMEGA_IE * math.cos(lat), 0.0, -OMEGA_IE * math.sin(lat)
 
 
 @njit
@@ -180,10 +186,16 @@ def displacement_n(lat: float, lon: float, h: float, lat0: float, lon0: float, h
 
     Arc lengths with the radii half-way between the two, for points a few kilometres apart; safe across the date line.
     """
+    return np.array(displacement_components(lat, lon, h, lat0, lon0, h0))
+
+
+@njit
+def displacement_components(lat: float, lon: float, h: float, lat0: float, lon0: float, h0: float) -> Three:
+    """`displacement_n` without an array, for long loops."""
     mid_lat, mid_h = 0.5 * (lat + lat0), 0.5 * (h + h0)
     R_M, R_N = radii(mid_lat)
     east = (R_N + mid_h) * math.cos(mid_lat) * wrap_longitude(lon - lon0)
-    return np.array([(R_M + mid_h) * (lat - lat0), east, h0 - h])
+    return (R_M + mid_h) * (lat - lat0), east, h0 - h
 
 
 @njit

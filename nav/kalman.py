@@ -67,12 +67,12 @@ def innovate(P: Array, H: Array, R: Array, nu: Array) -> tuple[Array, Array, Arr
     """
     m, n = H.shape
     S, HP, inverses = np.empty((m, m)), np.empty((m, n)), np.empty((2 * m, m))
-    nis = _innovate(P, H, R, nu, S, HP, inverses)
+    nis = innovate_in(P, H, R, nu, S, HP, inverses)
     return S, inverses[:m], HP, nis
 
 
 @lean
-def _innovate(P: Array, H: Array, R: Array, nu: Array, S: Array, HP: Array, inverses: Array) -> float:
+def innovate_in(P: Array, H: Array, R: Array, nu: Array, S: Array, HP: Array, inverses: Array) -> float:
     """`innovate` into ``S`` (m, m), ``HP`` (m, n) and the first half of ``inverses`` (2 m, m); nis."""
     m, n = H.shape
     for i in range(m):
@@ -122,7 +122,7 @@ def update_in(
     """`update` in the arrays of `scratch`; nis."""
     m = len(nu)
     HP, correction = work[:m], work[4 * m + 1]
-    nis = _innovate(P, H, R, nu, S, HP, inverses)
+    nis = innovate_in(P, H, R, nu, S, HP, inverses)
     if nis <= threshold:
         critical = is_critical(P, H, R)
         _correct(P, H, R, inverses, nu, work)

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from nav import unscented
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.aids.airspeed import AirspeedAid, Silence
 from nav.aids.barometer import BarometerAid, Scatter
 from nav.aids.base import (
@@ -455,8 +455,14 @@ class LocalFilter:
 def own_innovation(P: Array, x: Array, common: int, H: Array, R: Array, nu: Array) -> tuple[Array, Array, float]:
     """(innovation, S, nis) at nominal state plus ``x[:common]``, from the innovation ``nu`` (m,) at the nominal one."""
     own = nu.copy()
-    for k in range(len(nu)):
-        for j in range(common):
-            own[k] -= H[k, j] * x[j]
+    from_nominal(own, H, x, common)
     S, _, _, nis = innovate(P, H, R, own)
     return own, S, nis
+
+
+@lean
+def from_nominal(nu: Array, H: Array, x: Array, common: int) -> None:
+    """Make of the innovation ``nu`` (m,) at the nominal state the one at that plus ``x[:common]``, in place."""
+    for k in range(len(nu)):
+        for j in range(common):
+            nu[k] -= H[k, j] * x[j]

@@ -194,7 +194,7 @@ class Reference:
         return propagate(
             s.whole, *s.shape, self.driven, self._decay_rate, self._variance_rate, self._in_motion, self._room,
             self._work,
-            period, dtheta, dv, dt, settle, self.size,
+            period, dtheta, dv, dt, 0, len(dt), settle, self.size,
         )  # fmt: skip
 
     def correct(self, state: State, correction: Array) -> None:

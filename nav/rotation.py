@@ -48,7 +48,7 @@ def skew(v: Array) -> Array:
 
 
 @njit
-def dot(u: Array, v: Array) -> float:
+def dot(u: Array | Three, v: Array | Three) -> float:
     """U . v of (3,): in the same order, and so to the same bits, on every processor."""
     product: float = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
     return product
@@ -139,13 +139,17 @@ def rotvec_components(q: Array | Four) -> Three:
 @njit
 def dcm_from_quat(q: Array) -> Array:
     """Direction cosine matrix (3, 3) of a unit quaternion."""
+    return np.array(dcm_components(q))
+
+
+@njit
+def dcm_components(q: Array | Four) -> tuple[Three, Three, Three]:
+    """`dcm_from_quat` without an array, for long loops."""
     w, x, y, z = q[0], q[1], q[2], q[3]
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
 
 

@@ -299,10 +299,11 @@ def sigma_step(
 @lean
 def propagate(
     whole: Array, common: int, filters: int, n: int, driven: Indices, decay_rate: Array, variance_rate: Array,
-    in_motion: Array, room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, settle: bool,
-    first: int,
+    in_motion: Array, room: Array, work: Array, period: int, dtheta: Array, dv: Array, dt: Array, row: int, stop: int,
+    settle: bool, first: int,
 ) -> int:  # fmt: skip
-    """Strapdown and covariances over N increments in place; the last of them that was not usable, -1 for none.
+    """Strapdown and covariances over the increments from ``row`` to before ``stop`` in place; the last of them that was
+    not usable, -1 for none.
 
     A covariance step is taken every ``period`` samples and, to ``settle``, at the end. It stands at one place only,
     since it is long to compile. Of a `draft` it finds what there is, if ``first`` is ``common``; otherwise that is n.
@@ -312,8 +313,8 @@ def propagate(
     bad = -1
     shaken = in_motion[0, 2] > 0.0
     angle, push, before, old = FT[0, :3], FT[1, :3], FT[2, :4], FT[3, :3]  # until a covariance step needs the room
-    for k in range(len(dt) + 1):
-        T = dt[k] if k < len(dt) else 0.0
+    for k in range(row, stop + 1):
+        T = dt[k] if k < stop else 0.0
         if T > 0.0:
             sound = True
             for i in range(3):
@@ -350,7 +351,7 @@ def propagate(
             integrate(sums, before, q_nb, angle, push, T)
             elapsed[0] += T
             elapsed[1] += 1.0
-        if elapsed[1] >= period or (settle and k == len(dt) and elapsed[0] > 0.0):
+        if elapsed[1] >= period or (settle and k == stop and elapsed[0] > 0.0):
             _covariance_step(
                 v_n, lla, imu, x, P, errors, sums, elapsed, shaking,
                 driven, decay_rate, variance_rate, in_motion, Phi, FT, decay, half_noise, work, first,

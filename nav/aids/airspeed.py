@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, Ruling, range_problem
 from nav.columns import column
 from nav.earth import SEA_LEVEL_DENSITY, isa_density
 from nav.error_model import PHI, POS, VEL, Block, markov
-from nav.rotation import cross, dcm_from_quat, dot
+from nav.rotation import Three, cross_components, dcm_components, dot
 from nav.samples import AirspeedSample, Array, Outcome, Sample
 
 AIRSPEED_LIMITS = (-10.0, 300.0)  # what an instrument could possibly report [m/s]
@@ -175,17 +175,30 @@ def airspeed(
     The density rho is the standard atmosphere's at the estimated height. Gusts are as the tube feels them: were they
     scaled, the scale would be learned from how they come and go, of which a filter knows little.
     """
+    nu, H = np.empty(1), np.zeros((1, len(x)))
+    put_airspeed(nu, H, q_nb, v_n, lla, x, wind, gust, airspeed_scale, eas)
+    return nu, H
+
+
+@lean
+def put_airspeed(
+    nu: Array, H: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, wind: int, gust: int, airspeed_scale: int,
+    eas: float,
+) -> None:  # fmt: skip
+    """`airspeed` into ``nu`` (1,) and zeros ``H`` (1, n)."""
     factor = 1 + x[airspeed_scale] if airspeed_scale >= 0 else 1.0
     root = math.sqrt(isa_density(lla[2]) / SEA_LEVEL_DENSITY)
-    axis_n = dcm_from_quat(q_nb)[:, 0].copy()
+    C_nb = dcm_components(q_nb)
+    axis_n = C_nb[0][0], C_nb[1][0], C_nb[2][0]
     steady_n, air_n = _air(v_n, x, wind, gust, factor)
-    H = _jacobian(len(x), root * axis_n, cross(air_n, root * axis_n), wind, gust, factor)
+    slope_n = root * axis_n[0], root * axis_n[1], root * axis_n[2]
+    _put_jacobian(H, slope_n, cross_components(air_n, slope_n), wind, gust, factor)
     predicted = root * dot(axis_n, air_n)
     half_lapse = 0.25 * math.log(isa_density(lla[2] + 1.0) / isa_density(lla[2] - 1.0))  # of density, per metre up
     H[0, POS + 2] = -predicted * half_lapse
     if airspeed_scale >= 0:
         H[0, airspeed_scale] = root * dot(axis_n, steady_n)
-    return np.array([eas - predicted]), H
+    nu[0] = eas - predicted
 
 
 @njit
@@ -196,27 +209,37 @@ def sideslip(q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> tuple[A
     not along e_y. An aircraft turns into a gust from the side: e_y moves with the innovation. A gain along e_y would
     move with it too, and the mean of their product, which is not zero, would make a bias of the airspeed's scale.
     """
-    axis_n = dcm_from_quat(q_nb)[:, 1].copy()
+    nu, H = np.empty(1), np.zeros((1, len(x)))
+    put_sideslip(nu, H, q_nb, v_n, x, wind, gust)
+    return nu, H
+
+
+@lean
+def put_sideslip(nu: Array, H: Array, q_nb: Array, v_n: Array, x: Array, wind: int, gust: int) -> None:
+    """`sideslip` into ``nu`` (1,) and zeros ``H`` (1, n)."""
+    C_nb = dcm_components(q_nb)
+    axis_n = C_nb[0][1], C_nb[1][1], C_nb[2][1]
     _, air_n = _air(v_n, x, wind, gust, 1.0)
     slip, squared = dot(axis_n, air_n), dot(air_n, air_n)
-    across_n = axis_n - slip / squared * air_n if squared > 0.0 else axis_n
-    return np.array([-slip]), _jacobian(len(x), across_n, cross(air_n, axis_n), wind, gust, 1.0)
+    share = slip / squared if squared > 0.0 else 0.0
+    across_n = axis_n[0] - share * air_n[0], axis_n[1] - share * air_n[1], axis_n[2] - share * air_n[2]
+    _put_jacobian(H, across_n, cross_components(air_n, axis_n), wind, gust, 1.0)
+    nu[0] = -slip
 
 
 @njit
-def _air(v_n: Array, x: Array, wind: int, gust: int, factor: float) -> tuple[Array, Array]:
+def _air(v_n: Array, x: Array, wind: int, gust: int, factor: float) -> tuple[Three, Three]:
     """The velocity through the mean wind (3,), and factor times that less the gust (3,)."""
-    steady_n, air_n = np.empty(3), np.empty(3)
-    for i in range(3):
-        steady_n[i] = v_n[i] - x[wind + i] if wind >= 0 and i < 2 else v_n[i]
-        air_n[i] = factor * steady_n[i] - (x[gust + i] if gust >= 0 and i < 2 else 0.0)
-    return steady_n, air_n
+    north, east, down = v_n[0], v_n[1], v_n[2]
+    if wind >= 0:
+        north, east = north - x[wind], east - x[wind + 1]
+    gust_n, gust_e = (x[gust], x[gust + 1]) if gust >= 0 else (0.0, 0.0)
+    return (north, east, down), (factor * north - gust_n, factor * east - gust_e, factor * down)
 
 
-@njit
-def _jacobian(n: int, slope_n: Array, turned: Array, wind: int, gust: int, factor: float) -> Array:
+@lean
+def _put_jacobian(H: Array, slope_n: Three, turned: Three, wind: int, gust: int, factor: float) -> None:
     """Jacobian (1, n) of what has the gradient ``slope_n`` in factor (v - wind) - gust, and ``turned`` in phi."""
-    H = np.zeros((1, n))
     for i in range(3):
         H[0, PHI + i], H[0, VEL + i] = turned[i], factor * slope_n[i]
     for i in range(2):
@@ -224,4 +247,3 @@ def _jacobian(n: int, slope_n: Array, turned: Array, wind: int, gust: int, facto
             H[0, wind + i] = -factor * slope_n[i]
         if gust >= 0:
             H[0, gust + i] = -slope_n[i]
-    return H

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.claims import Following
 from nav.columns import column
@@ -133,11 +133,17 @@ def thinness(pressure: float) -> float:
 @njit
 def barometer(lla: Array, x: Array, bias: int, error: int, pressure_altitude: float) -> tuple[Array, Array]:
     """Pressure altitude [m]: h + bias + error; each is where its state is, -1 for none."""
-    nu = np.array([pressure_altitude - lla[2]])
-    H = np.zeros((1, len(x)))
+    nu, H = np.empty(1), np.zeros((1, len(x)))
+    put_barometer(nu, H, lla, x, bias, error, pressure_altitude)
+    return nu, H
+
+
+@lean
+def put_barometer(nu: Array, H: Array, lla: Array, x: Array, bias: int, error: int, pressure_altitude: float) -> None:
+    """`barometer` into ``nu`` (1,) and zeros ``H`` (1, n)."""
+    nu[0] = pressure_altitude - lla[2]
     H[0, POS + 2] = -1.0
     for state in (bias, error):
         if state >= 0:
             H[0, state] = 1.0
             nu[0] -= x[state]
-    return nu, H

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from nav._jit import njit
 from nav.error_model import PHI, Block
+from nav.rotation import Three
 from nav.samples import Array, Outcome, Sample, UpdateReport
 
 if TYPE_CHECKING:
@@ -203,7 +204,7 @@ def position_problem(lat: float, lon: float, h: float) -> str:
 
 
 @njit
-def put_skew(H: Array, v: Array) -> None:
+def put_skew(H: Array, v: Array | Three) -> None:
     """Write [v x] into the columns of the attitude."""
     for j in range(3):
         one, two = (j + 1) % 3, (j + 2) % 3

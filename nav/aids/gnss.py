@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.aids.base import (
     HEIGHT_LIMITS,
     NO_RATES,
@@ -24,9 +24,9 @@ from nav.aids.base import (
     well_within,
 )
 from nav.claims import WIDEST, Following
-from nav.earth import displacement_n, earth_rate_n, wrap_longitude
+from nav.earth import displacement_components, displacement_n, earth_rate_components, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
-from nav.rotation import cross, dcm_from_quat, quat_rotate
+from nav.rotation import cross_components, dcm_components, dcm_from_quat, quat_rotate_components
 from nav.samples import Array, GnssSample, Sample
 
 if TYPE_CHECKING:
@@ -200,10 +200,16 @@ class GnssAid:
 def white(sigma: Array, correlated_variance: Array) -> Array:
     """The white part of a receiver's reported variance, when the correlated part is a state of the filter."""
     R = np.empty(len(sigma))
+    put_white(R, sigma, correlated_variance)
+    return R
+
+
+@lean
+def put_white(R: Array, sigma: Array, correlated_variance: Array) -> None:
+    """`white` into ``R`` (3,)."""
     for i in range(len(sigma)):
         reported = sigma[i] * sigma[i]
         R[i] = max(reported - correlated_variance[i], WHITE_SHARE * reported)
-    return R
 
 
 @dataclass
@@ -303,17 +309,26 @@ def gnss_position(
     q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float, lon: float, h: float
 ) -> tuple[Array, Array]:
     """Antenna position [m], NED: p + C_nb arm_b + correlated receiver error."""
-    arm_n = quat_rotate(q_nb, arm_b)
-    nu = displacement_n(lat, lon, h, lla[0], lla[1], lla[2])
-    H = np.zeros((3, len(x)))
+    nu, H = np.empty(3), np.zeros((3, len(x)))
+    put_gnss_position(nu, H, q_nb, lla, x, arm_b, gnss_position_error, lat, lon, h)
+    return nu, H
+
+
+@lean
+def put_gnss_position(
+    nu: Array, H: Array, q_nb: Array, lla: Array, x: Array, arm_b: Array, gnss_position_error: int, lat: float,
+    lon: float, h: float,
+) -> None:  # fmt: skip
+    """`gnss_position` into ``nu`` (3,) and zeros ``H`` (3, n)."""
+    arm_n = quat_rotate_components(q_nb, arm_b)
+    away_n = displacement_components(lat, lon, h, lla[0], lla[1], lla[2])
     put_skew(H, arm_n)
     for i in range(3):
         H[i, POS + i] = 1.0
-        nu[i] -= arm_n[i]
+        nu[i] = away_n[i] - arm_n[i]
         if gnss_position_error >= 0:
             H[i, gnss_position_error + i] = 1.0
             nu[i] -= x[gnss_position_error + i]
-    return nu, H
 
 
 @njit
@@ -334,17 +349,31 @@ def gnss_velocity(
     omega_ib is the measured angular rate less the estimated sensor ``errors`` (4, 3), rows as `Drive`; ``driven`` tells
     which states those are (`ErrorModel.driven`).
     """
-    C_nb = dcm_from_quat(q_nb)
-    gain, omega_b = np.empty(3), np.empty(3)
-    for i in range(3):
-        gain[i] = 1 / (1 + errors[Drive.GYRO_SCALE, i])
-        omega_b[i] = (omega_measured_b[i] - errors[Drive.GYRO, i]) * gain[i]
-    arm_n = quat_rotate(q_nb, arm_b)
-    swing_n = quat_rotate(q_nb, cross(omega_b, arm_b))
-    earth_n = earth_rate_n(lla[0])
-    carried_n = cross(earth_n, arm_n)
-    nu = np.empty(3)
-    H = np.zeros((3, len(x)))
+    nu, H = np.empty(3), np.zeros((3, len(x)))
+    put_gnss_velocity(
+        nu, H, q_nb, v_n, lla, x, omega_measured_b, errors, driven, arm_b, gnss_velocity_error, antenna_v_n
+    )
+    return nu, H
+
+
+@lean
+def put_gnss_velocity(
+    nu: Array, H: Array, q_nb: Array, v_n: Array, lla: Array, x: Array, omega_measured_b: Array, errors: Array,
+    driven: Indices, arm_b: Array, gnss_velocity_error: int, antenna_v_n: Array,
+) -> None:  # fmt: skip
+    """`gnss_velocity` into ``nu`` (3,) and zeros ``H`` (3, n)."""
+    C_nb = dcm_components(q_nb)
+    scale, bias = errors[Drive.GYRO_SCALE], errors[Drive.GYRO]
+    gain = 1 / (1 + scale[0]), 1 / (1 + scale[1]), 1 / (1 + scale[2])
+    omega_b = (
+        (omega_measured_b[0] - bias[0]) * gain[0],
+        (omega_measured_b[1] - bias[1]) * gain[1],
+        (omega_measured_b[2] - bias[2]) * gain[2],
+    )
+    arm_n = quat_rotate_components(q_nb, arm_b)
+    swing_n = quat_rotate_components(q_nb, cross_components(omega_b, arm_b))
+    earth_n = earth_rate_components(lla[0])
+    carried_n = cross_components(earth_n, arm_n)
     put_skew(H, swing_n)
     along = earth_n[0] * arm_n[0] + earth_n[1] * arm_n[1] + earth_n[2] * arm_n[2]
     for i in range(3):
@@ -363,9 +392,8 @@ def gnss_velocity(
                 for j in range(3):
                     # C_nb [arm x]: a gyro bias estimated too high leaves too little rate
                     one, two = (j + 1) % 3, (j + 2) % 3
-                    from_gyro = (C_nb[i, one] * arm_b[two] - C_nb[i, two] * arm_b[one]) * gain[j]
+                    from_gyro = (C_nb[i][one] * arm_b[two] - C_nb[i][two] * arm_b[one]) * gain[j]
                     H[i, start + j] = from_gyro if kind == Drive.GYRO else from_gyro * omega_b[j]
-    return nu, H
 
 
 @njit

@@ -9,12 +9,12 @@ from functools import cached_property
 
 import numpy as np
 
-from nav._jit import njit
+from nav._jit import inlined, lean, njit
 from nav.aids.base import Kind, Measurement, OperatingPoint, range_problem
 from nav.claims import Following
 from nav.columns import column
 from nav.error_model import PHI, Block, markov
-from nav.rotation import dcm_from_quat
+from nav.rotation import Three, dcm_components
 from nav.samples import Array, MagnetometerSample, Sample
 
 FIELD_SIZE = 5e-5  # of the geomagnetic field at middle latitudes [T]
@@ -111,14 +111,23 @@ def magnetometer(
     ``bias``, ``error`` and the matrix A of soft iron, row by row, are fixed to the body, ``anomaly`` to n; each is
     where its states begin, -1 for none.
     """
-    C_nb = dcm_from_quat(q_nb)
-    H = np.zeros((3, len(x)))
-    nu = np.zeros(3)
+    nu, H = np.empty(3), np.zeros((3, len(x)))
+    put_magnetometer(nu, H, q_nb, x, bias, error, anomaly, soft_iron, field_n, field_b)
+    return nu, H
+
+
+@lean
+def put_magnetometer(
+    nu: Array, H: Array, q_nb: Array, x: Array, bias: int, error: int, anomaly: int, soft_iron: int, field_n: Array,
+    field_b: Array,
+) -> None:  # fmt: skip
+    """`magnetometer` into ``nu`` (3,) and zeros ``H`` (3, n)."""
+    C_nb = dcm_components(q_nb)
     m0, m1, m2 = field_n[0], field_n[1], field_n[2]
     if anomaly >= 0:
         m0, m1, m2 = m0 + x[anomaly], m1 + x[anomaly + 1], m2 + x[anomaly + 2]
     for i in range(3):
-        c0, c1, c2 = C_nb[0, i], C_nb[1, i], C_nb[2, i]
+        c0, c1, c2 = C_nb[0][i], C_nb[1][i], C_nb[2][i]
         nu[i] = field_b[i] - (c0 * m0 + c1 * m1 + c2 * m2)
         # -C_nb' [field x]
         H[i, PHI] = c2 * m1 - c1 * m2
@@ -132,21 +141,25 @@ def magnetometer(
                 nu[i] -= x[start + i]
     if soft_iron >= 0:
         _soften(nu, H, C_nb, x, anomaly, soft_iron, m0, m1, m2)
-    return nu, H
 
 
-@njit
+@inlined
 def _soften(
-    nu: Array, H: Array, C_nb: Array, x: Array, anomaly: int, soft_iron: int, m0: float, m1: float, m2: float
-) -> None:
+    nu: Array, H: Array, C_nb: tuple[Three, Three, Three], x: Array, anomaly: int, soft_iron: int, m0: float, m1: float,
+    m2: float,
+) -> None:  # fmt: skip
     """Add soft iron to the innovation (3,) and the Jacobian (3, n) of a magnetometer in the field m (3,) of n."""
-    turned = H[:, PHI : PHI + 3].copy()
+    turned = (
+        (H[0, PHI], H[0, PHI + 1], H[0, PHI + 2]),
+        (H[1, PHI], H[1, PHI + 1], H[1, PHI + 2]),
+        (H[2, PHI], H[2, PHI + 1], H[2, PHI + 2]),
+    )
     for i in range(3):
         for j in range(3):
-            a, m_b = x[soft_iron + 3 * i + j], C_nb[0, j] * m0 + C_nb[1, j] * m1 + C_nb[2, j] * m2
+            a, m_b = x[soft_iron + 3 * i + j], C_nb[0][j] * m0 + C_nb[1][j] * m1 + C_nb[2][j] * m2
             H[i, soft_iron + 3 * i + j] = m_b
             nu[i] -= a * m_b
             for k in range(3):
-                H[i, PHI + k] += a * turned[j, k]
+                H[i, PHI + k] += a * turned[j][k]
                 if anomaly >= 0:
-                    H[i, anomaly + k] += a * C_nb[k, j]
+                    H[i, anomaly + k] += a * C_nb[k][j]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from nav._jit import njit
+from nav._jit import lean, njit
 from nav.samples import Array
 
 Mask = NDArray[np.bool_]
@@ -64,7 +64,14 @@ def whiten(nu: Array, S: Array) -> tuple[Array, float]:
     """
     m = len(nu)
     L, r = np.empty((m, m)), np.empty((2, m))
+    return r, whiten_in(L, r, nu, S)
+
+
+@lean
+def whiten_in(L: Array, r: Array, nu: Array, S: Array) -> float:
+    """`whiten` with ``L`` (m, m) and into ``r`` (2, m); nu' S^-1 nu."""
     gamma2 = 0.0
+    m = len(nu)
     for i in range(m):
         total = nu[i]
         for j in range(i):
@@ -77,12 +84,12 @@ def whiten(nu: Array, S: Array) -> tuple[Array, float]:
         for k in range(i):
             pivot -= L[i, k] * L[i, k]
         if not (pivot > 0.0 and math.isfinite(nu[i])):
-            return r, math.nan
+            return math.nan
         L[i, i] = math.sqrt(pivot)
         r[0, i] = total / L[i, i]
         r[1, i] = nu[i] / math.sqrt(S[i, i])
         gamma2 += r[0, i] * r[0, i]
-    return r, gamma2
+    return gamma2
 
 
 @cache
