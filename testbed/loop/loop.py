@@ -338,9 +338,15 @@ class _Passage:
             others = {name: (one.at, one.estimates) for name, one in told.items() if name != shown}
             self.showing.hear(arrived, tracked[shown].reports)
             self.showing.begin(self.tick, block, own_rows, others)
-        for row in range(-self.tick % self.cadence.events, len(block), self.cadence.events):
+        rows = range(-self.tick % self.cadence.events, len(block), self.cadence.events)
+        quiet = not self.watch.heeds_fused and all(one.plain for one in self.backlog.values())
+        telling = {name: one for name, one in told.items() if one.news or not quiet}
+        looked = slice(rows.start, None, rows.step)
+        for row, t, leg in zip(rows, block.t[looked].tolist(), block.leg[looked].tolist(), strict=True):
             self.row = row
-            self._look(float(block.t[row]), float(block.leg[row]), told, row)
+            self._look(t, leg, telling, row)
+        for name in told.keys() - telling.keys() if rows else ():
+            self.backlog[name].skip(float(block.t[rows[-1]]))
         self.showing.until(len(block))
 
     def _emit(self, t: float, severity: str, text: str) -> None:

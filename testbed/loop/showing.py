@@ -91,12 +91,21 @@ class Backlog:
         self._unread.add(reports)
         self._single += sum(isinstance(piece, UpdateReport) for piece in reports.pieces)
 
+    @property
+    def plain(self) -> bool:
+        """Whether there are none but `FusedReports`."""
+        return not self._single and not self._votes
+
+    def skip(self, t: float) -> None:
+        """Remove those that are there at ``t``, all of `FusedReports`."""
+        self._passed = t - self._behind
+
     def until(self, t: float, fused: Callable[[], bool]) -> Iterator[UpdateReport]:
         """Remove and give those that are there at ``t``, of `FusedReports` only while these are asked for."""
         while self._votes and not self._votes[0].t > t:
             yield self._votes.popleft()
         if not self._single and not fused():
-            self._passed = t - self._behind
+            self.skip(t)
             return
         self._pass()
         for piece, first, last in self._unread.until(t - self._behind):
