@@ -74,8 +74,10 @@ class Taker(Protocol):
 
     realignment: Realignment
 
-    def trusted(self, fix: GnssSample, before: float) -> bool:
-        """Whether a sound fix, if it is inside its gate, is simply used when the one of the time ``before`` was."""
+    def trusted(self, sensor: str, t: float, before: float) -> bool:
+        """Whether a sound fix at ``t``, if it is inside its gate, is simply used when the one of the time ``before``
+        was.
+        """
         ...
 
     @property
@@ -257,12 +259,12 @@ class Batch:
         if pauses_from < math.inf:
             due = (rows[:, WHAT] >= 0) & (rows[:, TIME] >= pauses_from)
             stop = first + int(due.argmax()) + 1 if due.any() else stop
-        for k in plan.fixes[bisect_left(plan.fixes, first) : bisect_left(plan.fixes, stop)]:
-            fix = cast(GnssSample, steps.samples[k])
-            if not taker.trusted(fix, last_fix):
+        for k, sensor in plan.fixes[bisect_left(plan.fixes, (first, "")) : bisect_left(plan.fixes, (stop, ""))]:
+            t = float(plan.rows[k, TIME])
+            if not taker.trusted(sensor, t, last_fix):
                 stop = k
                 break
-            last_fix = fix.t
+            last_fix = t
         stop, silences = self._heard(steps, plan, stop)
         return plan.rows[first:stop], silences
 

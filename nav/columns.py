@@ -29,7 +29,7 @@ class Samples(Sequence[Sample]):
 
     kind: type[Any]
     sensor: str
-    columns: Mapping[str, Array]
+    columns: Mapping[str, npt.NDArray[Any]]
 
     @property
     def t(self) -> Array:
@@ -62,13 +62,26 @@ class Samples(Sequence[Sample]):
         return one
 
 
-def delivered(kind: type[Any], sensor: str, t: Array, latency: float, **columns: Array) -> Sequence[Sample]:
+def delivered(kind: type[Any], sensor: str, t: Array, latency: float, **columns: npt.NDArray[Any]) -> Sequence[Sample]:
     """What a sensor measured at ``t`` (N,) [s] and tells ``latency`` [s] later: few samples one by one."""
     samples = Samples(kind, sensor, {"t": t, "t_arrival": t + latency, **columns})
     return samples if len(t) >= MANY else [*samples]
 
 
-def column(samples: Sequence[Any], name: str) -> Array:
+def one_by_one(samples: Iterable[Sample | Samples]) -> Iterator[Sample]:
+    """All of them as single ones."""
+    for one in samples:
+        yield from one if isinstance(one, Samples) else (one,)
+
+
+def chosen(samples: Sequence[Any], which: npt.NDArray[np.bool_]) -> Sequence[Any]:
+    """Those of N samples of one sensor that a mask (N,) has."""
+    if isinstance(samples, Samples):
+        return samples[which]
+    return [one for one, wanted in zip(samples, which.tolist(), strict=True) if wanted]
+
+
+def column(samples: Sequence[Any], name: str) -> npt.NDArray[Any]:
     """One field of N samples of one sensor, a row of each."""
     return samples.columns[name] if isinstance(samples, Samples) else np.array([getattr(one, name) for one in samples])
 

@@ -58,10 +58,10 @@ class Doubts:
         self.fixes.gave_in(self._refusals.since, off, variance, alone and not self._witness)
         self._refusals.taken()
 
-    def trusted(self, fix: GnssSample, before: float) -> bool:
-        """Whether a fix, if it is not refused, is simply used when that of the time ``before`` was."""
-        sure = self._receivers[fix.sensor].sure(fix.t, before)
-        return sure and not (self._winds is not None and self._winds.due(fix.t))
+    def trusted(self, sensor: str, t: float, before: float) -> bool:
+        """Whether a fix at ``t``, if it is not refused, is simply used when that of the time ``before`` was."""
+        sure = self._receivers[sensor].sure(t, before)
+        return sure and not (self._winds is not None and self._winds.due(t))
 
     def used(self, fix: GnssSample) -> None:
         """A `trusted` fix with velocity was used."""

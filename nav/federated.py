@@ -229,9 +229,9 @@ class Federated:
             self._pause(self._state, last.t)
         return taken
 
-    def trusted(self, fix: GnssSample, before: float) -> bool:
+    def trusted(self, sensor: str, t: float, before: float) -> bool:
         """See `nav.batch.Taker`."""
-        return self._doubts.trusted(fix, before)
+        return self._doubts.trusted(sensor, t, before)
 
     def took(self, sample: Sample) -> None:
         """See `nav.batch.Taker`."""

@@ -18,7 +18,7 @@ from typing import Protocol, TypeAlias, cast, overload
 import numpy as np
 import numpy.typing as npt
 
-from nav.columns import Estimated, Estimates, Reported, Reports, Samples, column
+from nav.columns import Estimated, Estimates, Reported, Reports, Samples, column, one_by_one
 from nav.increments import COINCIDENT, Increments, Steps, joined, share_of
 from nav.samples import Array, Estimate, ImuSamples, Sample, UpdateReport
 from nav.strapdown import compensate
@@ -128,12 +128,11 @@ class FusionHorizon:
     def _wait(self, samples: Handed) -> None:
         """Let samples wait for their turn."""
         lag_s, queue = self.lag_s, self._queue
-        for piece in samples:
-            for sample in piece if isinstance(piece, Samples) else (piece,):
-                t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
-                known = sample.t_arrival - lag_s  # not before, however early it is handed over
-                queue.append((known if known > t + COINCIDENT else t, sample.sensor, self._count, sample))
-                self._count += 1
+        for count, sample in enumerate(one_by_one(samples), self._count):
+            t = sample.t if math.isfinite(sample.t) else sample.t_arrival  # when the estimator will refuse it
+            known = sample.t_arrival - lag_s  # not before, however early it is handed over
+            queue.append((known if known > t + COINCIDENT else t, sample.sensor, count, sample))
+        self._count += sum(len(one) if isinstance(one, Samples) else 1 for one in samples)
         queue.sort()  # which leaves a heap, and takes less than to put in and take out one after the other
 
     def estimate_at(self, t: float) -> Estimate:

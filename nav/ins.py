@@ -210,9 +210,9 @@ class Ins:
         self.t = ahead.t
         return taken
 
-    def trusted(self, fix: GnssSample, before: float) -> bool:
+    def trusted(self, sensor: str, t: float, before: float) -> bool:
         """See `nav.batch.Taker`."""
-        return self._monitor.sure(fix.t, before) and not (self._winds is not None and self._winds.due(fix.t))
+        return self._monitor.sure(t, before) and not (self._winds is not None and self._winds.due(t))
 
     @property
     def pauses_from(self) -> float:

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from nav.aids.base import PlainAid
+from nav.columns import chosen, column
 from nav.error_model import Indices
 from nav.increments import ADVANCE, ESTIMATE, HORIZON, NUMBERS, TIME, WHAT, Steps
-from nav.samples import Array, GnssSample, Sample
+from nav.samples import Array, GnssSample, has_fix
 
 SPLIT = -3  # of a step, in place of the number of an aid: it only ends an increment
 WIDTH = NUMBERS + 12
@@ -20,12 +21,12 @@ NONE = np.empty(0, np.int64)
 
 class Plan(NamedTuple):
     """All steps (N, WIDTH) as `follow` takes them; the rows of their aids in the tables (N,), or `ANY`, `OTHERWISE`;
-    which of them are fixes, and which are samples of each sensor, ascending.
+    which of them are fixes of which receiver, and which are samples of each sensor, ascending.
     """
 
     rows: Array
     aid: Indices
-    fixes: list[int]
+    fixes: list[tuple[int, str]]
     of: dict[str, Indices]
 
     def own(self, sensor: str, first: int, stop: int) -> Indices:
@@ -40,7 +41,7 @@ def planned(steps: Steps, aids: Mapping[str, tuple[int, PlainAid]]) -> Plan:
     rows, aid = np.zeros((len(t), WIDTH)), np.full(len(t), ANY)
     rows[:, TIME], rows[:, HORIZON], rows[:, WHAT] = t, horizon, np.where(np.isnan(t), ADVANCE, ESTIMATE)
     of: dict[str, list[Indices]] = {}
-    fixes: list[int] = []
+    fixes: list[tuple[int, str]] = []
     for sensor, places, samples in steps.groups:
         where = np.asarray(places)
         of.setdefault(sensor, []).append(where)
@@ -53,22 +54,17 @@ def planned(steps: Steps, aids: Mapping[str, tuple[int, PlainAid]]) -> Plan:
         rows[where, WHAT] = SPLIT
         are_fixes = isinstance(samples[0], GnssSample)
         if are_fixes:
-            telling &= np.array([_has_fix(sample) for sample in samples])
+            telling &= np.array(has_fix(column(samples, "fix_type")), bool)
         if not telling.any():
             continue
         if not telling.all():
-            samples, where = [samples[k] for k in np.flatnonzero(telling).tolist()], where[telling]
+            samples, where = chosen(samples, telling), where[telling]
         numbers = aid_of.numbers(samples)
         rows[where, NUMBERS : NUMBERS + numbers.shape[1]] = numbers
         rows[where, WHAT] = row
         if are_fixes:
-            fixes += where.tolist()
+            fixes += [(k, sensor) for k in where.tolist()]
     return Plan(
         rows, aid, sorted(fixes),
         {sensor: own[0] if len(own) == 1 else np.sort(np.concatenate(own)) for sensor, own in of.items()},
     )  # fmt: skip
-
-
-def _has_fix(sample: Sample) -> bool:
-    """Whether there is anything in a receiver's sample to be used."""
-    return isinstance(sample, GnssSample) and sample.has_fix

@@ -24,6 +24,7 @@ from nav.aids.base import (
     well_within,
 )
 from nav.claims import WIDEST, Following
+from nav.columns import column
 from nav.earth import displacement_components, displacement_n, earth_rate_components, wrap_longitude
 from nav.error_model import PHI, POS, VEL, Block, Drive, Indices, markov, sensor_errors
 from nav.rotation import cross_components, dcm_components, dcm_from_quat, quat_rotate_components
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from nav.unscented import Points
 
 WHITE_SHARE = 0.1  # of a receiver's reported variance, the least that is taken as white noise
+NUMBERS = "lat", "lon", "h", "v_n", "sigma_position_n", "sigma_velocity_n"  # of a fix
 AT_REST = 1e-12  # square of a speed below which there is no direction [m^2/s^2]
 CONTRADICTION_S, REMEMBERED_S = 2.0, 6.0  # over which positions are held against velocities, faults remembered
 WAKE_S = 0.5  # in which what manoeuvres do to velocities comes, and goes, but for 1/e
@@ -130,9 +132,7 @@ class GnssAid:
 
     def numbers(self, samples: Sequence[GnssSample]) -> Array:
         """See `PlainAid`."""
-        places = [(one.lat, one.lon, one.h) for one in samples]
-        vectors = [(one.v_n, one.sigma_position_n, one.sigma_velocity_n) for one in samples]
-        return np.hstack([np.array(places), np.array(vectors).reshape(-1, 9)])
+        return np.column_stack([column(samples, name) for name in NUMBERS])
 
     def measure(self, part: str, sample: Sample, at: OperatingPoint) -> Measurement | None:
         """See `Aid`."""

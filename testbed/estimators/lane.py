@@ -11,10 +11,10 @@ import numpy as np
 
 from nav._jit import njit
 from nav.alignment import InitialState
-from nav.columns import Estimates, Reports, Samples
+from nav.columns import Estimates, Reports, Samples, one_by_one
 from nav.horizon import FusionHorizon
 from nav.ins import Ins
-from nav.samples import Array, Estimate, GnssSample, ImuSamples, Outcome, Sample, UpdateReport
+from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
 from nav.standing import Standing
 from nav.voting import Voter
 from testbed.estimators.datasheet import imu_model
@@ -99,7 +99,7 @@ class Lane:
             own = self._thinned(aid, samples[aid])
             handed += [own] if isinstance(own, Samples) else own
         if self.standing is not None:
-            handed += self.standing.heard(increments, [one for one in handed if isinstance(one, GnssSample)])
+            handed += self.standing.heard(increments, [*one_by_one(handed)])
         reports, estimates = self.horizon.track(increments, handed, times)
         return Tracked(increments, votes, reports, estimates)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from nav.columns import Samples
-from nav.samples import GnssSample, Sample, UpdateReport
+from nav.samples import GnssSample, Sample, UpdateReport, has_fix
 from testbed.motion.logged import LogTruth
 from testbed.motion.table import ON_GROUND, OUTSIDE
 from testbed.scenario import Scenario
@@ -61,16 +61,13 @@ class EventWatch:
             self.silent.remove(sensor)
             self.emit(t, "info", f"{sensor} heard again")
         self.heard[sensor] = t
-        if isinstance(samples, Samples) and samples.kind is not GnssSample:
+        fixed = _fixed(samples, which)
+        if fixed is None:
             return
-        sample = samples[which]
-        if not isinstance(sample, GnssSample):
-            return
-        before = self.fix.get(sample.sensor)
-        if before is not None and before != sample.has_fix:
-            severity, what = ("info", "reacquired") if sample.has_fix else ("warning", "denied")
-            self.emit(sample.t, severity, f"{sample.sensor} {what}")
-        self.fix[sample.sensor] = sample.has_fix
+        if self.fix.get(sensor, fixed) != fixed:
+            severity, what = ("info", "reacquired") if fixed else ("warning", "denied")
+            self.emit(samples[which].t, severity, f"{sensor} {what}")
+        self.fix[sensor] = fixed
 
     @property
     def heeds_fused(self) -> bool:
@@ -124,6 +121,14 @@ class EventWatch:
         for when, what, one in sorted(edges, key=lambda edge: edge[0]):
             if self.t < when <= t:
                 self.emit(when, "info", f"fault {one.name} {what}: {one}")
+
+
+def _fixed(samples: Sequence[Sample], which: int) -> bool | None:
+    """Whether one of several samples of a sensor is a fix, None where that is no receiver."""
+    if isinstance(samples, Samples):
+        return bool(has_fix(samples.columns["fix_type"][which])) if samples.kind is GnssSample else None
+    sample = samples[which]
+    return sample.has_fix if isinstance(sample, GnssSample) else None
 
 
 def legs_unflown(scenario: Scenario, leg: float) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -17,9 +17,10 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from nav._jit import njit
+from nav.columns import delivered
 from nav.earth import earth_rate_n, ecef_from_geodetic, radii, wrap_longitude
 from nav.rotation import quat_rotate
-from nav.samples import Array, FixType, GnssSample
+from nav.samples import Array, FixType, GnssSample, Sample
 from testbed.motion.table import TruthBlock
 from testbed.noise import Process, stream
 from testbed.schema import Section
@@ -336,7 +337,7 @@ class Gnss:
             both = (self._sigma_position_n, self._sigma_velocity_n)
             self._accuracies = tuple(Accuracy(sigma, config.accuracy_lag_s, dt) for sigma in both)
 
-    def sense(self, truth: TruthBlock) -> list[GnssSample]:
+    def sense(self, truth: TruthBlock) -> Sequence[Sample]:
         """The epochs that fall inside this block; those without a fix are delivered too."""
         rows = self._schedule.rows(truth)
         old_n = None
@@ -352,21 +353,11 @@ class Gnss:
         antenna = self._antenna(truth, rows)
         if old_n is not None:
             antenna[:, 3:] = old_n[rows.start :: rows.step]
-        times = truth.t[rows.start :: rows.step].tolist()
-        unsettled = [self._unsettled(*where) for where in zip(times, *antenna[:, :2].T.tolist(), strict=True)]
-        fixed = [i for i, factor in enumerate(unsettled) if factor]
-        stamps = [t + self._off for t in times]
-        fixes = iter(
-            self._fixes(
-                [stamps[i] for i in fixed], antenna[fixed], noise[fixed], jumps_n[fixed], sky[fixed, 0].tolist(),
-                [unsettled[i] for i in fixed],
-            )
-        )  # fmt: skip
-        latency = self._config.latency_s
-        return [
-            next(fixes) if factor else without_fix(t, t + latency, self.name)
-            for t, factor in zip(stamps, unsettled, strict=True)
-        ]
+        t = truth.t[rows.start :: rows.step]
+        unsettled = np.array(
+            [self._unsettled(*where) for where in zip(t.tolist(), *antenna[:, :2].T.tolist(), strict=True)]
+        )
+        return self._samples(t + self._off, antenna, noise, jumps_n, sky[:, 0], unsettled)
 
     def _antenna(self, truth: TruthBlock, rows: range) -> Array:
         """Latitude, longitude, height and velocity NED (n, 6) of the antenna."""
@@ -393,41 +384,44 @@ class Gnss:
         since = t - self.reception.denied_until - config.reacquire_s
         return 1 + (config.settle_factor - 1) * math.exp(-since / config.settle_s)
 
-    def _fixes(
-        self, stamps: Sequence[float], antenna: Array, noise: Array, jumps_n: Array, sky: Sequence[float],
-        unsettled: Sequence[float],
-    ) -> Iterator[GnssSample]:  # fmt: skip
-        """The samples of N epochs with a fix: of the antenna's places and velocities (N, 6), and their errors."""
-        config = self._config
-        noise = noise * np.array(unsettled)[:, None]
-        noise[:, :3] += jumps_n
-        v_n = antenna[:, 3:] + noise[:, 3:]
-        for k, (t, factor, (lat, lon, h)) in enumerate(
-            zip(stamps, unsettled, _displaced(antenna, noise).tolist(), strict=True)
-        ):
-            satellites = max(MIN_SATELLITES, round((config.satellites + sky[k]) / factor))
-            dilution = math.sqrt(config.satellites / satellites)
-            yield GnssSample(
-                t,
-                t + config.latency_s,
-                lat,
-                lon,
-                h,
-                v_n[k],
-                *self._stated(factor, jumps_n[k]),
-                FixType.FIX_3D,
-                satellites,
-                config.hdop * dilution,
-                config.vdop * dilution,
-                self.name,
-            )
+    def _samples(
+        self, t: Array, antenna: Array, noise: Array, jumps_n: Array, sky: Array, unsettled: Array
+    ) -> Sequence[Sample]:
+        """The samples stamped ``t`` (N,) of the antenna's places and velocities (N, 6) and their errors.
 
-    def _stated(self, unsettled: float, jump_n: Array) -> tuple[Array, Array]:
-        """The accuracies of position and velocity that it reports."""
+        What goes with a fix is missing where there is none, ``unsettled`` being zero.
+        """
+        n, config, fixed = len(t), self._config, unsettled > 0.0
+        factor, jumps_n = unsettled[fixed], jumps_n[fixed]
+        noise = noise[fixed] * factor[:, None]
+        noise[:, :3] += jumps_n
+        place, v_n = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        place[fixed], v_n[fixed] = _displaced(antenna[fixed], noise), antenna[fixed, 3:] + noise[:, 3:]
+        sigma_position_n, sigma_velocity_n = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        sigma_position_n[fixed], sigma_velocity_n[fixed] = self._stated(factor, jumps_n)
+        satellites, kind = np.zeros(n, np.int64), np.full(n, FixType.NO_FIX, object)
+        satellites[fixed] = np.maximum(np.round((config.satellites + sky[fixed]) / factor), MIN_SATELLITES)
+        kind[fixed] = FixType.FIX_3D
+        hdop, vdop = np.full(n, NO_FIX_DOP), np.full(n, NO_FIX_DOP)
+        dilution = np.sqrt(config.satellites / satellites[fixed])
+        hdop[fixed], vdop[fixed] = config.hdop * dilution, config.vdop * dilution
+        return delivered(
+            GnssSample, self.name, t, config.latency_s, lat=place[:, 0], lon=place[:, 1], h=place[:, 2], v_n=v_n,
+            sigma_position_n=sigma_position_n, sigma_velocity_n=sigma_velocity_n, fix_type=kind, satellites=satellites,
+            hdop=hdop, vdop=vdop,
+        )  # fmt: skip
+
+    def _stated(self, unsettled: Array, jumps_n: Array) -> tuple[Array, Array]:
+        """The accuracies of position and velocity that it reports with each of N fixes, (N, 3) both."""
         if self._accuracies is None:
-            return self._sigma_position_n * unsettled, self._sigma_velocity_n * unsettled
+            return unsettled[:, None] * self._sigma_position_n, unsettled[:, None] * self._sigma_velocity_n
         position, velocity = self._accuracies
-        return position.stated(unsettled, jump_n), velocity.stated(unsettled, np.zeros(3))
+        stated = [
+            (position.stated(factor, jump_n), velocity.stated(factor, np.zeros(3)))
+            for factor, jump_n in zip(unsettled.tolist(), jumps_n, strict=True)
+        ]
+        both = np.array(stated).reshape(-1, 2, 3)
+        return both[:, 0], both[:, 1]
 
 
 @njit
