@@ -399,9 +399,8 @@ class Gnss:
         place[fixed], v_n[fixed] = _displaced(antenna[fixed], noise), antenna[fixed, 3:] + noise[:, 3:]
         sigma_position_n, sigma_velocity_n = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         sigma_position_n[fixed], sigma_velocity_n[fixed] = self._stated(factor, jumps_n)
-        satellites, kind = np.zeros(n, np.int64), np.full(n, FixType.NO_FIX, object)
+        satellites, kind = np.zeros(n, np.int64), np.array([FixType.NO_FIX, FixType.FIX_3D], object)[fixed.astype(int)]
         satellites[fixed] = np.maximum(np.round((config.satellites + sky[fixed]) / factor), MIN_SATELLITES)
-        kind[fixed] = FixType.FIX_3D
         hdop, vdop = np.full(n, NO_FIX_DOP), np.full(n, NO_FIX_DOP)
         dilution = np.sqrt(config.satellites / satellites[fixed])
         hdop[fixed], vdop[fixed] = config.hdop * dilution, config.vdop * dilution
