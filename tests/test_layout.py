@@ -12,7 +12,7 @@ MOST_PARAMETERS = 6
 # Compiled loops, which calls in between would slow down.
 KERNELS = {
     "nav/ahrs/state.py:propagate",
-    "nav/batch.py:follow",
+    "nav/batch.py:_follow",
     "nav/error_model.py:transition",
     "nav/strapdown.py:step",
     "testbed/sensors/increments.py:accumulate",
