@@ -8,6 +8,7 @@ from worlds.ins import CONSUMER, DT, FIELD_N, airspeed, barometer, flight, gnss,
 
 from nav.ahrs import Ahrs, AhrsConfig, AnyMotion
 from nav.aids import AirspeedAid, BarometerAid, GnssAid, MagnetometerAid, PositionFixAid
+from nav.columns import Samples
 from nav.detection import ChiSquare, Eraim
 from nav.federated import Federated
 from nav.federation import Config, Local
@@ -24,7 +25,13 @@ AIDS = (
     MagnetometerAid(soft_iron_sigma=0.005),
     AirspeedAid(gust_sigma=0.5, scale_sigma=0.01),
 )
+FEDERATION = Config(
+    CONSUMER,
+    tuple(Local(aid.sensor, (MonitoredAid(aid, lambda: ChiSquare(1e-3)),)) for aid in AIDS),
+)
 DURATION = 90
+# Step by step or not, blocks [s], samples one by one or in columns.
+WAYS = (True, 1.0, False), (False, 1.0, False), (False, 7.3, False), (False, 7.3, True), (False, 0.9, True)
 
 
 class OneByOne:
@@ -117,7 +124,24 @@ def field_n(lat, lon, h):
     return FIELD_N * (1 + 1e-3 * (lat - 0.83))
 
 
-def run(one_by_one, ins, increments, samples, block_s, times):
+def in_columns(samples):
+    """Those of each sensor as columns, but where a field of one has no number or another shape."""
+    handed = []
+    for sensor in sorted({sample.sensor for sample in samples}):
+        own = [sample for sample in samples if sample.sensor == sensor]
+        rows = [[getattr(sample, f.name) for f in dataclasses.fields(sample)[:-1]] for sample in own]
+        if len({tuple(np.shape(value) for value in row) for row in rows}) > 1:
+            handed += own
+            continue
+        names = [f.name for f in dataclasses.fields(own[0])[:-1]]
+        columns = [
+            np.array(column, object if isinstance(column[0], FixType) else None) for column in zip(*rows, strict=True)
+        ]
+        handed.append(Samples(type(own[0]), sensor, dict(zip(names, columns, strict=True))))
+    return handed
+
+
+def run(one_by_one, ins, increments, samples, block_s, times, columns=False):
     """Reports, estimates and the estimator, pushed in blocks of `block_s`."""
     horizon = FusionHorizon(OneByOne(ins) if one_by_one else ins, lag_s=0.1)
     samples = sorted(samples, key=lambda s: s.t_arrival)
@@ -130,7 +154,7 @@ def run(one_by_one, ins, increments, samples, block_s, times):
             arrived.append(samples[taken])
             taken += 1
         asked = [t for t in times if block.t[0] - DT + 1e-9 < t <= block.t[-1] + 1e-9]
-        some, told = horizon.track(block, arrived, asked)
+        some, told = horizon.track(block, in_columns(arrived) if columns else arrived, asked)
         reports += some
         estimates += told
     return reports, estimates, ins
@@ -169,7 +193,7 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         config = dataclasses.replace(config, alignment_aids=tuple(a for a in AIDS if a not in change["aids"]))
     times = np.arange(0.1, DURATION - 1, 0.1).tolist()
     results = []
-    for one_by_one, block_s in ((True, 1.0), (False, 1.0), (False, 7.3)):
+    for one_by_one, block_s, columns in WAYS:
         increments, samples = sound(offset_s)
         if spoilt:
             samples = rough(increments, samples)
@@ -178,7 +202,7 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
             PositionSample(t, t, truth.lat[k], truth.lon[k], truth.h[k])
             for k, t in ((k, k * DT) for k in range(round(20 / DT), round(60 / DT), round(1 / DT)))
         ]
-        results.append(run(one_by_one, Ins(config, field_n), increments, samples, block_s, times))
+        results.append(run(one_by_one, Ins(config, field_n), increments, samples, block_s, times, columns))
     (reports, estimates, ins), *others = results
     assert ins.aligned
     assert len({report.outcome for report in reports}) >= (4 if spoilt else min(1, len(config.aids)))
@@ -190,6 +214,22 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         assert same(ins._monitor, other._monitor)
         assert same(ins._refusals, other._refusals)
         assert same(ins.realignment._heading._refusals, other.realignment._heading._refusals)
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Ins(InsConfig(CONSUMER, AIDS), field_n), lambda: Federated(FEDERATION, field_n)]
+)
+def test_estimates_are_made_of_nothing_that_a_draft_lacks(make):
+    times, told = np.arange(0.1, DURATION - 1, 0.1).tolist(), []
+    size = None
+    for _ in range(2):
+        estimator, (increments, samples) = make(), sound()
+        if size is not None:
+            estimator._batch._wholes = np.full((len(times), size), np.nan)
+        told.append(run(False, estimator, increments, samples, 7.3, times)[1])
+        size = len(estimator._state.whole)
+    assert len(told[0]) == len(times)
+    assert all(map(same, *told))
 
 
 def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
@@ -226,21 +266,22 @@ def test_so_does_a_federation(change, detector):
     config = dataclasses.replace(Config(CONSUMER, parts), **change)
     times = np.arange(0.1, DURATION - 1, 0.1).tolist()
     results = []
-    for one_by_one, block_s in ((True, 1.0), (False, 7.3)):
+    for one_by_one, block_s, columns in WAYS:
         increments, samples = sound(0.0)
         samples = rough(increments, samples)
-        results.append(run(one_by_one, Federated(config, field_n), increments, samples, block_s, times))
-    (reports, estimates, one), (some, told, other) = results
+        results.append(run(one_by_one, Federated(config, field_n), increments, samples, block_s, times, columns))
+    (reports, estimates, one), *others = results
     assert one.aligned
     assert len({report.outcome for report in reports}) >= 4
-    assert len(some) == len(reports)
-    assert all(map(same, reports, some))
-    assert all(map(same, estimates, told))
-    assert same(one.events, other.events)
-    for a, b in zip(one.locals, other.locals, strict=True):
-        assert all(
-            same(x.suspected, y.suspected) for x, y in zip(a.monitors.values(), b.monitors.values(), strict=True)
-        )
+    for some, told, other in others:
+        assert len(some) == len(reports)
+        assert all(map(same, reports, some))
+        assert all(map(same, estimates, told))
+        assert same(one.events, other.events)
+        for a, b in zip(one.locals, other.locals, strict=True):
+            assert all(
+                same(x.suspected, y.suspected) for x, y in zip(a.monitors.values(), b.monitors.values(), strict=True)
+            )
 
 
 LOOSE = LowDynamics(1.0, 0.1, 0.1)  # this flight is level now and then
@@ -286,7 +327,7 @@ def test_so_does_an_attitude_filter(change, offset_s, spoilt, advised):
     config = dataclasses.replace(ATTITUDE, **change)
     times = np.arange(0.1, DURATION - 1, 0.1).tolist()
     results = []
-    for one_by_one, block_s in ((True, 1.0), (False, 1.0), (False, 7.3)):
+    for one_by_one, block_s, columns in WAYS:
         increments, samples = sound()
         if spoilt:
             samples = rough(increments, samples)
@@ -299,7 +340,7 @@ def test_so_does_an_attitude_filter(change, offset_s, spoilt, advised):
         ahrs = Ahrs(config, FIELD_N)
         if advised:
             ahrs.flight_control(increments.t, np.sin(increments.t) < 0.5)
-        results.append(run(one_by_one, ahrs, increments, samples, block_s, times))
+        results.append(run(one_by_one, ahrs, increments, samples, block_s, times, columns))
     (reports, estimates, ahrs), *others = results
     assert ahrs.aligned
     assert ahrs.in_steps is not ({"any_motion", "correction"} & change.keys() != set())

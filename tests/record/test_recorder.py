@@ -24,8 +24,8 @@ from worlds import synthetic_run
 from worlds.full_disk import file_size_limit
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.columns import Estimates
-from nav.samples import ImuSamples, Outcome, UpdateReport
+from nav.columns import Estimates, Samples, delivered
+from nav.samples import ImuSamples, MagnetometerSample, Outcome, UpdateReport
 from testbed import interrupts
 from testbed.errors import UserError
 from testbed.motion.table import COLUMNS, TruthBlock
@@ -72,6 +72,22 @@ def assert_same(a: Any, b: Any) -> None:
             assert variable.values.tolist() == right[path].values.tolist(), path
         else:
             np.testing.assert_array_equal(variable.values, right[path].values, err_msg=path)
+
+
+def test_samples_in_columns_are_recorded_as_single_ones_are() -> None:
+    t, field_b = np.arange(20) * 0.5, np.random.default_rng(2).standard_normal((20, 3))
+    many = delivered(MagnetometerSample, "compass", t, 0.1, field_b=field_b)
+    assert isinstance(many, Samples)
+    found = []
+    for pieces in ([[*many]], [many], [many[:9], [*many[9:12]], many[12:]]):
+        recorder = Recorder(None, scenario(10.0), 3)
+        recorder.truth(circle(10.0))
+        for piece in pieces:
+            recorder.samples("compass", piece)
+        found.append(recorder.dataset())
+    assert_same(found[0], found[1])
+    assert_same(found[0], found[2])
+    assert np.array_equal(found[0]["sensors/compass/field_b"], field_b)
 
 
 def test_truth_is_recorded_at_its_own_rate_with_summed_increments(run_file: Path) -> None:
