@@ -15,7 +15,7 @@ from typing import Any
 import numba
 import pytest
 
-from nav import aids, alignment, earth, reference, state, strapdown
+from nav import aids, alignment, columns, earth, reference, state, strapdown
 from nav.aids.base import Measurement
 from nav.detection import Never
 from nav.error_model import PHI, POS, VEL
@@ -97,7 +97,7 @@ def samples_as_they_arrive(monkeypatch: pytest.MonkeyPatch) -> None:
     right = FusionHorizon.track
 
     def wrong(self: FusionHorizon, imu: Any, samples: list[Sample], times: Any) -> Any:
-        return right(self, imu, [replace(sample, t=sample.t_arrival) for sample in samples], times)
+        return right(self, imu, [replace(sample, t=sample.t_arrival) for sample in columns.one_by_one(samples)], times)
 
     monkeypatch.setattr(FusionHorizon, "track", wrong)
 
