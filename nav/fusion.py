@@ -36,11 +36,12 @@ def combine(
     Information: ``P_g = (sum P_i^-1)^-1, x_g = P_g sum P_i^-1 x_i`` (Cui et al. 2022, Eq 10). Covariance intersection
     is the same with each P_i^-1 times w_i, sum w_i = 1. Scalar: ``x_g = sum w_i x_i`` (Zhu et al. 2020, Eq 14) with the
     bound ``P_g = sum w_i P_i``, which holds for any correlation. The w_i are those of `weights_by_covariance`, or of
-    ``weigh``.
+    ``weigh``, which is handed the covariances of the common states (filters, common, common).
     """
     if combination == "information":
         return Master(*information(x, P, common, members), members)
-    weights = (weigh or weights_by_covariance)(P, common, members)
+    own = np.ascontiguousarray(P[:, :common, :common])  # on the way to an estimate there is nothing else in P
+    weights = (weigh or weights_by_covariance)(own, common, members)
     if combination == "scalar":
         x_g, P_g = weights @ x[:, :common], np.tensordot(weights, P[:, :common, :common], 1)
     else:

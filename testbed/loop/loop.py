@@ -405,6 +405,7 @@ class _Passage:
         for section in self.setup.own(self.scenario):
             _, *smoothed = section.recorded
             for name in smoothed:
+                self.recorder.flush()  # looking back takes a while, and a run may be killed in it
                 self.recorder.estimates(name, Estimates.of(self.lanes[section.name].smoothed(times)))
         if self.setup.far_end is not None:
             for name, found in self.setup.far_end.estimates(times).items():

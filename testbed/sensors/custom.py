@@ -332,9 +332,17 @@ def _copy(truth: TruthBlock) -> TruthBlock:
 
 
 def _timed(sample: Any) -> Any:
-    """The same, with numbers as its times where they are arrays without dimensions."""
+    """The same, with numbers of Python as its times where they are arrays without dimensions, or in single precision.
+
+    Beside a single number NumPy compares in single precision, in an array not.
+    """
     times = {name: getattr(sample, name, None) for name in ("t", "t_arrival")}
-    changes = {name: value[()] for name, value in times.items() if isinstance(value, np.ndarray) and not value.ndim}
+    changes = {
+        name: value.item()
+        for name, value in times.items()
+        if (isinstance(value, np.ndarray) and not value.ndim)
+        or (isinstance(value, np.generic) and not isinstance(value, float))
+    }
     return dataclasses.replace(sample, **changes) if changes else sample
 
 

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from nav.samples import Estimate
 from testbed import Scenario, run
 from testbed.errors import UserError
+from testbed.estimators.lane import Lane
+from testbed.record.reader import load
+from testbed.results import RECORD
 from testbed.score.accuracy import column
 
 ONE = [
@@ -27,6 +34,18 @@ def test_it_is_recorded_and_scored_beside_the_filter() -> None:
     np.testing.assert_allclose(np.diff(t), 0.1, atol=1e-6)
     assert t[-1] == column(smoothed.dataset, "truth/time")[-1]
     assert smoothed.dataset["estimators/ins_smoothed/magnetometer_soft_iron"].shape == (len(t), 9)
+
+
+def test_a_run_that_is_killed_while_it_looks_back_has_a_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    smoothed, kept = Lane.smoothed, []
+
+    def look_back(lane: Lane, times: Iterable[float]) -> Iterator[Estimate]:
+        kept.append(load(tmp_path / RECORD)["truth/time"].values[-1])
+        return smoothed(lane, times)
+
+    monkeypatch.setattr(Lane, "smoothed", look_back)
+    run(Scenario.parse(TURN), out=tmp_path)
+    assert kept == [30.0]
 
 
 TURN = """

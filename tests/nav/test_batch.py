@@ -216,8 +216,19 @@ def test_the_same_bits_as_one_after_the_other(change, offset_s, spoilt):
         assert same(ins.realignment._heading._refusals, other.realignment._heading._refusals)
 
 
+def by_all(P, common, members):
+    """Weights (filters,) by whatever covariances are handed over."""
+    better = members / np.array([np.linalg.norm(own) for own in P])
+    return better / better.sum()
+
+
 @pytest.mark.parametrize(
-    "make", [lambda: Ins(InsConfig(CONSUMER, AIDS), field_n), lambda: Federated(FEDERATION, field_n)]
+    "make",
+    [
+        lambda: Ins(InsConfig(CONSUMER, AIDS), field_n),
+        lambda: Federated(FEDERATION, field_n),
+        lambda: Federated(dataclasses.replace(FEDERATION, combination="scalar", sharing="none", weigh=by_all), field_n),
+    ],
 )
 def test_estimates_are_made_of_nothing_that_a_draft_lacks(make):
     times, told = np.arange(0.1, DURATION - 1, 0.1).tolist(), []

@@ -358,6 +358,16 @@ def test_samples_of_ours_may_have_two_numbers() -> None:
     assert guard.sense(TruthBlock.empty(0, 1))[0].wind_n.tolist() == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.int64, np.array])
+def test_times_are_numbers_of_python(kind: Any) -> None:
+    """Single precision was compared with other times in single precision or not, by how the run was cut."""
+    made = [MagnetometerSample(kind(1), kind(2), np.ones(3), "radar")]
+    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
+    (sample,) = guard.sense(TruthBlock.empty(0, 1))
+    assert (sample.t, sample.t_arrival) == (1, 2)
+    assert {type(sample.t), type(sample.t_arrival)} <= {float, int}
+
+
 def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
     array = np.ones(3)
     made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
