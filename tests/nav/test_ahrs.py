@@ -654,7 +654,7 @@ def test_half_an_hour_without_gnss(plan):
         model = imu_model(sense["imu"][0].errors())
         told = AhrsConfig(model, LAT, 300.0, ("airspeed", "barometer"), heading=30 * DEG, force_sigma=0.3)
         _, estimates = FusionHorizon(Ahrs(told)).track(
-            sense["imu"][1], sense["airspeed"][1] + sense["barometer"][1], times.tolist()
+            sense["imu"][1], [*sense["airspeed"][1], *sense["barometer"][1]], times.tolist()
         )
         error = errors(np.array([e.q_nb for e in estimates]), truth.q_nb[np.round(times * 200).astype(int)])[:, :2]
         sigma = np.sqrt([np.diag(e.covariance)[6:8].mean() for e in estimates]) / DEG
