@@ -336,6 +336,8 @@ def _timed(sample: Any) -> Any:
 
     Beside a single number NumPy compares in single precision, in an array not.
     """
+    if not dataclasses.is_dataclass(sample) or isinstance(sample, type):
+        return sample
     times = {name: getattr(sample, name, None) for name in ("t", "t_arrival")}
     changes = {
         name: value.item()

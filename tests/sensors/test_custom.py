@@ -368,6 +368,13 @@ def test_times_are_numbers_of_python(kind: Any) -> None:
     assert {type(sample.t), type(sample.t_arrival)} <= {float, int}
 
 
+def test_what_is_no_dataclass_is_told_whatever_its_times_are() -> None:
+    given = SimpleNamespace(t=np.float32(1), t_arrival=np.array(1.0), sensor="radar")
+    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: [given]))
+    with pytest.raises(UserError, match="gave SimpleNamespace where a sample was expected: a dataclass with t"):
+        guard.sense(TruthBlock.empty(0, 1))
+
+
 def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
     array = np.ones(3)
     made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
