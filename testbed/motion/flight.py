@@ -48,6 +48,7 @@ class Flight:
         start, envelope, wind = truth.start, self._aircraft.envelope, self._weather.start()
         self._launcher: Launcher | None = None
         self._legs, self._ground, self._hit = list(plan), terrain.of(truth.terrain), HIT_M
+        self._summit = float(self._ground.heights.max())
         if start.on_ground:
             assert envelope.launch is not None  # the scenario was checked
             self._launcher = Launcher(envelope.launch, truth, self._frame)
@@ -155,7 +156,10 @@ class Flight:
     def _guide(self) -> None:
         """One step of guidance, or the end of the flight."""
         true = self.true_feedback()
-        self.failure = _loss_of_control(true, self._hit + self._height_of_ground(true.lat, true.lon))
+        high = true.h > self._hit + self._summit  # whatever is below
+        self.failure = _loss_of_control(
+            true, self._hit + (self._summit if high else self._height_of_ground(true.lat, true.lon))
+        )
         if self.failure:
             self._ended = True
             return

@@ -164,7 +164,10 @@ class Aircraft:
         try:
             yield
         except jsbsim.BaseError as error:
-            raise UserError(f"{self._model}: JSBSim can't fly it: {' '.join(str(error).split())}") from None
+            raise self._not_flown(error) from None
+
+    def _not_flown(self, error: jsbsim.BaseError) -> UserError:
+        return UserError(f"{self._model}: JSBSim can't fly it: {' '.join(str(error).split())}")
 
     def _require_state(self) -> None:
         if not all(map(math.isfinite, self.read())):
@@ -192,10 +195,12 @@ class Aircraft:
         run, nodes = self.fdm.run, self._nodes
         flown: list[float] = []
         read = flown.extend  # no list for each row, and packed all at once: every step of Python counts here
-        with self._flying():
+        try:
             for _ in range(steps):
                 run()
                 read(map(VALUE, nodes))
+        except jsbsim.BaseError as error:
+            raise self._not_flown(error) from None
         rows.frombytes(struct.pack(f"{len(flown)}d", *flown))
         return flown[-WIDTH:]
 

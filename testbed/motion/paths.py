@@ -54,23 +54,19 @@ class TangentPlane:
 
     def motion(self, state: Feedback) -> Motion:
         """Position, ground velocity and heading of ``state`` seen in the plane, at the aircraft's height."""
-        s, c = math.sin(state.lat), math.cos(state.lat)
-        sl, cl = math.sin(state.lon - self._lon), math.cos(state.lon - self._lon)
+        lat, lon, h, north, east, down, _, _, heading, _, _, _, airspeed = state  # once: names take their time
+        s, c = math.sin(lat), math.cos(lat)
+        sl, cl = math.sin(lon - self._lon), math.cos(lon - self._lon)
         normal = A / math.sqrt(1.0 - E2 * s * s)
-        x = (normal + state.h) * c * cl - (self._normal + state.h) * self._cos
-        z = (normal * (1.0 - E2) + state.h) * s - (self._normal * (1.0 - E2) + state.h) * self._sin
-        v_x = -state.v_north * s * cl - state.v_east * sl - state.v_down * c * cl
-        v_y = -state.v_north * s * sl + state.v_east * cl - state.v_down * c * sl
-        v_z = state.v_north * c - state.v_down * s
-        v_north, v_east = v_z * self._cos - v_x * self._sin, v_y
-        convergence = math.atan2(v_east, v_north) - math.atan2(state.v_east, state.v_north)
+        x = (normal + h) * c * cl - (self._normal + h) * self._cos
+        z = (normal * (1.0 - E2) + h) * s - (self._normal * (1.0 - E2) + h) * self._sin
+        v_x = -north * s * cl - east * sl - down * c * cl
+        v_y = -north * s * sl + east * cl - down * c * sl
+        v_z = north * c - down * s
+        v_north = v_z * self._cos - v_x * self._sin
+        convergence = math.atan2(v_y, v_north) - math.atan2(east, north)
         return Motion(
-            z * self._cos - x * self._sin,
-            (normal + state.h) * c * sl,
-            v_north,
-            v_east,
-            state.heading + convergence,
-            state.airspeed,
+            z * self._cos - x * self._sin, (normal + h) * c * sl, v_north, v_y, heading + convergence, airspeed
         )
 
 
