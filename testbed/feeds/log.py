@@ -57,6 +57,7 @@ class Reference:
 
     ``columns`` are those of the truth table that it has (`testbed.motion.table.COLUMNS`), NaN where it is silent.
     ``sigma_position_n`` [m] and ``sigma_velocity_n`` [m/s] (3,) are how good it is, 0 where it is the truth.
+    ``point_b`` (3,) [m], b, is what it is of: 0 of what all lever arms begin at, or an antenna.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Reference:
     columns: Mapping[str, Array]
     sigma_position_n: Array = field(default_factory=lambda: np.zeros(3))
     sigma_velocity_n: Array = field(default_factory=lambda: np.zeros(3))
+    point_b: Array = field(default_factory=lambda: np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,6 +141,7 @@ class Recorded:
         self.origin = {
             "reference": reference.name,
             "reference_sigma_n": json.dumps([*reference.sigma_position_n, *reference.sigma_velocity_n]),
+            "reference_point_b_m": json.dumps(reference.point_b.tolist()),
             "log": f"{log.path.name} ({log.format})",
         }
         sections = scenario.sensors
@@ -201,7 +202,8 @@ class Recorded:
         else:
             section = sections.get(receiver, GnssConfig.model_validate({}))
             told = self._samples.get(receiver) or _samples_of(section, log, receiver, self._start)
-            found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver)
+            arm_b = np.array(section.lever_arm_m) if isinstance(section, GnssConfig) else np.zeros(3)
+            found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver, arm_b)
             found = _when_felt(found, section, log, receiver)
             if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
                 found = _with_attitude(found, solution, self._start)

@@ -21,6 +21,8 @@ LONGEST_STEP_S = 1.5  # between rows that are joined: a receiver of 1 Hz may be 
 OTHER_HEIGHT_M = 10.0  # as the sea is above the ellipsoid or below it, and no receiver all the time
 DOUBTED_M, LATE_S = 10.0, 0.5  # of a solution from its receiver: more than both are off, and the receiver is late
 STEPS = 3.0  # or so many of its own, where it is slower
+FAR_M, FAR = 10.0, 10.0  # that a fix may be off by and count, or so many times the usual
+BACK = 0.2  # of the way there, by which the way back may miss
 KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
 
 
@@ -134,6 +136,7 @@ def doubt(solution: Reference | None, samples: Mapping[str, Samples]) -> str:
     """What there is to say of a solution that is not where the first receiver with a fix was, nothing otherwise."""
     for name, own in samples.items():
         fixes = [one for one in own if isinstance(one, GnssSample) and one.has_fix and is_flown(one.lat, one.h)]
+        fixes = [one for one, wrong in zip(fixes, strays(fixes), strict=True) if not wrong]
         if fixes and solution is not None and "lat" in solution.columns:
             at = ReferenceMotion(solution, 1.0, 0).at(np.array([one.t for one in fixes]))
             there = np.array([(one.lat, one.lon, one.h) for one in fixes]).T
@@ -177,16 +180,39 @@ def silence(reference: Reference, first: float, last: float) -> str:
     return f"{reference.name} is of {t[0]:.10g} to {t[-1]:.10g} s, outside of the {first:.10g} to {last:.10g} s"
 
 
-def of_receiver(samples: Sequence[GnssSample], name: str) -> Reference:
-    """A receiver's own fixes as the reference, as good as it says."""
+def strays(fixes: Sequence[GnssSample]) -> npt.NDArray[np.bool_]:
+    """Which fixes (N,) are far from the one before and from the one after, while those two agree.
+
+    That is by how far each step is from what velocities say of it, or from nothing where there are none.
+    """
+    found = np.zeros(len(fixes), bool)
+    if len(fixes) < 3:
+        return found
+    t, lat, lon, h = np.array([(one.t, one.lat, one.lon, one.h) for one in fixes]).T
+    v_n = np.array([one.v_n for one in fixes])
+    said = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(t)[:, None]
+    off = position_difference_n(lat[1:], lon[1:], h[1:], lat[:-1], lon[:-1], h[:-1])
+    off -= np.where(np.isfinite(said), said, 0.0)
+    far = np.linalg.norm(off, axis=1)
+    least = np.minimum(far[1:], far[:-1])
+    back = np.linalg.norm(off[1:] + off[:-1], axis=1)
+    found[1:-1] = (least > max(FAR_M, FAR * float(np.median(far)))) & (back < BACK * least)
+    return found
+
+
+def of_receiver(samples: Sequence[GnssSample], name: str, point_b: Array) -> Reference:
+    """A receiver's own fixes as the reference, as good as it says, of its antenna at ``point_b`` (3,); no `strays`."""
     fixes = [one for one in samples if one.has_fix]
+    wrong = strays(fixes)
+    fixes = [one for one, left_out in zip(fixes, wrong.tolist(), strict=True) if not left_out]
+    but = f", but for {wrong.sum()} far from those before and after" if wrong.any() else ""
 
     def rows(key: str) -> Array:
         return np.array([getattr(one, key) for one in fixes], float)
 
     columns = {key: rows(key) for key in ("lat", "lon", "h")} | {"v_n": rows("v_n").reshape(-1, 3)}
     sigma = [usual_sigma(rows(key).reshape(-1, 3)) for key in ("sigma_position_n", "sigma_velocity_n")]
-    return Reference(f"{name} of the log, kept back where it is denied", rows("t"), columns, *sigma)
+    return Reference(f"{name} of the log, kept back where it is denied{but}", rows("t"), columns, *sigma, point_b)
 
 
 def usual_sigma(told: Array) -> Array:

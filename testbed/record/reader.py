@@ -28,6 +28,7 @@ IN_JSON: Mapping[str, type] = {
     "estimated_point_b_m": dict,
     "estimator_imus": dict,
     "reference_sigma_n": list,
+    "reference_point_b_m": list,
 }
 SAID = {"scenario", "overrides", "estimated_point_b_m", *NUMBERS}
 # What comes with a column that samples of ours have. Where more than one is not there, they are the user's.

@@ -138,8 +138,10 @@ def errors(dataset: xarray.DataTree, estimator: str, settling_s: float = SETTLIN
         estimated("lat"), estimated("lon"), estimated("h"), true("lat"), true("lon"), true("h")
     )
     velocity = estimated("v_n") - true("v_n")
-    # Truth is of the centre of gravity, the estimate of the IMU. (The Earth's own rate does 1e-4 m/s per metre.)
-    arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator])
+    # The estimate is of the IMU, truth of the centre of gravity and a receiver of its antenna. (The Earth's own rate
+    # does 1e-4 m/s per metre.)
+    arm_b = np.array(json.loads(dataset.attrs["estimated_point_b_m"])[estimator], float)
+    arm_b -= json.loads(dataset.attrs.get("reference_point_b_m", "[0, 0, 0]"))
     if arm_b.any():
         lying = np.where(np.isfinite(true("q_nb")), true("q_nb"), estimated("q_nb"))  # as near as anybody knows
         position -= rotated(lying, np.broadcast_to(arm_b, position.shape))
