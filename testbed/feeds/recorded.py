@@ -35,6 +35,7 @@ EDGE_S = 1e-6  # a sample this close to a row comes with it
 DIGITS = 3  # of a rate that is found
 FASTEST_HZ = 10_000.0  # of any sensor
 SLOWEST_IMU_HZ = 5.0
+ALIKE = 0.1  # of a rate, by which those of units that are meant to report together are measured otherwise
 OTHER_CLOCK_S = 0.5  # by which a receiver is late otherwise than is told
 NOBODY = Reference("none: nothing is judged", np.empty(0), {})
 
@@ -54,6 +55,11 @@ def located(scenario: Scenario) -> Scenario:
     for name, section in scenario.sensors.items():
         if "rate_hz" not in section.model_fields_set:
             found[f"sensors.{name}.rate_hz"] = rate(log, name)
+    for estimator in scenario.estimator:  # spares are given at the times of the unit that they stand in for
+        for spare in estimator.spare_imus:
+            own, first = (found.get(f"sensors.{name}.rate_hz", math.nan) for name in (spare, estimator.imu))
+            if abs(own - first) < ALIKE * first:
+                found[f"sensors.{spare}.rate_hz"] = first
     return scenario.changed(found) if found else scenario
 
 

@@ -211,8 +211,9 @@ def of_receiver(samples: Sequence[GnssSample], name: str, point_b: Array) -> Ref
         return np.array([getattr(one, key) for one in fixes], float)
 
     columns = {key: rows(key) for key in ("lat", "lon", "h")} | {"v_n": rows("v_n").reshape(-1, 3)}
-    sigma = [usual_sigma(rows(key).reshape(-1, 3)) for key in ("sigma_position_n", "sigma_velocity_n")]
-    return Reference(f"{name} of the log, kept back where it is denied{but}", rows("t"), columns, *sigma, point_b)
+    position, velocity = (usual_sigma(rows(f"sigma_{what}_n").reshape(-1, 3)) for what in ("position", "velocity"))
+    told = f"{name} of the log, kept back where it is denied{but}"
+    return Reference(told, rows("t"), columns, position, velocity, point_b)
 
 
 def usual_sigma(told: Array) -> Array:

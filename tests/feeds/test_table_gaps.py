@@ -182,6 +182,19 @@ def test_a_second_unit_may_have_been_heard_later(moved: float, tmp_path: Path) -
             run(Scenario.load(tmp_path / "a.toml"))
 
 
+@pytest.mark.parametrize("step", [0.0099, 0.0101, 0.02])
+def test_a_spare_unit_may_be_a_little_faster_or_slower(step: float, tmp_path: Path) -> None:
+    """By two crystals; it is given at the times of the first. One of another rate is refused."""
+    t = np.arange(6000) / 100
+    np.savez(tmp_path / "a.npz", **unit(t) | fixes(np.arange(60.0)) | {"t2": step * np.arange(6000)})
+    (tmp_path / "a.toml").write_text(TWO + '[sensors.spare]\nkind = "imu"\n')
+    if step < 0.02:
+        run(Scenario.load(tmp_path / "a.toml", {"estimator.ins.spare_imus": ["spare"]}))
+    else:
+        with pytest.raises(UserError, match=r"has 50 Hz, not the 100 Hz of 'imu'"):
+            run(Scenario.load(tmp_path / "a.toml", {"estimator.ins.spare_imus": ["spare"]}))
+
+
 def test_fixes_may_come_as_often_as_increments(tmp_path: Path) -> None:
     """As those of a receiver's solution that somebody interpolated: no one gave that rate, nor can mend it."""
     t = np.arange(6000) / 200
