@@ -77,6 +77,22 @@ def withdraw(path: Path) -> None:
             (path.parent / MANIFEST).unlink()
 
 
+@contextmanager
+def beside(folder: Path, names: Collection[str], force: bool = False) -> Iterator[None]:
+    """Files of these names are written by somebody while a run makes ``folder`` anew: they are listed when it is over.
+
+    Raises UserError as `require_own` does.
+    """
+    require_own(folder, names, force)
+    if before := _listed(folder).intersection(names):
+        _list(folder, _listed(folder) - before)  # or the run would remove them
+    try:
+        yield
+    finally:
+        if there := [name for name in names if (folder / name).exists()]:
+            enter(folder, there)
+
+
 def start_anew(folder: Path, names: Iterable[str] = ()) -> None:
     """Remove what the manifest of a folder lists, but files of these names: they are listed, as about to be written.
 
@@ -86,7 +102,7 @@ def start_anew(folder: Path, names: Iterable[str] = ()) -> None:
     before = _listed(folder)
     try:
         for path in (folder / name for name in sorted(before - coming)):
-            if path.is_dir():  # an export, with a manifest of its own
+            if path.is_dir() and not path.is_symlink():  # an export, with a manifest of its own
                 start_anew(path)
                 with suppress(OSError):  # something else is in it
                     path.rmdir()

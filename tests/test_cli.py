@@ -198,6 +198,7 @@ print("slow:", sorted({"matplotlib", "scipy.signal", "scipy.stats", "scipy.spati
             "testbed: tlog:runs/u_turn/../u_turn/run.nc: a result of the run goes there: give the log another name",
         ),
         (["run", "u_turn", "--mavlink", "tlog:o/report.html", "--out", "o"], "a result of the run goes there"),
+        (["run", "u_turn", "--mavlink", "tlog:o/flight.png", "--out", "o"], "a result of the run goes there"),
         (["run", "u_turn", "--mavlink", "udp"], "testbed: udp: not a MAVLink address"),
         (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-key", " "], "testbed: --mavlink-key: is empty"),
         (["run", "u_turn", "--mavlink", "a.tlog", "--mavlink-identity", "apm"], "choose from px4, ardupilot"),
@@ -262,6 +263,13 @@ def test_a_telemetry_log_of_somebody_else_is_kept(testbed: Testbed, tmp_path: Pa
     with held(tmp_path / "a"):
         assert "another run is writing here" in testbed(*run, "tlog:a/run.tlog").err
     assert (tmp_path / "a" / "run.tlog").read_bytes() == before
+    (tmp_path / "a" / "mine.tlog").write_bytes(b"mine")
+    ended = testbed(*run, "tlog:a/mine.tlog")
+    assert ended.code == 2
+    assert "a: there is mine.tlog already, not made by an earlier command" in ended.err
+    assert (tmp_path / "a" / "mine.tlog").read_bytes() == b"mine"
+    assert testbed(*run[:-1]).code == 0
+    assert not (tmp_path / "a" / "run.tlog").exists(), "the log of another run is beside the record"
 
 
 def test_metrics_are_those_of_the_whole_record_that_a_killed_run_left(testbed: Testbed, tmp_path: Path) -> None:

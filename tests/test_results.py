@@ -14,7 +14,18 @@ import pytest
 from testbed import Scenario, run
 from testbed.data import write_file
 from testbed.errors import UserError
-from testbed.results import CAMPAIGN, MANIFEST, RECORD, REPORT, enter, held, require_own, start_anew, write_result
+from testbed.results import (
+    CAMPAIGN,
+    MANIFEST,
+    RECORD,
+    REPORT,
+    beside,
+    enter,
+    held,
+    require_own,
+    start_anew,
+    write_result,
+)  # fmt: skip
 
 HOLDER = """
 import sys, time
@@ -51,6 +62,32 @@ def test_an_export_goes_with_what_else_was_listed_but_for_foreign_files_in_it(tm
     start_anew(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["kept_csv"]
     assert [path.name for path in (tmp_path / "kept_csv").iterdir()] == ["mine.txt"]
+
+
+def test_of_an_export_that_was_moved_and_linked_only_the_link_goes(tmp_path: Path) -> None:
+    (tmp_path / "kept" / "run_csv").mkdir(parents=True)
+    write_result(tmp_path / "kept" / "run_csv" / "truth.csv", b"1")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run_csv").symlink_to(tmp_path / "kept" / "run_csv")
+    enter(tmp_path / "run", ["run_csv"])
+    start_anew(tmp_path / "run")
+    assert list((tmp_path / "run").iterdir()) == []
+    assert (tmp_path / "kept" / "run_csv" / "truth.csv").read_bytes() == b"1"
+
+
+def test_what_somebody_writes_meanwhile_stays_and_is_listed_in_the_end(tmp_path: Path) -> None:
+    for content in (b"1", b"2"):
+        with beside(tmp_path, ["run.tlog", "none.tlog"]):
+            (tmp_path / "run.tlog").write_bytes(content)
+            start_anew(tmp_path, [RECORD])
+        assert (tmp_path / "run.tlog").read_bytes() == content
+        assert set(listed(tmp_path)) == {RECORD, "run.tlog"}
+    (tmp_path / "mine.tlog").write_bytes(b"mine")
+    with pytest.raises(UserError, match=r"there is mine\.tlog already"), beside(tmp_path, ["mine.tlog"]):
+        pass
+    with beside(tmp_path, ["mine.tlog"], force=True):
+        pass
+    assert "mine.tlog" in listed(tmp_path)
 
 
 def test_results_of_one_command_are_not_replaced_by_anothers(tmp_path: Path) -> None:

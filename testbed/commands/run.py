@@ -7,7 +7,7 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -25,7 +25,7 @@ from testbed.commands.shared import (
     remark,
 )
 from testbed.errors import UserError
-from testbed.results import MANIFEST, METRICS, RECORD, REPORT, held, require_own, withdraw
+from testbed.results import MANIFEST, METRICS, RECORD, beside, held, require_own, withdraw
 
 if TYPE_CHECKING:
     from testbed.bridges.gps_input import GpsInput
@@ -114,20 +114,21 @@ def run(
         raise UserError(f"{scenario}: would be overwritten by its own rerun: choose another folder with --out")
     with output_folder(folder):
         far_end = flown or _far_end(loaded, px4, ardupilot, gps_input, pilot)
-        with held(folder):  # a log that another run is writing is not to be begun anew
-            _require_own(loaded, folder, report, force)
-            links = _connect(
-                mavlink or [],
-                loaded,
-                folder,
-                estimator,
-                force,
-                identity=mavlink_identity,
-                vehicles=mavlink_vehicles,
-                readonly=mavlink_readonly,
-                key=mavlink_key,
-            )
-        result = _fly(loaded, folder, realtime, seed=seed, links=links, shown=estimator, replay=replay, far_end=far_end)
+        with ExitStack() as over:
+            with held(folder):  # a log that another run is writing is not to be begun anew
+                _require_own(loaded, folder, report, force)
+                over.enter_context(beside(folder, _logs(mavlink or [], loaded, folder, report, force), force))
+                links = _connect(
+                    mavlink or [],
+                    loaded,
+                    estimator,
+                    identity=mavlink_identity,
+                    vehicles=mavlink_vehicles,
+                    readonly=mavlink_readonly,
+                    key=mavlink_key,
+                )
+            options = {"seed": seed, "links": links, "shown": estimator, "replay": replay, "far_end": far_end}
+            result = _fly(loaded, folder, realtime, **options)
         with interrupts.leaving(lambda: _shows(folder / RECORD, "the record is")):
             conclude(result.dataset, result.metrics, folder / RECORD, report, force)
     if _lost(result):
@@ -203,21 +204,44 @@ def _require_own(scenario: Scenario, folder: Path, report: bool, force: bool) ->
     if force:  # what figures there will be is not known; each is forced as it is written
         require_own(folder, [RECORD, METRICS], force)
         return
+    require_own(folder, _results(scenario, report))
+
+
+def _results(scenario: Scenario, report: bool) -> list[str]:
+    """What files a run may make of itself."""
     names = [RECORD, METRICS]
     if report:
         from testbed.report import page
 
         names += page.files([*(one.name for one in scenario.estimator), *scenario.sensors])
-    require_own(folder, names)
+    return names
 
 
-def _connect(
-    urls: Sequence[str], scenario: Scenario, folder: Path, estimator: str | None, force: bool, **options: Any
-) -> list[Publisher]:
-    """Open the links, once it is sure that there is something to show and that no log would overwrite a result.
+def _logs(urls: Sequence[str], scenario: Scenario, folder: Path, report: bool, force: bool) -> list[str]:
+    """The telemetry logs among the links that go to the results, by name.
 
-    Nor, without ``force``, one that is elsewhere than the results. ``options`` are those of
-    `testbed.mavlink.MavlinkPublisher`.
+    Raises UserError of one that would overwrite a result or, without ``force``, a file elsewhere.
+    """
+    from testbed.mavlink.link import log_path
+
+    found = []
+    for url, path in ((url, log_path(url)) for url in urls):
+        if path is None:
+            continue
+        if path.resolve().parent != folder.resolve():
+            if path.is_file() and not force:
+                raise UserError(f"{url}: {path.name} is there already: give the log another name, or add --force")
+        elif path.name in (MANIFEST, *_results(scenario, report)):
+            raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
+        else:
+            found.append(path.name)
+    return found
+
+
+def _connect(urls: Sequence[str], scenario: Scenario, estimator: str | None, **options: Any) -> list[Publisher]:
+    """Open the links, once it is sure that there is something to show.
+
+    ``options`` are those of `testbed.mavlink.MavlinkPublisher`.
     """
     if not urls:
         if any(options.values()):
@@ -225,16 +249,9 @@ def _connect(
             raise UserError(f"{given}: there is no link: add --mavlink URL, or leave it out")
         return []
     from testbed.loop.links import shown_estimator
-    from testbed.mavlink import MavlinkPublisher, log_path
+    from testbed.mavlink import MavlinkPublisher
 
     shown_estimator(scenario.estimator, estimator)
-    for url in urls:
-        path = log_path(url)
-        results = (RECORD, METRICS, REPORT, MANIFEST)
-        if path is not None and path.resolve().parent == folder.resolve() and path.name in results:
-            raise UserError(f"{url}: a result of the run goes there: give the log another name, such as run.tlog")
-        if path is not None and path.resolve().parent != folder.resolve() and path.is_file() and not force:
-            raise UserError(f"{url}: {path.name} is there already: give the log another name, or add --force")
     return [MavlinkPublisher(urls, scenario, **{name: value for name, value in options.items() if value is not None})]
 
 
