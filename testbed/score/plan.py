@@ -1,8 +1,9 @@
-"""Whether the leg in which a run ended was flown as it was meant: a run may well end in the middle of one."""
+"""Whether legs were flown as they were meant: a run may well end in the middle of one."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +24,7 @@ from testbed.motion.legs import (
     STurns,
     Turn,
     UTurn,
+    Waypoint,
 )
 from testbed.motion.paths import turn_radius
 from testbed.motion.sections import FlightTruth
@@ -38,24 +40,50 @@ SETTLED_S = 15.0  # and so long on top, for getting onto its path
 TURNED_S, FARTHER_M = 60.0, 50.0  # after which a leg to a place should come nearer to it, not farther
 
 
-def unfinished_leg(dataset: xarray.DataTree) -> list[str]:
+def not_as_planned(dataset: xarray.DataTree) -> list[str]:
+    """A sentence on the first leg that the wind turned round, and one on the leg in which a run ended, if need be."""
+    try:
+        scenario = scenario_of(dataset)
+    except UserError:  # `metrics.unscored` says so
+        return []
+    if not isinstance(scenario.truth, FlightTruth):
+        return []
+    said = [f"leg {k}/{len(scenario.plan)} {leg.leg.replace('_', ' ')}" for k, leg in enumerate(scenario.plan, 1)]
+    number = int(column(dataset, "truth/leg")[-1])
+    t = column(dataset, "truth/time")
+    cut = len(t) > 1 and t[-1] + 2 * (t[-1] - t[-2]) > scenario.duration_s
+    found = _turned_round(dataset, scenario.plan, said)
+    if cut and 0 <= number < len(scenario.plan):  # of an early end something else is told
+        found += _unfinished(dataset, number, scenario.plan[number], said[number])
+    return found
+
+
+def _turned_round(dataset: xarray.DataTree, plan: Sequence[Leg], said: Sequence[str]) -> list[str]:
+    """Of the first leg along the course of the moment in which wind drove the aircraft backwards: it leads back."""
+    legs, q_nb, v_n = (column(dataset, f"truth/{name}") for name in ("leg", "q_nb", "v_n"))
+    for number in np.unique(legs[(legs >= 0) & (legs < len(plan))]).astype(int):
+        row, leg = int(np.argmax(legs == number)), plan[number]
+        w, x, y, z = q_nb[row]
+        ahead = v_n[row, 0] * (1 - 2 * (y * y + z * z)) + v_n[row, 1] * 2 * (x * y + w * z)
+        if isinstance(leg, Straight | Climb | Descend | Airspeed) and _place(leg) is None and ahead < 0:
+            wind = float(np.linalg.norm(column(dataset, "truth/wind_n")[row, :2]))
+            fast = float(column(dataset, "truth/commands")[row, 2])
+            return [
+                f"{said[number]} went the other way: it keeps the course over ground, which is backwards where the wind"
+                f" ({wind:.3g} m/s) is faster than the aircraft ({fast:.3g} m/s)"
+            ]
+    return []
+
+
+def _unfinished(dataset: xarray.DataTree, number: int, leg: Leg, named: str) -> list[str]:
     """A sentence when a run ended in a leg that should have been over by then, or led away from its place; or none.
 
     Over: after `LATE` times what its path takes at its airspeed in still air, and `SETTLED_S`; against an ordinary wind
     after what it takes there. Away: `FARTHER_M` and more, when `TURNED_S` have passed.
     """
-    try:
-        scenario = scenario_of(dataset)
-    except UserError:  # `metrics.unscored` says so
-        return []
-    t, legs = column(dataset, "truth/time"), column(dataset, "truth/leg")
-    cut = len(t) > 1 and t[-1] + 2 * (t[-1] - t[-2]) > scenario.duration_s
-    number = int(legs[-1]) if cut and isinstance(scenario.truth, FlightTruth) else -1
-    if not 0 <= number < len(scenario.plan):  # of an early end something else is told
-        return []
-    rows, leg = np.flatnonzero(legs == number), scenario.plan[number]
+    t, rows = column(dataset, "truth/time"), np.flatnonzero(column(dataset, "truth/leg") == number)
     took, airspeed = t[-1] - t[rows[0]], float(column(dataset, "truth/commands")[rows, 2].min())
-    said = f"leg {number + 1}/{len(scenario.plan)} {leg.leg.replace('_', ' ')} was begun and not flown to its end"
+    said = f"{named} was begun and not flown to its end"
     first, last = (_away(leg, dataset, row) for row in (rows[0], -1))
     if took > TURNED_S and last > first + FARTHER_M:
         return [f"{said}: it was {first / 1000:.3g} km away at first, and {last / 1000:.3g} km after {took:.0f} s"]
@@ -67,9 +95,14 @@ def unfinished_leg(dataset: xarray.DataTree) -> list[str]:
     return []
 
 
+def _place(leg: Leg) -> Waypoint | None:
+    """What a leg leads to, or circles about."""
+    return getattr(leg, "to", None) or getattr(leg, "centre", None)
+
+
 def _away(leg: Leg, dataset: xarray.DataTree, row: int) -> float:
     """From the place that a leg leads to, or the circle about it [m]; 0 for a leg without one."""
-    place = getattr(leg, "to", None) or getattr(leg, "centre", None)
+    place = _place(leg)
     if place is None:
         return 0.0
     lat, lon, h = (float(column(dataset, f"truth/{name}")[row]) for name in ("lat", "lon", "h"))

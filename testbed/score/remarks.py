@@ -24,7 +24,7 @@ from testbed.errors import UserError
 from testbed.record.reader import scenario_of
 from testbed.score import accuracy, detection
 from testbed.score import metrics as scores
-from testbed.score.plan import unfinished_leg
+from testbed.score.plan import not_as_planned
 
 if TYPE_CHECKING:
     import xarray
@@ -52,7 +52,7 @@ def remarks(dataset: xarray.DataTree, metrics: Mapping[str, float]) -> list[str]
         *_refusing(dataset),
         *_useless(dataset),
         *_uncounted(dataset),
-        *unfinished_leg(dataset),
+        *not_as_planned(dataset),
         *_impossible(dataset),
         *_unjudged(dataset),
         *astray.values(),

@@ -8,7 +8,7 @@ from testbed import Scenario
 from testbed.motion.flight import Flight
 from testbed.motion.sections import FlightTruth
 from testbed.record.recorder import Recorder
-from testbed.score.plan import unfinished_leg
+from testbed.score.plan import not_as_planned
 
 
 def told(wind_mps: float, duration_s: float, *legs: str) -> list[str]:
@@ -19,7 +19,7 @@ def told(wind_mps: float, duration_s: float, *legs: str) -> list[str]:
     recorder = Recorder(None, scenario, 1)
     recorder.truth(Flight(scenario.truth, scenario.plan, 1).advance(round(duration_s * scenario.truth.rate_hz) + 1))
     recorder.close()
-    return unfinished_leg(recorder.dataset())
+    return not_as_planned(recorder.dataset())
 
 
 STRAIGHT, TO = "{leg='straight', length_m=%g}", "{leg='straight', to={lat_deg=47.0, lon_deg=%g}}"
@@ -38,6 +38,15 @@ LOITER = "{leg='loiter', radius_m=460, %s}"
 def test_a_leg_that_should_have_been_over_is_told(wind_mps: float, legs: list[str], said: str) -> None:
     (remark,) = told(wind_mps, 61.0, *legs)
     assert remark.startswith(f"leg 1/1 {said}")
+
+
+@pytest.mark.parametrize("leg", [STRAIGHT % 700, "{leg='climb', to_m=430}"])
+def test_a_leg_that_wind_turned_round_is_told(leg: str) -> None:
+    """It keeps the course over ground, and so flew away from where it was to go, to its end."""
+    remarks = told(30.0, 61.0, leg, "{leg='turn', to_deg=270}")
+    assert any(one.startswith(f"leg 1/2 {leg[6:].split(chr(39))[0]} went the other way: ") for one in remarks)
+    assert any("the wind (30 m/s) is faster than the aircraft (25 m/s)" in one for one in remarks)
+    assert not any("went the other way" in one for one in told(20.0, 61.0, leg, "{leg='turn', to_deg=270}"))
 
 
 @pytest.mark.ci
