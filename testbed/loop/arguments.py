@@ -76,7 +76,7 @@ def setup_of(
 ) -> Setup:
     """The arguments of `run`, with what they leave to the scenario."""
     seed = scenario.seed if seed is None else seed
-    if not (isinstance(seed, Integral) and 0 <= seed <= LARGEST_SEED):
+    if not (isinstance(seed, Integral) and not isinstance(seed, bool) and 0 <= seed <= LARGEST_SEED):
         raise UserError(f"seed {seed}: must be from 0 to {LARGEST_SEED}, a whole number")
     setup = Setup(seed, None if out is None else Path(out), progress, **others)
     if not setup.links and setup.shown is None:

@@ -69,14 +69,16 @@ def claim(folder: Path, room: str, what: str, setup: Mapping[str, Any]) -> None:
     ``what`` it is called, and ``setup`` is everything that decides its numbers, apart from the seeds. Raises UserError.
     """
     file = folder / SETUP
-    advice = "choose another folder with --out, or delete this one"
+    advice = "choose another folder with --out"
     try:
         (folder / room).mkdir(parents=True, exist_ok=True)
         if file.exists():
             before = json.loads(file.read_bytes())
             differ = [key for key in setup if before.get(key) != setup[key]]
             if differ:
-                raise UserError(f"{folder}: holds a {what} with different {', '.join(differ)}: {advice}")
+                raise UserError(
+                    f"{folder}: holds a {what} with different {', '.join(differ)}: {advice}, or delete this one"
+                )
         elif any((folder / room).iterdir()):
             raise UserError(f"{folder}: has {room} but no {SETUP} to say of what: {advice}")
         else:

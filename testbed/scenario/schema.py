@@ -234,6 +234,8 @@ class Scenario(Section):
 
         The keys of an estimator of the user's are left to its class, which may be another one by now.
         """
+        if not isinstance(text, str):
+            raise UserError(f"Scenario.parse: {shown(str(text))} is no text: Scenario.load reads a file")
         return cls._parsed(text, _texts(overrides, "parse"), path, {})
 
     @classmethod

@@ -181,6 +181,7 @@ def test_links_show_the_estimator_that_was_asked_for() -> None:
     ("options", "overrides", "says"),
     [
         ({"seed": -1}, [], "seed -1: must be from 0 to 9223372036854775807"),
+        ({"seed": True}, [], "seed True: must be from 0 to 9223372036854775807"),
         ({"seed": 2**63}, [], "seed 9223372036854775808: must be from 0"),
         ({"seed": 1.5}, [], r"seed 1\.5: must be .*, a whole number"),
         ({"shown": "inz"}, [], "--estimator inz: the scenario has no such estimator: choose from ins"),

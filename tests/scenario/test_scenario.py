@@ -257,6 +257,8 @@ def test_line_numbers_cover_exactly_what_the_parser_finds(tables: list[dict[str,
 def test_what_is_no_file_is_told(name: Any) -> None:
     with pytest.raises(UserError, match=r"Scenario\.load: .* is neither a file nor a shipped name"):
         Scenario.load(name)
+    with pytest.raises(UserError, match=r"Scenario\.parse: .* is no text: Scenario\.load reads a file"):
+        Scenario.parse(b"seed = 1")  # type: ignore[arg-type]
 
 
 def test_one_override_may_be_a_text() -> None:
