@@ -101,11 +101,12 @@ def outages(dataset: xarray.DataTree) -> list[Window]:
     """
     changes: list[tuple[float, str, bool]] = []
     for name in receivers(dataset):
-        t = column(dataset, f"sensors/{name}/time")
+        t, arrival = (column(dataset, f"sensors/{name}/{key}") for key in ("time", "t_arrival"))
         fix = np.asarray(has_fix(column(dataset, f"sensors/{name}/fix_type")))
-        when = np.where(fix, column(dataset, f"sensors/{name}/t_arrival"), t)
+        when = np.where(fix, arrival, t)
         interval = float(np.median(np.diff(t))) if len(t) > 1 else LONGEST_RUN_S
-        silent = np.flatnonzero(np.diff(t, append=column(dataset, "truth/time")[-1]) > patience(1 / interval))
+        heard = column(dataset, "truth/time")[-1] - (arrival[-1:] - t[-1:])  # what came later is not recorded
+        silent = np.flatnonzero(np.diff(t, append=heard) > patience(1 / interval))
         fix, when = np.insert(fix, silent + 1, False), np.insert(when, silent + 1, t[silent] + interval)
         first = np.flatnonzero(np.diff(fix, prepend=~fix[:1]))
         changes += [(float(when[k]), name, bool(fix[k])) for k in first]

@@ -554,7 +554,7 @@ def test_an_outage_at_the_end_is_not_judged() -> None:
     assert not [key for key in found if "recover" in key]
 
 
-def receivers(reports: dict[str, Any], end: float = 60.0) -> list[tuple[float, float]]:
+def receivers(reports: dict[str, Any], end: float = 60.0, late: float = 0.2) -> list[tuple[float, float]]:
     """Outages of receivers that report twice a second, by the times at which they do and whether there is a fix."""
     recorder = Recorder(None, scenario(), 1)
     recorder.truth(circle(end))
@@ -563,7 +563,7 @@ def receivers(reports: dict[str, Any], end: float = 60.0) -> list[tuple[float, f
         for t in np.arange(0.0, end + 0.1, 0.5):
             if says(t) is not None:
                 fix = FixType.FIX_3D if says(t) else FixType.NO_FIX
-                sample = GnssSample(t, t + 0.2, nan[0], nan[0], nan[0], nan, nan, nan, fix, 0, 1.0, 1.0, name)
+                sample = GnssSample(t, t + late, nan[0], nan[0], nan[0], nan, nan, nan, fix, 0, 1.0, 1.0, name)
                 recorder.samples(name, [sample])
     return metrics.outages(recorder.dataset())
 
@@ -579,6 +579,9 @@ def test_a_receiver_that_falls_silent_has_no_fix() -> None:
     assert receivers({"left": lambda t: None if 20.0 <= t < 30.0 else True}) == [(20.0, 30.2)]
     assert receivers({"left": lambda t: None if t >= 50.0 else True}) == [(50.0, np.inf)]
     assert receivers({"left": lambda t: True}) == []
+    late = 1.2  # what comes after the end isn't recorded
+    assert receivers({"left": lambda t: True if t + late <= 60.0 else None}, late=late) == []
+    assert receivers({"left": lambda t: True if t <= 57.0 else None}, late=late) == [(57.5, np.inf)]
 
 
 @pytest.mark.ci
