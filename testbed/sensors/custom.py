@@ -39,7 +39,7 @@ def is_own(section: Section) -> bool:
 def made(name: str, section: Section, *given: Any) -> Any:
     """The user's sensor of a section, and what else its kind is given. Raises UserError where its class does."""
     try:
-        return registry.of(section).sensor(name, section, *given)
+        return plugins.confined(registry.of(section).sensor, name, section, *given)
     except UserError:
         raise
     except INTERRUPTS:
@@ -54,7 +54,7 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
     One of a class of the user's is guarded, also where that is made of one of `nav.aids`; one of these is what it is.
     """
     try:
-        found = maker(name, section, imu)
+        found = plugins.confined(maker, name, section, imu)
     except UserError:
         raise
     except INTERRUPTS:
@@ -186,7 +186,7 @@ def _measured(
 
 def _asked(called: str, ask: Callable[..., Any], *given: Any) -> Any:
     try:
-        return ask(*given)
+        return plugins.confined(ask, *given)
     except UserError:
         raise
     except INTERRUPTS:
@@ -223,11 +223,7 @@ class Guard:
     def sense(self, truth: TruthBlock) -> list[Any]:
         """The samples inside a block. Raises UserError where there are none such, or it raises."""
         try:
-            given = self._sensor.sense(_copy(truth))
-            if not isinstance(given, Iterable):
-                raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
-            # One that is made at a time is copied at once: the next may be written into the same arrays.
-            samples = [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
+            given, samples = plugins.confined(self._sensed, truth)
         except UserError:
             raise
         except INTERRUPTS:
@@ -243,6 +239,14 @@ class Guard:
         if wrong := self._overwritten(samples):
             raise UserError(f"{self._called}: sense gave {wrong}")
         return [_owned(sample) for sample in samples]
+
+    def _sensed(self, truth: TruthBlock) -> tuple[Iterable[Any], list[Any]]:
+        """What it gives, and what is in it."""
+        given = self._sensor.sense(_copy(truth))
+        if not isinstance(given, Iterable):
+            raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
+        # One that is made at a time is copied at once: the next may be written into the same arrays.
+        return given, [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
 
     def _overwritten(self, samples: Sequence[Any]) -> str:
         """That an array is in several samples, and has changed: they all have what was written last."""

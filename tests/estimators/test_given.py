@@ -1,6 +1,7 @@
 """What an own estimator gives may be anything: what can't be used is its own end, and is named."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -340,6 +341,29 @@ def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any]
     assert adapter.failure.startswith(f"{type(error).__name__}: {error} (test_given.py, line")
     assert not adapter.listening
     assert not adapter.accepts(SAMPLE)
+
+
+class Restless(Giving):
+    """Changes what is everybody's, wherever it is asked."""
+
+    def _moves(self, *_: Any) -> Any:
+        os.chdir("/")
+        np.seterr(all="raise")
+
+    propagate = update = estimate = predict = accepts = refuse = _moves  # type: ignore[assignment]
+    listening = property(_moves)
+
+
+@pytest.mark.parametrize(
+    "ask", [*ASKED, lambda a: a.propagate(IMU), lambda a: a.update(SAMPLE), lambda a: a.estimate()]
+)
+def test_wherever_it_is_asked_working_folder_and_error_state_are_put_back(
+    ask: Callable[[Adapter], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = np.geterr()
+    ask(Adapter(Restless(), TICK_S))
+    assert (Path.cwd(), np.geterr()) == (tmp_path, before)
 
 
 def test_what_it_raises_is_told_on_one_line() -> None:

@@ -1,10 +1,12 @@
 """Anybody's sensor: found, sensed, recorded, and aiding the filters."""
 
 import dataclasses
+import os
 import pickle
 import re
 import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -327,6 +329,46 @@ def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, sa
     with pytest.raises(UserError) as told:
         run(Scenario.load(scenario.with_name("rest.toml"), {"sensors.radar.how": how}))
     assert re.match(rf"sensor radar: \./radar\.py:Radar:? {re.escape(says)}", str(told.value)), told.value
+
+
+class Restless:
+    """Changes what is everybody's, wherever it is asked."""
+
+    sensor, parts, states = "radar", (), ()
+
+    def __init__(self, *_: Any) -> None:
+        os.chdir("/")
+        np.seterr(all="raise")
+
+    def sense(self, truth: Any) -> Any:
+        Restless()
+        yield from map(Restless, ())
+
+    def blocks(self) -> Any:
+        Restless()
+        return []
+
+    aid = classmethod(lambda cls, *_: cls())
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda section: custom.made("radar", section),
+        lambda section: custom.Guard("radar", section, object.__new__(Restless)).sense(TruthBlock.empty(0, 1)),
+        lambda section: custom.aid(Restless.aid, "radar", section, None),
+        lambda section: custom.AidGuard("radar", "radar", object.__new__(Restless)).blocks(),
+    ],
+)
+def test_wherever_it_is_asked_working_folder_and_error_state_are_put_back(
+    ask: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(registry._BY_SECTION, MagnetometerConfig, registry.Kind(MagnetometerConfig, Restless))
+    before = np.geterr()
+    with suppress(UserError):  # of an aid without measure
+        ask(MagnetometerConfig())
+    assert (Path.cwd(), np.geterr()) == (tmp_path, before)
 
 
 def sensed(given: Any, seen_as: Any = lambda array: array) -> list[list[float]]:
