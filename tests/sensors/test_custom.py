@@ -20,6 +20,7 @@ from nav.samples import MagnetometerSample, WindSample
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.motion.table import TruthBlock
+from testbed.record.reader import load
 from testbed.report import page as report
 from testbed.sensors import custom, registry
 from testbed.sensors.magnetometer import MagnetometerConfig
@@ -381,7 +382,7 @@ def sensed(given: Any, seen_as: Any = lambda array: array) -> list[list[float]]:
             yield MagnetometerSample(0.1 * k, 0.1 * k, seen_as(array), "radar")
 
     guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: given(samples())))
-    return [one.field_b.tolist() for _ in range(3) for one in guard.sense(TruthBlock.empty(0, 1))]
+    return [one.field_b.tolist() for _ in range(3) for one in guard.sense(until(1.0))]
 
 
 def test_an_array_that_is_written_anew_for_each_sample_is_copied() -> None:
@@ -405,7 +406,7 @@ def test_times_are_numbers_of_python(kind: Any) -> None:
     """Single precision was compared with other times in single precision or not, by how the run was cut."""
     made = [MagnetometerSample(kind(1), kind(2), np.ones(3), "radar")]
     guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
-    (sample,) = guard.sense(TruthBlock.empty(0, 1))
+    (sample,) = guard.sense(until(1.0))
     assert (sample.t, sample.t_arrival) == (1, 2)
     assert {type(sample.t), type(sample.t_arrival)} <= {float, int}
 
@@ -422,7 +423,80 @@ def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
     made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
     guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
     for _ in range(2):
-        assert [one.field_b.tolist() for one in guard.sense(TruthBlock.empty(0, 1))] == [[1.0] * 3] * 3
+        assert [one.field_b.tolist() for one in guard.sense(until(1.0))] == [[1.0] * 3] * 3
+
+
+def until(t: float) -> TruthBlock:
+    """A block of one row at ``t`` [s]."""
+    block = TruthBlock.empty(0, 1)
+    block.t[:] = t
+    return block
+
+
+def guarded(sample: Any) -> Any:
+    """What comes through of one sample in a block that ends at 1 s; the sensor has 10 Hz."""
+    guard = custom.Guard("radar", MagnetometerConfig(rate_hz=10), SimpleNamespace(sense=lambda truth: [sample]))
+    (given,) = guard.sense(until(1.0))
+    return given
+
+
+def of(value: Any, name: str = "value", **metadata: Any) -> Any:
+    """A sample with one field beside those that every one has."""
+    fields = [("t", float), ("t_arrival", float), (name, Any, dataclasses.field(metadata=metadata))]
+    made = dataclasses.make_dataclass("Own", [*fields, ("sensor", str, "radar")], frozen=True)
+    return made(1.0, 1.0, value)
+
+
+@pytest.mark.parametrize("given", [[1.0, 2.0], (1.0, 2.0), [1, 2]])
+def test_a_list_or_a_tuple_is_an_array(given: Any) -> None:
+    """It was let through, and the record then ended in an AttributeError."""
+    value = guarded(of(given)).value
+    assert isinstance(value, np.ndarray)
+    assert (value.dtype, value.tolist()) == (np.dtype(float), [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("sample", "says"),
+    [
+        (of([]), "a sample whose value is []: it must be a number or a list of them"),
+        (of(10**400), "a sample whose value is an integer beyond 1.8e308: it must be a number"),
+        (of([10**5000]), "a sample whose value is an integer beyond 1.8e308: it must be a number"),
+        (of(1.0, "time"), "a sample with a field time, which the record has already: give it another name"),
+        (of(1.0, "component"), "a sample with a field component, which the record has already"),
+        (of(1.0, meaning="\udc80"), r'a sample whose value has the meaning "\udc80", which'),
+        (MagnetometerSample(1001.0, 1001.0, np.ones(3), "radar"), "a sample of 1001 s inside a block of truth that"),
+        (MagnetometerSample(1.11, 1.2, np.ones(3), "radar"), "a sample of 1.11 s inside a block of truth that"),
+    ],
+)  # fmt: skip
+def test_what_the_record_cant_have_is_told(sample: Any, says: str) -> None:
+    with pytest.raises(UserError) as told:
+        guarded(sample)
+    assert f"sense gave {says}" in str(told.value)
+
+
+def test_a_stamp_may_be_late_and_a_sample_of_before() -> None:
+    """By jitter of its own, less than a period; of the middle of what it saw, or held back."""
+    for t, arrival in ((1.09, 1.09), (1.0, 3.0), (0.1, 0.1), (0.1, 1.0)):
+        assert guarded(MagnetometerSample(t, arrival, np.ones(3), "radar")).t == t
+
+
+def test_lists_of_any_lengths_are_recorded(tmp_path: Path) -> None:
+    """Two lengths in one sample, or a list that is called as a number of ours is, ended in a ValueError."""
+    (tmp_path / "radar.py").write_text(
+        RADAR + "\n\n@dataclass(frozen=True)\nclass Beams:\n    t: float\n    t_arrival: float\n    range: list\n"
+        "    width: tuple\n    v_n: list\n    wind_n: list\n    sensor: str = 'radar'\n\n\nclass Many(Radar):\n"
+        "    def sense(self, truth):\n        return [\n            Beams(one.t, one.t_arrival, [1.0, one.t],"
+        " (1.0, 2.0, 3.0), [4.0, 5.0, 6.0], [one.t])\n            for one in super().sense(truth)\n        ]\n"
+    )
+    (tmp_path / "rest.toml").write_text(AT_REST, "utf-8")
+    run(Scenario.load(tmp_path / "rest.toml", {"sensors.radar.kind": "./radar.py:Many"}), out=tmp_path / "out")
+    own = load(tmp_path / "out/run.nc")["sensors/radar"]
+    t = own["time"].values
+    assert np.array_equal(own["range"].values, np.column_stack([np.ones(len(t)), t]))
+    assert np.array_equal(own["width"].values, np.tile([1.0, 2.0, 3.0], (len(t), 1)))
+    assert np.array_equal(own["wind_n"].values, t[:, None])
+    assert own["v_n"].attrs["units"] == "m/s"
+    assert own["v_n"].dims == ("time", "ned")
 
 
 @pytest.mark.parametrize(
