@@ -160,11 +160,7 @@ def move():
 
 class Mine:
     class Options(BaseModel):
-        @model_validator(mode="before")
-        @classmethod
-        def _moves(cls, keys):
-            move()
-            return keys
+        _moves = model_validator(mode="before")(lambda keys: move() or keys)
 
     def __init__(self, rig):
         move()
