@@ -233,8 +233,9 @@ class UpdateReport:
 
     ``t`` is the sample's time of validity; ``aid`` the measurement's name, such as ``gnss_position``; ``innovation``
     (m,) = measurement - prediction; ``S`` (m, m) its covariance before the update; ``nis`` = innovation' S^-1
-    innovation; ``threshold`` the gate for it; ``weight`` the factor on the information of the sample (1 taken as
-    it is, 0 rejected), the mean over the axes; ``outcome`` what became of it, ``reason`` the same in words for people.
+    innovation, not divided by m, and ``threshold`` the gate for it; ``weight`` the factor on the information of the
+    sample (1 taken as it is, 0 rejected), the mean over the axes; ``outcome`` what became of it, ``reason`` the same in
+    words for people.
     """
 
     t: float

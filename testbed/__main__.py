@@ -68,6 +68,14 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point: a user's mistake ends with its message and exit code 2, never with a traceback."""
+    try:
+        _main()
+    except SystemExit as end:
+        interrupts.wait_for_nobody(end.code)
+        raise
+
+
+def _main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that is not UTF-8 lacks signs of ours

@@ -11,9 +11,12 @@ import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
+
+from testbed.errors import printable
 
 GRACE_S = 2.0  # to close files and to end other processes
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -27,6 +30,7 @@ _left: list[Callable[[], str]] = []  # what the contexts that are open leave beh
 _last: list[Callable[[], object]] = []  # what is to be done though no context is left in order
 _announced = False
 _held = False
+_program = False  # whether this process is a command's, and not another's that runs one
 _waiting: list[int] = []  # signals that came in the meantime
 
 
@@ -46,6 +50,8 @@ INTERRUPTS = (Interrupted, KeyboardInterrupt)  # which are nobody's own to take
 
 def end_at_once() -> None:
     """From now on each of `SIGNALS` ends this process there and then, with a line: before anything is begun."""
+    global _program
+    _program = True
     for one in SIGNALS:
         if signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, _end)
@@ -54,6 +60,29 @@ def end_at_once() -> None:
 def _end(number: int, frame: object) -> None:
     _tell()
     os._exit(128 + number)
+
+
+def wait_for_nobody(code: object) -> None:
+    """Once the main thread has ended, end this process with ``code`` and a line where Python waits for other threads.
+
+    Those that the user began in an estimator or a sensor, such as a reader of a port, may know of no end.
+    """
+    if not _program:
+        return
+    threading.Thread(target=_end_alone, args=(code if isinstance(code, int) else 0,), daemon=True, name="end").start()
+
+
+def _end_alone(code: int) -> None:
+    threading.main_thread().join()
+    time.sleep(GRACE_S)
+    going_on = [one.name for one in threading.enumerate() if not (one.daemon or one is threading.main_thread())]
+    if not going_on:
+        return
+    with suppress(Exception):  # nobody may listen any more
+        sys.stdout.flush()
+        told = f"ended, though threads still ran: {', '.join(going_on)}: end them, or make them daemon threads"
+        print(f"testbed: {printable(told)}", file=sys.stderr, flush=True)
+    os._exit(code)
 
 
 def left_to_others() -> None:

@@ -9,13 +9,15 @@ import os
 import sys
 import sysconfig
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from testbed.errors import UserError, printable, shown, unknown
 from testbed.interrupts import INTERRUPTS
@@ -24,6 +26,27 @@ from testbed.interrupts import INTERRUPTS
 _STDLIB = tuple(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib"))
 _PACKAGES = {"site-packages", "dist-packages"}
 _HERE = (Path(__file__).resolve().parent, Path(__file__).resolve().parents[1] / "nav")
+
+T = TypeVar("T")
+
+
+def confined(call: Callable[..., T], /, *given: Any, **options: Any) -> T:
+    """What the user's code gives. Working folder and error state of NumPy, which are everybody's, are put back."""
+    folder = _working_folder()
+    with np.errstate():
+        try:
+            return call(*given, **options)
+        finally:
+            if folder and folder != _working_folder():
+                os.chdir(folder)
+
+
+def _working_folder() -> str:
+    """Empty where it has been removed."""
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
 
 
 @cache
@@ -65,7 +88,8 @@ def _named(kind: str, folder: Path, group: str) -> tuple[ModuleType, str, str]:
     if wrong:
         raise UserError(f"{_called(kind, group)}: {wrong}")
     try:
-        module = _file(folder / where) if where.endswith(".py") else importlib.import_module(where)
+        found = (_file, folder / where) if where.endswith(".py") else (importlib.import_module, where)
+        module = confined(*found)
     except UserError as error:
         raise UserError(f"{_called(kind, group)}: {error}") from None
     except ModuleNotFoundError as error:

@@ -184,3 +184,44 @@ def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([METRICS, MANIFEST])
     withdraw(tmp_path / METRICS)
     assert not [*tmp_path.iterdir()]
+
+
+GOING_ON = """
+import threading, time
+from nav.samples import Estimate
+
+
+class Mine:
+    def __init__(self, rig):
+        self.t = 0.0
+        threading.Thread(target=time.sleep, args=(1000.0,), name="reader", daemon={daemon}).start()
+
+    def propagate(self, imu):
+        self.t = float(imu.t[-1])
+
+    def update(self, sample): ...
+
+    def estimate(self):
+        return Estimate.of(self.t)
+
+
+class Lacking:
+    __init__ = Mine.__init__
+"""
+
+
+@pytest.mark.parametrize(("name", "daemon", "code"), [("Mine", False, 0), ("Mine", True, 0), ("Lacking", False, 2)])
+def test_a_thread_of_the_users_does_not_outlive_its_command(tmp_path: Path, name: str, daemon: bool, code: int) -> None:
+    """All was printed, and then the command hung."""
+    (tmp_path / "mine.py").write_text(GOING_ON.format(daemon=daemon))
+    bench = (Path(__file__).parents[1] / "scenarios/static_bench.toml").read_text().partition("[[estimator]]")[0]
+    (tmp_path / "mine.toml").write_text(f'{bench}\n[[estimator]]\nname = "mine"\nkind = "./mine.py:{name}"\n')
+    ended = subprocess.run(
+        [sys.executable, "-m", "testbed", "run", "mine.toml", "--no-report", "--set", "duration_s=1"],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True, text=True, check=False, timeout=100,
+    )  # fmt: skip
+    assert ended.returncode == code, ended.stderr
+    assert code or ended.stdout.splitlines()[-1].startswith("record: ")
+    told = "testbed: ended, though threads still ran: reader: end them, or make them daemon threads"
+    assert (told == ended.stderr.splitlines()[-1]) == (not daemon)

@@ -3,8 +3,10 @@
 import os
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from testbed import plugins
@@ -121,3 +123,48 @@ def test_a_class_and_what_it_imports_can_be_edited_while_nobody_asks_what_it_was
     plugins.load("./mine.py:Mine", project, GROUP)
     with pytest.raises(UserError, match=r"helper.py: has been edited since it was imported: start Python anew"):
         _digest(project)
+
+
+class Restless:
+    """Changes what is everybody's."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def move(self, *_: object, call: int = 0) -> float:
+        os.chdir(self.folder)
+        np.seterr(all="raise")
+        if call < 0:
+            raise ValueError("no")
+        return 3.0
+
+
+@pytest.mark.parametrize("call", [0, -1])
+def test_working_folder_and_error_state_are_put_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    """Records went to where an estimator had gone, and figures ended in a FloatingPointError that it had asked for."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    before = np.geterr()
+    with suppress(ValueError):
+        assert plugins.confined(Restless(tmp_path / "elsewhere").move, 1, call=call) == 3.0
+    assert Path.cwd() == tmp_path
+    assert np.geterr() == before
+
+
+def test_a_working_folder_that_is_gone_stays_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert plugins.confined(lambda: 3.0) == 3.0
+
+
+def test_a_file_may_change_them_while_it_is_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "restless.py").write_text(
+        "import os\nimport numpy as np\nos.chdir('/')\nnp.seterr(all='raise')\nclass Mine: ...\n"
+    )
+    before = np.geterr()
+    assert plugins.load("./restless.py:Mine", Path(), GROUP).__name__ == "Mine"
+    assert (Path.cwd(), np.geterr()) == (tmp_path, before)

@@ -84,7 +84,7 @@ def build(section: CustomSection, rig: Rig) -> Lane:
         raise UserError(f"estimator {section.name}: {error}") from None
     options = _options(section, made)
     try:
-        inner = made(dataclasses.replace(rig, sensors=dict(rig.sensors)), **options)
+        inner = plugins.confined(made, dataclasses.replace(rig, sensors=dict(rig.sensors)), **options)
         missing = [name for name in METHODS if not callable(getattr(inner, name, None))]
     except UserError:
         raise
@@ -119,7 +119,7 @@ def _model(made: Any) -> type[BaseModel] | None:
 
 def checked(options: type[BaseModel], given: Mapping[str, Any]) -> BaseModel:
     """The keys as the model of a class has them. Raises ValidationError, of a key that no field has too."""
-    return _strict(options).model_validate(given)
+    return plugins.confined(_strict(options).model_validate, given)
 
 
 @cache
@@ -200,7 +200,7 @@ class Adapter:
         if self.failure:
             return otherwise
         try:
-            return ask(*arguments)
+            return plugins.confined(ask, *arguments)
         except Unfit as error:
             self.failure = str(error)
         except INTERRUPTS:

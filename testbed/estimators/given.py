@@ -34,9 +34,10 @@ class Unfit(Exception):
 class Given:
     """Looks at what one estimator gives; the length of what has a name must stay as it was at first.
 
-    Numbers and arrays of another type than that of the record become of that type. An estimate may be off its time by
-    ``tick_s`` [s], as a clock that counts ticks is between them. Before the first increment nobody tells it the time:
-    then it may be of the run's start, or as old as a sample that it was handed.
+    Numbers and arrays of another type than that of the record become of that type; arrays are copies, since a filter
+    may go on in those that it gave. An estimate may be off its time by ``tick_s`` [s], as a clock that counts ticks is
+    between them. Before the first increment nobody tells it the time: then it may be of the run's start, or as old as a
+    sample that it was handed.
     """
 
     def __init__(self, tick_s: float) -> None:
@@ -60,20 +61,17 @@ class Given:
             if not isinstance(value, float):
                 changes[name] = _number(value, f"{method}: {name}")
         for name, shape in VECTORS.items():
-            value = getattr(given, name)
-            if type(value) is not np.ndarray or value.dtype is not FLOAT:
-                value = changes[name] = _array(value, f"{method}: {name}")
+            value = changes[name] = _array(getattr(given, name), f"{method}: {name}")
             if value.shape != shape:
                 raise Unfit(f"{method}: {name} has shape {value.shape}, not {shape}")
-        w, x, y, z = changes.get("q_nb", given.q_nb).tolist()
+        w, x, y, z = changes["q_nb"].tolist()
         square = w * w + x * x + y * y + z * z
         if abs(square - 1.0) > 2 * LENGTH:  # false for NaN
             raise Unfit(f"{method}: q_nb has length {math.sqrt(square):.4g}, not 1")
         if type(given.status) is not Status or not 0 <= given.status <= ALL:
             changes["status"] = _status(given.status, f"{method}: status")
-        if type(given.extra) is not dict or given.extra:
-            changes["extra"] = self._extra(given.extra, f"{method}: extra")
-        fit = dataclasses.replace(given, **changes) if changes else given
+        changes["extra"] = self._extra(given.extra, f"{method}: extra")
+        fit = dataclasses.replace(given, **changes)
         if fit.status & Status.ALIGNED:
             self._require_time(fit.t, method, t)
         for name, limit in LIMITS.items():
@@ -132,6 +130,8 @@ class Given:
             raise Unfit(f"{of} S has shape {S.shape}, not {(m, m)} as its innovation has {m}")
         if m:  # a sample that was refused before has none
             _require_length(self._innovations, given.aid, m, f"{of} innovation of {given.aid}")
+        if m and math.isnan(changes["nis"]):
+            changes["nis"] = _nis(innovation, S)
         try:
             changes["outcome"] = Outcome(given.outcome)
         except ValueError:
@@ -179,9 +179,19 @@ def _number(value: Any, what: str) -> float:
     return float(value)
 
 
+def _nis(innovation: Array, S: Array) -> float:
+    """The sum nu' S^-1 nu, NaN where ``S`` is not positive definite, or not known."""
+    try:
+        whitened = np.linalg.solve(np.linalg.cholesky(S), innovation)
+    except np.linalg.LinAlgError:
+        return math.nan
+    return float(whitened @ whitened)
+
+
 def _array(value: Any, what: str) -> Array:
+    """An array of its own."""
     if type(value) is np.ndarray and value.dtype is FLOAT:
-        return value
+        return value.copy()
     try:
         array = np.asarray(value)
     except ValueError:  # rows of different lengths

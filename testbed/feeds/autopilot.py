@@ -385,11 +385,13 @@ def _first(kind: str, used: Sequence[str], scenario: Scenario) -> str:
 
 
 def _speed_through_air(estimate: Estimate) -> float:
-    """|v_n - wind| [m/s], NaN when no wind is estimated."""
+    """|v_n - wind| [m/s], NaN when no wind is estimated, or one that is none."""
     wind = next(
         (value for name, (value, _) in estimate.extra.items() if name == "wind" or name.endswith("_wind")), None
     )
     if wind is None or len(wind) < 2:  # an estimator of the user's may call another thing so
+        return math.nan
+    if max(abs(wind[0]), abs(wind[1])) > MOST_SPEED:
         return math.nan
     north, east, down = estimate.v_n.tolist()
     return math.sqrt((north - float(wind[0])) ** 2 + (east - float(wind[1])) ** 2 + down**2)

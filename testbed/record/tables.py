@@ -180,10 +180,14 @@ def pack_samples(samples: Sequence[Sample]) -> tuple[Block, dict[str, Variable]]
     """Samples of one sensor."""
     block: Block = {"time": _scalars(samples, "t")}
     variables = dict(SAMPLE)
+    sizes: dict[str, int] = {}
     for f in fields(samples[0]):
         if f.name in ("t", "sensor"):
             continue
-        variable = variables.setdefault(f.name, _own(f, getattr(samples[0], f.name)))
+        shape = np.shape(getattr(samples[0], f.name))
+        if f.name not in SAMPLE or shape != tuple(len(AXES[dim]) for dim in SAMPLE[f.name].dims):
+            variables[f.name] = _own(f, shape, sizes)  # the user's may call another thing as ours
+        variable = variables[f.name]
         block[f.name] = _vectors(samples, f.name) if variable.dims else _scalars(samples, f.name, variable.dtype)
     return block, variables
 
@@ -193,10 +197,16 @@ def sample_columns(samples: Samples) -> tuple[Block, Mapping[str, Variable]]:
     return {"time": samples.t} | {name: x for name, x in samples.columns.items() if name != "t"}, SAMPLE
 
 
-def _own(f: Field[Any], value: Any) -> Variable:
-    """A number of a sample of the user's: unit and meaning from its metadata."""
+def _own(f: Field[Any], shape: tuple[int, ...], sizes: dict[str, int]) -> Variable:
+    """A number of a sample of the user's, or several: unit and meaning from its metadata.
+
+    ``sizes`` has those of the dimensions that the numbers before it have.
+    """
     unit, meaning = (str(f.metadata.get(key, "unknown")) for key in ("unit", "meaning"))
-    return Variable(unit, meaning, ("component",) if np.ndim(value) else ())
+    if not shape:
+        return Variable(unit, meaning)
+    alike = sizes.setdefault("component", shape[0]) == shape[0]
+    return Variable(unit, meaning, ("component" if alike else f"{f.name}_component",))
 
 
 def pack_reports(aid: str, reports: Sequence[UpdateReport]) -> tuple[Block, dict[str, Variable]]:

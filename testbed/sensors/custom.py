@@ -25,9 +25,11 @@ from testbed.interrupts import INTERRUPTS
 from testbed.motion.table import COLUMNS, TruthBlock
 from testbed.schema import Section
 from testbed.sensors import registry
+from testbed.sensors.timing import AidingTiming
 
 # Of the arrays in samples of ours, those that have not three numbers.
 OURS: Mapping[str, tuple[int, ...]] = {"q_ib": (4,), "wind_n": (2,), "flow_b": (2,), "rotation_b": (2,)}
+TAKEN = ("time", "component")  # what the record has beside the fields of a sample: its times, and places in lists
 AID = ("sensor", "parts", "states", "blocks", "measure")  # what an aid has (`nav.aids.base.Aid`)
 
 
@@ -39,7 +41,7 @@ def is_own(section: Section) -> bool:
 def made(name: str, section: Section, *given: Any) -> Any:
     """The user's sensor of a section, and what else its kind is given. Raises UserError where its class does."""
     try:
-        return registry.of(section).sensor(name, section, *given)
+        return plugins.confined(registry.of(section).sensor, name, section, *given)
     except UserError:
         raise
     except INTERRUPTS:
@@ -54,7 +56,7 @@ def aid(maker: Callable[..., Any], name: str, section: Section, imu: Any) -> Any
     One of a class of the user's is guarded, also where that is made of one of `nav.aids`; one of these is what it is.
     """
     try:
-        found = maker(name, section, imu)
+        found = plugins.confined(maker, name, section, imu)
     except UserError:
         raise
     except INTERRUPTS:
@@ -186,7 +188,7 @@ def _measured(
 
 def _asked(called: str, ask: Callable[..., Any], *given: Any) -> Any:
     try:
-        return ask(*given)
+        return plugins.confined(ask, *given)
     except UserError:
         raise
     except INTERRUPTS:
@@ -216,6 +218,7 @@ class Guard:
 
     def __init__(self, name: str, section: Section, sensor: Any) -> None:
         self._name, self._called, self._sensor = name, _called(name, section), sensor
+        self._period_s = 1 / cast("AidingTiming", section).rate_hz
         self._kind: type | None = None  # of all its samples
         self._shapes: dict[str, tuple[int, ...]] = {}  # of their numbers
         self._shared: dict[int, tuple[Any, Any]] = {}  # arrays that were in several samples, and with what
@@ -223,26 +226,27 @@ class Guard:
     def sense(self, truth: TruthBlock) -> list[Any]:
         """The samples inside a block. Raises UserError where there are none such, or it raises."""
         try:
-            given = self._sensor.sense(_copy(truth))
-            if not isinstance(given, Iterable):
-                raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
-            # One that is made at a time is copied at once: the next may be written into the same arrays.
-            samples = [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
+            given, samples = plugins.confined(self._sensed, truth)
+            wrong = next(filter(None, (self._wrong(sample, _ends(truth)) for sample in samples)), "")
         except UserError:
             raise
         except INTERRUPTS:
             raise
         except BaseException as error:
             raise UserError(f"{self._called}: {plugins.raised(error)}") from error
-        for sample in samples:
-            wrong = self._wrong(sample)
-            if wrong:
-                raise UserError(f"{self._called}: sense gave {wrong}")
-        if not isinstance(given, Sequence):
-            return samples
-        if wrong := self._overwritten(samples):
+        if isinstance(given, Sequence):
+            wrong = wrong or self._overwritten(samples)
+        if wrong:
             raise UserError(f"{self._called}: sense gave {wrong}")
-        return [_owned(sample) for sample in samples]
+        return [_in_arrays(_owned(sample) if isinstance(given, Sequence) else sample) for sample in samples]
+
+    def _sensed(self, truth: TruthBlock) -> tuple[Iterable[Any], list[Any]]:
+        """What it gives, and what is in it."""
+        given = self._sensor.sense(_copy(truth))
+        if not isinstance(given, Iterable):
+            raise UserError(f"{self._called}: sense gave {_type(given)}: give a list of samples, if an empty one")
+        # One that is made at a time is copied at once: the next may be written into the same arrays.
+        return given, [_timed(sample) if isinstance(given, Sequence) else _owned(_timed(sample)) for sample in given]
 
     def _overwritten(self, samples: Sequence[Any]) -> str:
         """That an array is in several samples, and has changed: they all have what was written last."""
@@ -256,17 +260,17 @@ class Guard:
         self._shared = shared
         return ""
 
-    def _wrong(self, sample: Any) -> str:
-        """What is wrong with a sample; empty when nothing is."""
+    def _wrong(self, sample: Any, until: float) -> str:
+        """What is wrong with a sample of a block that ends at ``until`` [s]; empty when nothing is."""
         if not dataclasses.is_dataclass(sample) or isinstance(sample, type):
             return f"{_type(sample)} where a sample was expected: a dataclass with t, t_arrival, numbers and sensor"
         missing = [one for one in ("t", "t_arrival", "sensor") if not hasattr(sample, one)]
         if missing:
             return f"{_type(sample)}, which lacks {', '.join(missing)}"
-        return self._mistimed(sample) or self._unlike(sample)
+        return self._mistimed(sample, until) or self._unlike(sample)
 
-    def _mistimed(self, sample: Any) -> str:
-        """What is wrong with its times, or its name."""
+    def _mistimed(self, sample: Any, until: float) -> str:
+        """What is wrong with its times, or its name. Its stamp may be late, but not by more than a period."""
         t, arrival, name = sample.t, sample.t_arrival, sample.sensor
         for what, value in (("t", t), ("t_arrival", arrival)):
             if not (isinstance(value, Real) and math.isfinite(value)):
@@ -275,6 +279,8 @@ class Guard:
             return f"a sample of {t:g} s, before the run begins: leave it out"
         if arrival < t:
             return f"a sample that arrives at {arrival:g} s, before it is true at {t:g} s"
+        if t > until + self._period_s:
+            return f"a sample of {t:g} s inside a block of truth that ends at {until:g} s: give it with a later block"
         if name != self._name:
             return f"a sample of sensor {shown(name)}, not {shown(self._name)}: its name is handed to the class"
         return ""
@@ -282,7 +288,10 @@ class Guard:
     def _unlike(self, sample: Any) -> str:
         """What is wrong with its numbers, or tells it from the samples before it."""
         kind = type(sample)
-        self._kind = self._kind or kind
+        if self._kind is None:
+            self._kind = kind
+            if wrong := _unrecordable(kind):
+                return wrong
         if kind is not self._kind:
             return f"{kind.__name__} after {self._kind.__name__}: all samples of a sensor are of one class"
         ours = kind.__module__ == nav.samples.__name__
@@ -290,9 +299,11 @@ class Guard:
             value = getattr(sample, name)
             try:
                 shape = np.asarray(value, dtype=float).shape
+            except OverflowError:
+                return f"a sample whose {name} is an integer beyond 1.8e308: it must be a number or a list of them"
             except (TypeError, ValueError):
                 shape = None
-            if shape is None or value is None:
+            if shape is None or value is None or 0 in shape:
                 return f"a sample whose {name} is {shown(value)}: it must be a number or a list of them"
             wanted = OURS.get(name, (3,)) if of == "Array" else ()
             if ours and shape != wanted:
@@ -300,6 +311,23 @@ class Guard:
             if len(shape) > 1 or self._shapes.setdefault(name, shape) != shape:
                 return f"a sample whose {name} has shape {shape}: it must be a number, or as many in every sample"
         return ""
+
+
+def _ends(truth: TruthBlock) -> float:
+    """The end of a block [s]; one without rows has none."""
+    return float(truth.t[-1]) if len(truth) else math.inf
+
+
+def _unrecordable(kind: Any) -> str:
+    """What the record can't have of a class of samples, a name or a text of its metadata; empty without."""
+    for one in dataclasses.fields(kind):
+        if one.name in TAKEN:
+            return f"a sample with a field {one.name}, which the record has already: give it another name"
+        for key in ("unit", "meaning"):
+            text = str(one.metadata.get(key, ""))
+            if text != text.encode(errors="ignore").decode():
+                return f"a sample whose {one.name} has the {key} {shown(text)}, which can't be written as UTF-8"
+    return ""
 
 
 def _place(value: Any) -> int:
@@ -323,6 +351,18 @@ def _owned(sample: Any) -> Any:
     own = copy.copy(sample)
     for name, value in arrays.items():
         object.__setattr__(own, name, value.copy())  # it may be frozen
+    return own
+
+
+def _in_arrays(sample: Any) -> Any:
+    """The same with arrays for lists and tuples of numbers."""
+    values = ((field.name, getattr(sample, field.name)) for field in dataclasses.fields(sample))
+    lists = {name: np.array(value, dtype=float) for name, value in values if isinstance(value, list | tuple)}
+    if not lists:
+        return sample
+    own = copy.copy(sample)
+    for name, value in lists.items():
+        object.__setattr__(own, name, value)  # it may be frozen
     return own
 
 

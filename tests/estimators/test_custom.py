@@ -147,6 +147,40 @@ def ours(result) -> dict[str, np.ndarray]:
     return {name: one.values for name, one in result.dataset["estimators/ins"].data_vars.items()}
 
 
+RESTLESS = """
+import os
+import numpy as np
+from pydantic import BaseModel, model_validator
+
+
+def move():
+    os.chdir("/")
+    np.seterr(all="raise")
+
+
+class Mine:
+    class Options(BaseModel):
+        _moves = model_validator(mode="before")(lambda keys: move() or keys)
+
+    def __init__(self, rig):
+        move()
+
+    propagate = update = estimate = None
+"""
+
+
+def test_one_that_changes_what_is_everybodys_as_it_is_made_changes_nothing(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "restless.py").write_text(RESTLESS)
+    monkeypatch.chdir(tmp_path)
+    before = np.geterr()
+    loaded = Scenario.load(folder / "own.toml", SHORT | {"estimator[1].kind": "./restless.py:Mine"})
+    with pytest.raises(UserError, match="lacks propagate, update, estimate"):
+        run(loaded, out=Path("out"))
+    assert (Path.cwd(), np.geterr()) == (tmp_path, before)
+
+
 def test_it_runs_beside_ours_and_is_recorded(healthy) -> None:
     own, truth = healthy.dataset["estimators/mine"], healthy.dataset["truth"]
     assert own["time"].values[-1] == truth["time"].values[-1]

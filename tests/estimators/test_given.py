@@ -1,6 +1,7 @@
 """What an own estimator gives may be anything: what can't be used is its own end, and is named."""
 
 import dataclasses
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -229,9 +230,63 @@ def test_reports_in_any_wrapping() -> None:
 
 
 def test_what_no_test_was_made_of_is_unknown() -> None:
-    (report,), failure = reported(dataclasses.replace(REPORT, nis=None, threshold=None))
+    nothing = {"innovation": np.empty(0), "S": np.empty((0, 0))}
+    (report,), failure = reported(dataclasses.replace(REPORT, nis=None, threshold=None, **nothing))
     assert failure == ""
     assert np.isnan([report.nis, report.threshold]).all()
+
+
+@pytest.mark.parametrize("left_out", [None, np.nan])
+def test_an_nis_that_is_left_out_is_formed(left_out: float | None) -> None:
+    """The record had none, and the score neither nis_mean nor rejected_fraction nor false alarms."""
+    nu, S = np.array([3.0, -1.0]), np.array([[4.0, 1.0], [1.0, 2.0]])
+    (report,), failure = reported(dataclasses.replace(REPORT, innovation=nu, S=S, nis=left_out))
+    assert failure == ""
+    assert report.nis == pytest.approx((2 * 3.0**2 + 4 * 1.0**2 + 2 * 3.0) / 7)  # by the adjugate of S
+
+
+@pytest.mark.parametrize("S", [np.zeros((3, 3)), -np.eye(3), np.full((3, 3), np.nan)])
+def test_an_nis_of_no_covariance_is_unknown(S: np.ndarray) -> None:
+    (report,), failure = reported(dataclasses.replace(REPORT, S=S, nis=None))
+    assert failure == ""
+    assert np.isnan(report.nis)
+
+
+@pytest.mark.parametrize("ask", [lambda a: a.estimate(), lambda a: a.predict(IMU)])
+def test_a_filter_may_go_on_in_the_arrays_of_its_estimate(ask: Callable[[Adapter], Estimate]) -> None:
+    """What a filter that works in place (``v += ...``) had given became what it knew when the record was written."""
+    v, P, states = np.ones(3), np.eye(9), {"b": (np.ones(2), np.ones(2))}
+    inner = Giving(dataclasses.replace(SOUND, v_n=v, covariance=P, extra=states))
+    inner.predict = lambda imu: inner.given  # type: ignore[attr-defined]
+    adapter = Adapter(inner, TICK_S)
+    adapter.propagate(IMU)
+    given = ask(adapter)
+    v += 1.0
+    P *= 2.0
+    states["b"][0][:] = 5.0
+    states["c"] = states["b"]
+    assert given.v_n.tolist() == [1.0] * 3
+    assert np.array_equal(given.covariance, np.eye(9))
+    assert [*given.extra] == ["b"]
+    assert given.extra["b"][0].tolist() == [1.0, 1.0]
+
+
+def test_a_filter_may_begin_without_further_states_in_a_dictionary_of_its_own() -> None:
+    states: dict[str, Any] = {}
+    adapter = Adapter(Giving(dataclasses.replace(SOUND, extra=states)), TICK_S)
+    adapter.propagate(IMU)
+    given = adapter.estimate()
+    states["b"] = pair(2)
+    assert given.extra == {}
+
+
+def test_a_filter_may_go_on_in_the_arrays_of_its_report() -> None:
+    nu, S = np.ones(3), np.eye(3)
+    (report,), _ = reported(dataclasses.replace(REPORT, innovation=nu, S=S))
+    nu += 1.0
+    S *= 2.0
+    assert report.innovation.tolist() == [1.0] * 3
+    assert np.array_equal(report.S, np.eye(3))
 
 
 def test_the_names_of_all_dimensions_are_taken() -> None:
@@ -286,6 +341,29 @@ def test_whatever_it_raises_wherever_ends_it_alone(ask: Callable[[Adapter], Any]
     assert adapter.failure.startswith(f"{type(error).__name__}: {error} (test_given.py, line")
     assert not adapter.listening
     assert not adapter.accepts(SAMPLE)
+
+
+class Restless(Giving):
+    """Changes what is everybody's, wherever it is asked."""
+
+    def _moves(self, *_: Any) -> Any:
+        os.chdir("/")
+        np.seterr(all="raise")
+
+    propagate = update = estimate = predict = accepts = refuse = _moves  # type: ignore[assignment]
+    listening = property(_moves)
+
+
+@pytest.mark.parametrize(
+    "ask", [*ASKED, lambda a: a.propagate(IMU), lambda a: a.update(SAMPLE), lambda a: a.estimate()]
+)
+def test_wherever_it_is_asked_working_folder_and_error_state_are_put_back(
+    ask: Callable[[Adapter], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = np.geterr()
+    ask(Adapter(Restless(), TICK_S))
+    assert (Path.cwd(), np.geterr()) == (tmp_path, before)
 
 
 def test_what_it_raises_is_told_on_one_line() -> None:

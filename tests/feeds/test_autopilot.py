@@ -205,7 +205,15 @@ def test_an_estimate_that_is_no_number_ends_the_run(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    ("wind", "speed"), [(np.array([3.0, 0.0]), 4.0), (np.array([3.0]), math.nan), (None, math.nan)]
+    ("wind", "speed"),
+    [
+        (np.array([3.0, 0.0]), 4.0),
+        (np.array([3.0]), math.nan),
+        (None, math.nan),
+        (np.array([1e300, 1e300]), math.nan),  # an OverflowError ended the run
+        (np.array([0.0, -1e9]), math.nan),
+        (np.array([math.nan, 0.0]), math.nan),
+    ],
 )
 def test_speed_through_air_needs_a_wind_north_and_east(wind: np.ndarray | None, speed: float) -> None:
     """An own estimator may call another thing wind."""

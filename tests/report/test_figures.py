@@ -210,3 +210,30 @@ def test_a_run_without_estimators_shows_its_flight() -> None:
     names = [name for chapter in CHAPTERS for _, _, name, _, _ in chapter.drawn(run)]
     assert names[:2] == ["ground_track", "flight"]
     assert flight.wind(run) is None
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e308, np.nan])
+def test_a_wind_that_is_none_leaves_the_others_to_be_seen(value: float) -> None:
+    """Axis limits cannot be NaN or Inf, said the report of an own estimator that had divided by zero."""
+    dataset = synthetic_run.dataset(20.0, {"ins": Errors()})
+    dataset["estimators/ins/wind"].values[5:8] = value
+    figure = flight.wind(Run(dataset))
+    assert figure is not None
+    figure.canvas.draw()
+    for ax in figure.axes:
+        low, high = ax.get_ylim()
+        assert -20.0 < low < high < 20.0
+
+
+def test_a_steady_speed_is_shown_as_one() -> None:
+    """In calm air the axis was that of its rounding: +2.5e1 over half a millimetre per second."""
+    run = Run(synthetic_run.dataset(20.0, {}))
+    truth = run.dataset["truth"]
+    truth["airspeed"].values[:] = 25.0 + 1e-4 * np.sin(truth["time"].values)
+    truth["v_n"].values[:] = [25.0, 0.0, 0.0]
+    figure = flight.flight(run)
+    figure.canvas.draw()
+    speeds = figure.axes[1]
+    assert np.ptp(speeds.get_ylim()) >= 2.0
+    assert speeds.yaxis.get_major_formatter().get_offset() == ""

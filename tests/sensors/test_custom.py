@@ -6,18 +6,15 @@ import re
 import shutil
 import sys
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from nav.aids import GnssAid
 from nav.aids.base import Aid
-from nav.samples import MagnetometerSample, WindSample
 from testbed import Scenario, run
 from testbed.errors import UserError
-from testbed.motion.table import TruthBlock
+from testbed.record.reader import load
 from testbed.report import page as report
 from testbed.sensors import custom, registry
 from testbed.sensors.magnetometer import MagnetometerConfig
@@ -329,58 +326,23 @@ def test_what_is_no_sample_ends_the_run_with_a_line(scenario: Path, how: str, sa
     assert re.match(rf"sensor radar: \./radar\.py:Radar:? {re.escape(says)}", str(told.value)), told.value
 
 
-def sensed(given: Any, seen_as: Any = lambda array: array) -> list[list[float]]:
-    """The fields of three blocks of a sensor that writes into one array, of samples as ``given`` by a list or so."""
-    array = np.zeros(3)
-
-    def samples() -> Any:
-        for k in range(3):
-            array[:] += 1
-            yield MagnetometerSample(0.1 * k, 0.1 * k, seen_as(array), "radar")
-
-    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: given(samples())))
-    return [one.field_b.tolist() for _ in range(3) for one in guard.sense(TruthBlock.empty(0, 1))]
-
-
-def test_an_array_that_is_written_anew_for_each_sample_is_copied() -> None:
-    """All samples had what was in it in the end; of those of a list it can't be had any more, and is told."""
-    assert sensed(lambda samples: samples) == [[k] * 3 for k in range(1, 10)]
-    assert sensed(lambda samples: [next(samples)]) == [[k] * 3 for k in range(1, 4)]
-    with pytest.raises(UserError, match="gave one array as field_b of several samples, and overwrote it: give each"):
-        sensed(list)
-    with pytest.raises(UserError, match="overwrote it: give each a copy"):
-        sensed(list, lambda array: array[:])  # another view each time, of the same numbers
-
-
-def test_samples_of_ours_may_have_two_numbers() -> None:
-    wind = WindSample(0.0, 0.0, np.zeros(2), 0.0, 1.0, "radar")
-    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: [wind]))
-    assert guard.sense(TruthBlock.empty(0, 1))[0].wind_n.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize("kind", [np.float32, np.int64, np.array])
-def test_times_are_numbers_of_python(kind: Any) -> None:
-    """Single precision was compared with other times in single precision or not, by how the run was cut."""
-    made = [MagnetometerSample(kind(1), kind(2), np.ones(3), "radar")]
-    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
-    (sample,) = guard.sense(TruthBlock.empty(0, 1))
-    assert (sample.t, sample.t_arrival) == (1, 2)
-    assert {type(sample.t), type(sample.t_arrival)} <= {float, int}
-
-
-def test_what_is_no_dataclass_is_told_whatever_its_times_are() -> None:
-    given = SimpleNamespace(t=np.float32(1), t_arrival=np.array(1.0), sensor="radar")
-    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: [given]))
-    with pytest.raises(UserError, match="gave SimpleNamespace where a sample was expected: a dataclass with t"):
-        guard.sense(TruthBlock.empty(0, 1))
-
-
-def test_an_array_that_stays_as_it_is_may_be_in_all_samples() -> None:
-    array = np.ones(3)
-    made = [MagnetometerSample(0.1 * k, 0.1 * k, array, "radar") for k in range(3)]
-    guard = custom.Guard("radar", MagnetometerConfig(), SimpleNamespace(sense=lambda truth: made))
-    for _ in range(2):
-        assert [one.field_b.tolist() for one in guard.sense(TruthBlock.empty(0, 1))] == [[1.0] * 3] * 3
+def test_lists_of_any_lengths_are_recorded(tmp_path: Path) -> None:
+    """Two lengths in one sample, or a list that is called as a number of ours is, ended in a ValueError."""
+    (tmp_path / "radar.py").write_text(
+        RADAR + "\n\n@dataclass(frozen=True)\nclass Beams:\n    t: float\n    t_arrival: float\n    range: list\n"
+        "    width: tuple\n    v_n: list\n    wind_n: list\n    sensor: str = 'radar'\n\n\nclass Many(Radar):\n"
+        "    def sense(self, truth):\n        return [\n            Beams(one.t, one.t_arrival, [1.0, one.t],"
+        " (1.0, 2.0, 3.0), [4.0, 5.0, 6.0], [one.t])\n            for one in super().sense(truth)\n        ]\n"
+    )
+    (tmp_path / "rest.toml").write_text(AT_REST, "utf-8")
+    run(Scenario.load(tmp_path / "rest.toml", {"sensors.radar.kind": "./radar.py:Many"}), out=tmp_path / "out")
+    own = load(tmp_path / "out/run.nc")["sensors/radar"]
+    t = own["time"].values
+    assert np.array_equal(own["range"].values, np.column_stack([np.ones(len(t)), t]))
+    assert np.array_equal(own["width"].values, np.tile([1.0, 2.0, 3.0], (len(t), 1)))
+    assert np.array_equal(own["wind_n"].values, t[:, None])
+    assert own["v_n"].attrs["units"] == "m/s"
+    assert own["v_n"].dims == ("time", "ned")
 
 
 @pytest.mark.parametrize(

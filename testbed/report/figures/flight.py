@@ -26,6 +26,8 @@ from testbed.score import accuracy
 from testbed.score.accuracy import column
 
 SHORT_KM, TICKS = 2.0, 6
+LEAST_SPEEDS = 2.0  # that the speed panel spans [m/s]: in calm air the rest is no news
+MOST_WIND = 1e6  # [m/s] that the wind panel makes room for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -112,6 +114,9 @@ def flight(run: Run) -> Figure:
     ground = np.hypot(run.truth("v_n")[:, 0], run.truth("v_n")[:, 1])
     whose = "speed over ground of the reference" if run.recorded else "true speed over ground"
     bottom.plot(*thin(run.t, ground), color=GUIDE, lw=1, ls="--", label=whose)
+    low, high = bottom.get_ylim()
+    if high - low < LEAST_SPEEDS:
+        bottom.set_ylim((low + high - LEAST_SPEEDS) / 2, (low + high + LEAST_SPEEDS) / 2)
     bottom.set_ylabel("speed [m/s]")
     run.against_time(drawn)
     return drawn.figure
@@ -141,8 +146,10 @@ def wind(run: Run) -> Figure | None:
 
 
 def _centre(ax: Any, values: Array) -> None:
-    middle, spread = float(np.nanmedian(values)), max(float(np.nanmax(np.abs(values))), 2.0)
-    ax.set_ylim(middle - spread, middle + spread)
+    shown = values[np.abs(values) < MOST_WIND]  # an estimator of the user's may say anything
+    if len(shown):
+        middle, spread = float(np.median(shown)), max(float(np.abs(shown).max()), 2.0)
+        ax.set_ylim(middle - spread, middle + spread)
 
 
 PLOTS = (
