@@ -7,6 +7,7 @@ vehicle started again: the longer part is kept.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from typing import TypeAlias
@@ -100,26 +101,42 @@ def _late(usual: float) -> float:
 
 
 def _astray(t: Array) -> Mask:
-    """Which of times (N,) in the order of their rows are a few that are far off, where those about them go on.
+    """Which of times (N,) in the order of their rows are far off, where those about them go on.
 
-    Pieces that do not go on from each other are few, but for a clock that says nonsense again and again.
+    Of the pieces between jumps the chain in which time goes on is kept that has the most rows, where the clock going
+    back for good costs as many as may be far off, and a counter that begins anew none: the longest path by pieces.
     """
-    off: Mask = np.zeros(len(t), bool)
     usual = _usual(t)
     late, few = _late(usual), max(STRAY, int(STRAY_SHARE * len(t)))
     steps = np.diff(t)
-    cuts = np.flatnonzero((steps < -late) | (steps > _gap(usual))) + 1
     if not (steps < -late).any():
-        return off
-    edges = [0, *cuts.tolist(), len(t)]
-    before = -math.inf  # the newest that is not off
-    for first, stop in itertools.pairwise(edges):
-        after = float(t[stop]) if stop < len(t) else math.inf
-        alone = stop - first <= few and before - late <= after
-        if alone and (t[first] < before - late or t[stop - 1] > after + late):
-            off[first:stop] = first > 0 or not _wrap(float(t[stop - 1]), after, usual)
-        if not off[first]:
-            before = float(t[stop - 1])
+        return np.zeros(len(t), bool)
+    edges = np.array([0, *(np.flatnonzero((steps < -late) | (steps > _gap(usual))) + 1).tolist(), len(t)])
+    first, last, count = t[edges[:-1]].tolist(), t[edges[1:] - 1].tolist(), np.diff(edges).tolist()
+    most, before = list(count), [-1] * len(count)  # rows of the best chain up to each piece, and the piece before it
+    ends: list[float] = []  # ascending, of the pieces up to which no chain that ends as early has as many rows
+    best: list[int] = []
+    for k, begin in enumerate(first):
+        ways = [(0, -1)] if edges[k] <= few else []
+        if found := bisect.bisect_right(ends, begin + late):
+            ways.append((most[best[found - 1]], best[found - 1]))
+        for j in range(max(k - STRAY, 0), k):
+            if last[j] - late > begin:
+                anew = _begins_anew(t[edges[k] :], last[j], usual, few)
+                ways.append((most[j] - (0 if anew else few), j))
+        rows, before[k] = max(ways)
+        most[k] += rows
+        place = bisect.bisect_right(ends, last[k])
+        if not place or most[best[place - 1]] < most[k]:
+            beaten = place
+            while beaten < len(best) and most[best[beaten]] <= most[k]:
+                beaten += 1
+            ends[place:beaten], best[place:beaten] = [last[k]], [k]
+    off: Mask = np.ones(len(t), bool)
+    k = max((k for k in range(len(most)) if len(t) - edges[k + 1] <= few), key=most.__getitem__)
+    while k >= 0:
+        off[edges[k] : edges[k + 1]] = False
+        k = before[k]
     return off
 
 
@@ -134,6 +151,13 @@ def _wrap(before: float, after: float, usual: float) -> float:
         if begins_anew or abs(before - after - wrap) < WRAP_SHARE * wrap:
             return wrap
     return 0.0
+
+
+def _begins_anew(t: Array, before: float, usual: float, few: int) -> bool:
+    """Whether times (N,) are those of a counter that began anew after ``before``: a ``few`` rows on it is not back."""
+    wrap = _wrap(before, float(t[0]), usual)
+    soon = t[: 1 + min(few, int(wrap / 2 / max(usual, EDGE_S)))]
+    return wrap > 0 and not ((soon >= before) & (soon < before + wrap / 2)).any()
 
 
 def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
