@@ -200,7 +200,7 @@ def load(path: Path) -> Table:
             frame = pandas.read_parquet(path, engine="pyarrow")
             if not isinstance(frame.index, pandas.RangeIndex) and not {*frame.index.names} & {*frame.columns}:
                 frame = frame.reset_index()  # often of times
-            return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
+            return _sorted(path, ((str(name), _stacked(_in_utc(frame[name]))) for name in frame.columns))
         return _sorted(path, text.columns(path))
     except UserError:
         raise
@@ -210,6 +210,11 @@ def load(path: Path) -> Table:
         raise UserError(f"{path}: can't be read as a table: {str(error).splitlines()[0][:200]}") from None
     except Exception as error:  # of a file cut anywhere: zlib.error, struct.error and the like of three libraries
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
+
+
+def _in_utc(column: Any) -> Any:
+    """The values of a pandas column, dates of any time zone in UTC."""
+    return (column.dt.tz_convert(None) if getattr(column.dtype, "tz", None) else column).to_numpy()
 
 
 def _stacked(values: Any) -> Any:
