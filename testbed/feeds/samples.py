@@ -28,6 +28,8 @@ HELD_SHARE = 0.9  # of a sensor's rows that are at the times of an inertial unit
 # What a slower clock makes: so many times that rows are held, and of these the share that last about as long as the
 # usual one, to so much of it and of a row at least.
 LEAST_HELD, ALIKE_SHARE, ALIKE, ALIKE_ROWS = 20, 0.9, 0.25, 1.5
+# Or so many times that: at rest a coarse place is held for several epochs. By chance a share of 3/8 would do.
+EPOCHS, LEAST_ROWS = 16, 8
 
 
 class Fixes:
@@ -78,10 +80,11 @@ def newly(
     """Times (N,) and quantities of a sensor without the rows that repeat the one before, of one that is only held.
 
     A table with a row for each of an inertial unit's says again what a slower sensor said last. That is so where all of
-    it, to the last bit, is held about as long each time, or for about as many rows, as a slower clock makes it, at the
-    unit's own times: by a receiver that stands still at its own rate nothing is held, nor by a sensor of the unit's
-    rate that says the same by chance, or since nothing changes. Of a receiver latitude and longitude tell, where the
-    rest changes no more often: it may come in rows of its own.
+    it, to the last bit, is held about as long each time, or for about as many rows, as a slower clock makes it, or for
+    several times of that, at the unit's own times: by a receiver that stands still at its own rate nothing is held, nor
+    by a sensor of the unit's rate that says the same by chance, or since nothing changes. Of a receiver latitude and
+    longitude tell, where the rest changes no more often: it may come in rows of its own. One of which it is not known
+    is told.
     """
     if len(t) < 2 or not any(np.isin(t, imu.t).mean() > HELD_SHARE for imu in imus.values()):
         return t, dict(values)
@@ -92,8 +95,13 @@ def newly(
             first = placed
     rows = np.diff(first, append=len(t))
     lasts = np.diff(t[first], append=t[-1])
-    alike = max(_alike(rows, 1.0), _alike(lasts, usual_step(t)))
-    if np.median(rows) < 2 or len(first) < LEAST_HELD or alike < ALIKE_SHARE:
+    if np.median(rows) < 2 or len(first) < LEAST_HELD:
+        return t, dict(values)
+    ways = ((rows, 1.0), (lasts, usual_step(t)))
+    if max(_alike(*way) for way in ways) < ALIKE_SHARE and max(_of_epochs(*way) for way in ways) < ALIKE_SHARE:
+        if "lat" in values:
+            told = f"{len(t)} rows, at the times of an IMU, are all taken for new, and {len(first)} differ from the one"
+            notes.append(left_out(name, f"{told} before: leave those blank that only hold it", len(t), len(t)))
         return t, dict(values)
     held = len(t) - len(first)
     told = f"{held} of {len(t)} rows, at the times of an IMU, hold what the one before had: left out"
@@ -105,6 +113,21 @@ def _alike(lasts: Array, step: float) -> float:
     """The share of times (N,) that are about as long as the usual one, where one row is a ``step``."""
     usual = float(np.median(lasts))
     return float(np.mean(np.abs(lasts - usual) <= max(ALIKE * usual, ALIKE_ROWS * step)))
+
+
+def _of_epochs(lasts: Array, step: float) -> float:
+    """The share of times (N,) up to `EPOCHS` epochs that are whole numbers of these, to `ALIKE_ROWS` steps at an end.
+
+    An epoch is as long as the shortest are; 0 where few are, or where one is so short that most would do by chance.
+    """
+    epoch = float(np.mean(lasts[lasts <= 1.5 * np.quantile(lasts, 0.1)]))
+    for most in (1, 4, EPOCHS):  # the longer they are the better they tell it
+        number = np.maximum(np.round(lasts / epoch), 1)
+        epoch = float(lasts[number <= most].sum() / number[number <= most].sum())
+    known = number <= EPOCHS
+    if epoch < LEAST_ROWS * step or np.sum(number == 1) < LEAST_HELD or 2 * known.sum() < len(lasts):
+        return 0.0
+    return float(np.mean(np.abs(lasts - number * epoch)[known] <= ALIKE_ROWS * step))
 
 
 def _changes(values: Iterable[Array]) -> Array:

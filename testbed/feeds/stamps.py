@@ -7,9 +7,11 @@ vehicle started again: the longer part is kept.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
-from typing import TypeAlias
+from collections.abc import Mapping
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -41,6 +43,17 @@ class Loss(str):
     stream: str
 
 
+class Course(NamedTuple):
+    """How a clock went: the ``part`` that is kept, from 0 on, of the ``parts`` between which it was set back.
+
+    It began ``anew`` so often after so long [s].
+    """
+
+    part: int = 0
+    parts: int = 1
+    anew: Mapping[float, int] = {}
+
+
 def left_out(stream: str, text: str, lost: int, rows: int) -> str:
     """A note of ``lost`` of a stream's ``rows`` that are left out."""
     note = f"{stream}: {text}"
@@ -59,6 +72,13 @@ def ordered(
     ``notes`` gets a sentence for each kind of thing, beginning with the stream's ``name``. No silence in the time for
     which another stream was ``heard`` [s], on the same clock, is too long.
     """
+    return in_parts(name, stamps, notes, heard, Course())[:2]
+
+
+def in_parts(
+    name: str, stamps: npt.ArrayLike, notes: list[str], heard: tuple[float, float] | None, leader: Course
+) -> tuple[Array, Rows, Course]:
+    """The same, and how the clock went: of as many parts as the ``leader`` has, that is kept which it keeps."""
     t = np.array(stamps, float)
     rows: Rows = np.arange(len(t))
 
@@ -74,8 +94,15 @@ def ordered(
         notes.append(f"{name}: its times go back from row to row, and are taken from the last row on")
         t, rows = t[::-1], rows[::-1]
     keep(~_astray(t), "times are far off those before and after, and left out")
-    t = _unwrapped(name, t, notes)
-    t, rows = _longest_part(name, t, rows, notes)
+    t, anew = _unwrapped(name, t, notes)
+    edges = _parts(t)
+    part, parts = _kept(edges, leader), len(edges) - 1
+    kept = slice(edges[part], edges[part + 1])
+    if left := len(t) - (kept.stop - kept.start):
+        which = f"part {part + 1}, that of the IMU," if parts == leader.parts else "the longest part"
+        told = f"time goes back {parts - 1} times: {which} is kept, {left} rows are left out"
+        notes.append(left_out(name, told, left, len(t)))
+    t, rows = t[kept], rows[kept]
     order = np.argsort(t, kind="stable")
     moved = int(np.sum(np.diff(t) < 0))
     if moved:
@@ -85,7 +112,7 @@ def ordered(
     set_on = f"times are {LONGEST_GAP_S:g} s and more from all others, a clock that was set: left out"
     keep(_of_one_clock(t, heard), set_on)
     _note_gaps(name, t, notes)
-    return t, rows
+    return t, rows, Course(part, parts, anew)
 
 
 def _usual(t: Array) -> float:
@@ -100,26 +127,42 @@ def _late(usual: float) -> float:
 
 
 def _astray(t: Array) -> Mask:
-    """Which of times (N,) in the order of their rows are a few that are far off, where those about them go on.
+    """Which of times (N,) in the order of their rows are far off, where those about them go on.
 
-    Pieces that do not go on from each other are few, but for a clock that says nonsense again and again.
+    Of the pieces between jumps the chain in which time goes on is kept that has the most rows, where the clock going
+    back for good costs as many as may be far off, and a counter that begins anew none: the longest path by pieces.
     """
-    off: Mask = np.zeros(len(t), bool)
     usual = _usual(t)
     late, few = _late(usual), max(STRAY, int(STRAY_SHARE * len(t)))
     steps = np.diff(t)
-    cuts = np.flatnonzero((steps < -late) | (steps > _gap(usual))) + 1
     if not (steps < -late).any():
-        return off
-    edges = [0, *cuts.tolist(), len(t)]
-    before = -math.inf  # the newest that is not off
-    for first, stop in itertools.pairwise(edges):
-        after = float(t[stop]) if stop < len(t) else math.inf
-        alone = stop - first <= few and before - late <= after
-        if alone and (t[first] < before - late or t[stop - 1] > after + late):
-            off[first:stop] = first > 0 or not _wrap(float(t[stop - 1]), after, usual)
-        if not off[first]:
-            before = float(t[stop - 1])
+        return np.zeros(len(t), bool)
+    edges = np.array([0, *(np.flatnonzero((steps < -late) | (steps > _gap(usual))) + 1).tolist(), len(t)])
+    first, last, count = t[edges[:-1]].tolist(), t[edges[1:] - 1].tolist(), np.diff(edges).tolist()
+    most, before = list(count), [-1] * len(count)  # rows of the best chain up to each piece, and the piece before it
+    ends: list[float] = []  # ascending, of the pieces up to which no chain that ends as early has as many rows
+    best: list[int] = []
+    for k, begin in enumerate(first):
+        ways = [(0, -1)] if edges[k] <= few else []
+        if found := bisect.bisect_right(ends, begin + late):
+            ways.append((most[best[found - 1]], best[found - 1]))
+        for j in range(max(k - STRAY, 0), k):
+            if last[j] - late > begin:
+                anew = _begins_anew(t[edges[k] :], last[j], usual, few)
+                ways.append((most[j] - (0 if anew else few), j))
+        rows, before[k] = max(ways)
+        most[k] += rows
+        place = bisect.bisect_right(ends, last[k])
+        if not place or most[best[place - 1]] < most[k]:
+            beaten = place
+            while beaten < len(best) and most[best[beaten]] <= most[k]:
+                beaten += 1
+            ends[place:beaten], best[place:beaten] = [last[k]], [k]
+    off: Mask = np.ones(len(t), bool)
+    k = max((k for k in range(len(most)) if len(t) - edges[k + 1] <= few), key=most.__getitem__)
+    while k >= 0:
+        off[edges[k] : edges[k + 1]] = False
+        k = before[k]
     return off
 
 
@@ -136,8 +179,18 @@ def _wrap(before: float, after: float, usual: float) -> float:
     return 0.0
 
 
-def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
-    """The same with counters that began anew going on; one that comes back to where it was did not begin anew."""
+def _begins_anew(t: Array, before: float, usual: float, few: int) -> bool:
+    """Whether times (N,) are those of a counter that began anew after ``before``: a ``few`` rows on it is not back."""
+    wrap = _wrap(before, float(t[0]), usual)
+    soon = t[: 1 + min(few, int(wrap / 2 / max(usual, EDGE_S)))]
+    return wrap > 0 and not ((soon >= before) & (soon < before + wrap / 2)).any()
+
+
+def _unwrapped(name: str, t: Array, notes: list[str]) -> tuple[Array, dict[float, int]]:
+    """The same with counters that began anew going on, and how often after how long they did.
+
+    One that comes back to where it was did not begin anew.
+    """
     usual, whole = _usual(t), np.zeros(len(t))
     edges = [*(np.flatnonzero(np.diff(t) < -_late(usual)) + 1).tolist(), len(t)]
     count: dict[float, int] = {}
@@ -150,27 +203,28 @@ def _unwrapped(name: str, t: Array, notes: list[str]) -> Array:
             count[wrap] = count.get(wrap, 0) + 1
     for wrap, times in count.items():
         notes.append(f"{name}: the clock began anew after {wrap:g} s, {times} times, and goes on")
-    return t + whole if count else t
+    return (t + whole if count else t), count
 
 
-def _longest_part(name: str, t: Array, rows: Rows, notes: list[str]) -> tuple[Array, Rows]:
-    """The longest stretch in which time does not go back for good: by more than `STRAY` rows' worth."""
+def _parts(t: Array) -> list[int]:
+    """The first row of each stretch in which time does not go back for good, by more than `STRAY` rows' worth.
+
+    And the number of all rows.
+    """
     if len(t) <= STRAY:
-        return t, rows
+        return [0, len(t)]
     newest = np.maximum.accumulate(t)
     behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
     behind &= t < newest - GAP_S  # not a burst that came late
-    begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
-    begins = np.array([k for k in begins.tolist() if not _is_shuffled(t, k, float(newest[k]))], np.intp)
-    if not len(begins):
-        return t, rows
-    edges = [0, *begins.tolist(), len(t)]
-    longest = max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
-    part = slice(edges[longest], edges[longest + 1])
-    left = len(t) - (part.stop - part.start)
-    told = f"time goes back {len(begins)} times: the longest part is kept, {left} rows are left out"
-    notes.append(left_out(name, told, left, len(t)))
-    return t[part], rows[part]
+    begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0)).tolist()
+    return [0, *(k for k in begins if not _is_shuffled(t, k, float(newest[k]))), len(t)]
+
+
+def _kept(edges: list[int], leader: Course) -> int:
+    """Which of the parts between ``edges`` is kept: the leader's, where there are as many, else the longest."""
+    if len(edges) - 1 == leader.parts:
+        return leader.part
+    return max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
 
 
 def _is_shuffled(t: Array, row: int, newest: float) -> bool:

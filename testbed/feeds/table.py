@@ -16,13 +16,14 @@ from nav.earth import isa_pressure
 from nav.samples import Array, FixType, ImuSamples
 from testbed.errors import UserError, choice, shown, unknown
 from testbed.feeds import text
+from testbed.feeds.clocks import Clocks
 from testbed.feeds.doubted import contradicted
 from testbed.feeds.earth_fixed import on_the_ellipsoid
 from testbed.feeds.formats import known
 from testbed.feeds.log import TABLE, Log, Reference, Samples, beginning, require_imu, require_one_clock
 from testbed.feeds.reference import usual_sigma
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
-from testbed.feeds.stamps import integrated, left_out, ordered, spaced, with_holes
+from testbed.feeds.stamps import integrated, left_out, spaced, with_holes
 from testbed.motion.logged import Column, Stream
 from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
 
@@ -128,11 +129,12 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     imus: dict[str, ImuSamples] = {}
     samples: dict[str, Samples] = {}
     reference = None
+    clocks = Clocks()
     # Inertial units first: what is held on at their times is known by them.
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
         heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = quantities(Tables(of_files, path), name, kind, stream, heard, notes)
+        t, values = quantities(Tables(of_files, path), name, kind, stream, heard, notes, clocks)
         if kind == "imu":
             t, values = _whole(name, t, values, stream, notes)
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
@@ -200,7 +202,7 @@ def load(path: Path) -> Table:
             frame = pandas.read_parquet(path, engine="pyarrow")
             if not isinstance(frame.index, pandas.RangeIndex) and not {*frame.index.names} & {*frame.columns}:
                 frame = frame.reset_index()  # often of times
-            return _sorted(path, ((str(name), _stacked(frame[name].to_numpy())) for name in frame.columns))
+            return _sorted(path, ((str(name), _values(frame[name])) for name in frame.columns))
         return _sorted(path, text.columns(path))
     except UserError:
         raise
@@ -212,8 +214,9 @@ def load(path: Path) -> Table:
         raise UserError(f"{path}: is damaged: {type(error).__name__} {str(error)[:200]}") from None
 
 
-def _stacked(values: Any) -> Any:
-    """A column of lists that are equally long as (N, k), any other as it is."""
+def _values(column: Any) -> Any:
+    """The values of a pandas column: dates of any time zone in UTC, lists that are equally long as (N, k)."""
+    values = (column.dt.tz_convert(None) if getattr(column.dtype, "tz", None) else column).to_numpy()
     lists = values.dtype == object and all(isinstance(one, np.ndarray) for one in values)
     return np.stack(values) if lists and len({len(one) for one in values}) == 1 else values
 
@@ -305,11 +308,17 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def quantities(
-    tables: Tables, name: str, kind: str, stream: Stream, heard: tuple[float, float] | None, notes: list[str]
+    tables: Tables,
+    name: str,
+    kind: str,
+    stream: Stream,
+    heard: tuple[float, float] | None,
+    notes: list[str],
+    clocks: Clocks | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs.
 
-    ``heard`` is when the inertial unit was, as of `ordered`.
+    ``heard`` is when the inertial unit was, as of `ordered`; ``clocks`` are those of the sensors before it.
     """
     where = f"truth.columns.{name}"
     if kind not in NEEDED:
@@ -338,7 +347,8 @@ def quantities(
     blank = np.all([np.isnan(array).reshape(len(array), -1).all(axis=1) for array in values.values()], axis=0)
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
     apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]
-    t, kept = ordered(name, apart, notes, heard)
+    source = (stream.time.file or stream.file, stream.time)
+    t, kept = (clocks or Clocks()).ordered(name, source, rows, apart, notes, heard)
     return t, {key: array[rows[kept]] for key, array in values.items()}
 
 

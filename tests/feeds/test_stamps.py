@@ -84,6 +84,48 @@ def test_a_few_stray_stamps_cost_their_own_rows_alone(rows: list[int], value: fl
     assert not any(isinstance(note, Loss) for note in notes)
 
 
+@pytest.mark.parametrize(
+    "strays",
+    [
+        {900: 1e9, 901: 0.0},
+        {900: 0.0, 901: 1e9},
+        {900: 1e9, 901: 0.0, 902: 1e6, 903: 5.0},
+        dict.fromkeys(range(30, 24_000, 160), 0.0),
+        {row: 1e9 if row % 20 else 0.0 for row in range(30, 24_000, 110)},
+    ],
+)
+@pytest.mark.parametrize("wrap", [0.0, 65.536])
+def test_stray_stamps_side_by_side_or_often_cost_their_own_rows_alone(strays: dict[int, float], wrap: float) -> None:
+    """Of a counter that begins anew soon after the first of them, too."""
+    whole = LONG + 61.0 if wrap else LONG
+    stamps = whole % wrap if wrap else whole.copy()
+    stamps[list(strays)] = list(strays.values())
+    notes: list[str] = []
+    t, kept = ordered("imu", stamps, notes)
+    others = np.delete(np.arange(len(LONG)), list(strays))
+    np.testing.assert_array_equal(kept, others)
+    np.testing.assert_allclose(t, whole[others], rtol=0, atol=1e-6)
+    assert f"imu: {len(strays)} times are far off those before and after, and left out" in notes
+
+
+def test_rows_that_are_swapped_by_more_than_a_gap_cost_two_rows_each() -> None:
+    order = np.arange(len(LONG))
+    for row in range(300, 24_000, 400):
+        order[[row, row + 25]] = order[[row + 25, row]]
+    t, rows = ordered("imu", LONG[order], [])
+    assert len(t) == len(LONG) - 2 * 60
+    np.testing.assert_array_equal(LONG[order][rows], t)
+
+
+def test_a_clock_that_is_set_back_again_and_again_leaves_its_longest_part() -> None:
+    """Told as that, however short the parts are."""
+    notes: list[str] = []
+    stamps = np.concatenate([np.tile(LONG[:100], 120), LONG[:200], np.tile(LONG[:100], 118)])
+    _, rows = ordered("imu", stamps, notes)
+    np.testing.assert_array_equal(rows, np.arange(12_000, 12_200))
+    assert any("time goes back" in note for note in notes)
+
+
 @pytest.mark.parametrize("late", [9, 15, 100])
 def test_a_row_that_comes_late_does_not_cut_the_stream(late: int) -> None:
     """By less than a gap it is put where it belongs, by more it is left out."""

@@ -123,6 +123,21 @@ def test_an_index_of_parquet_that_is_called_as_a_column_is_left_out(tmp_path: Pa
     assert load(path).numbers["b"].tolist() == [3.0, 4.0]
 
 
+@pytest.mark.parametrize("zone", [None, "UTC", "Europe/Berlin"])
+@pytest.mark.parametrize("index", [False, True])
+def test_dates_of_parquet_may_have_a_zone(zone: str | None, index: bool, tmp_path: Path) -> None:
+    """Those of none are UTC; one that is missing is unknown."""
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    noon = dt.datetime(2024, 6, 1, 12, tzinfo=dt.UTC).timestamp()
+    times = pandas.to_datetime([noon + 0.25, noon + 1.25, None], unit="s", utc=True).tz_convert(zone)
+    rows = pandas.DataFrame({"t": times, "a": [1.0, 2.0, 3.0]})
+    (rows.set_index("t") if index else rows).to_parquet(tmp_path / "a.parquet", engine="pyarrow")
+    found = load(tmp_path / "a.parquet")
+    np.testing.assert_array_equal(found.numbers["t"], [noon + 0.25, noon + 1.25, np.nan])
+    assert found.dates == {"t"}
+
+
 @pytest.mark.parametrize("words", ["Dear diary, we flew", "we flew\nand landed", "1 fish 2 fish\n3 fish"])
 def test_prose_is_no_table(words: str, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(words)

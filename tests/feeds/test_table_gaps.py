@@ -14,6 +14,7 @@ from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.log import Log
 from testbed.feeds.samples import Fixes
+from testbed.feeds.stamps import Loss
 from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth
 
@@ -133,6 +134,40 @@ def test_who_is_held_is_told_by_time_where_rows_come_anyhow(seed: int, tmp_path:
     own = np.floor(t * 4) / 4
     log = read(tmp_path, unit(t) | fixes(own) | {"gt": t}, gnss=GNSS)
     assert len(log.samples["gnss"]) == len(np.unique(own))
+
+
+def coarse(t: np.ndarray, hz: float, jitter: float = 0.0) -> tuple[dict[str, Any], np.ndarray]:
+    """Fixes of a receiver that wanders at rest for two minutes, then moves for one, at times t; when each was new."""
+    rng = np.random.default_rng(7)
+    own = np.arange(0.0, 180.0, 1 / hz)
+    own = np.sort(own + jitter * rng.uniform(-0.5, 0.5, len(own)) / hz)
+    north = np.cumsum(0.02 * rng.standard_normal(len(own))) + 5 * np.maximum(own - 120, 0)
+    lat = np.round(0.8 + north / 6.4e6, 8)  # to 6 cm
+    rows = np.maximum(np.searchsorted(own, t, side="right") - 1, 0)
+    new = np.flatnonzero(np.diff(lat[rows], prepend=np.nan) != 0)
+    return {"gt": t, "lat": lat[rows], "lon": np.full(len(t), 0.1), "h": np.full(len(t), 500.0)}, t[new]
+
+
+@pytest.mark.parametrize("hz", [1.0, 4.0, 5.0, 8.0, 10.0])
+@pytest.mark.parametrize("late", [0.0, 0.002])
+def test_who_is_held_is_known_after_a_long_rest_where_it_often_says_the_same(
+    hz: float, late: float, tmp_path: Path
+) -> None:
+    t = np.arange(18_000) / 100 + late * np.random.default_rng(3).random(18_000)
+    held, new = coarse(t, hz)
+    assert len(new) < 0.8 * 180 * hz
+    log = read(tmp_path, unit(t) | held, gnss=GNSS)
+    np.testing.assert_array_equal([one.t for one in log.samples["gnss"]], new)
+
+
+def test_a_receiver_whose_rows_may_be_held_is_told(tmp_path: Path) -> None:
+    """One that comes at any time: nothing says which of its rows are new."""
+    t = np.arange(18_000) / 100
+    log = read(tmp_path, unit(t) | coarse(t, 5.0, 1.0)[0], gnss=GNSS)
+    assert len(log.samples["gnss"]) == len(t)
+    notes = [note for note in log.notes if isinstance(note, Loss)]
+    assert len(notes) == 1
+    assert notes[0].startswith("gnss: 18000 rows, at the times of an IMU, are all taken for new")
 
 
 @pytest.mark.parametrize("begins", [-400.0, -5.0, 61.0, 600.0])
