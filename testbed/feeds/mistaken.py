@@ -98,6 +98,8 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
     if log.receiver is None:
         return
     t, v_n, _ = fixes(log.samples[log.receiver])
+    known = np.isfinite(v_n).all(axis=1)
+    t, v_n = t[known], v_n[known]
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
     turned = np.minimum(turned, FASTEST * imu.dt)  # a row that is wrong is no wrong unit
     felt = np.concatenate([[0.0], np.cumsum(turned)])

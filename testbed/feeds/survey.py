@@ -345,7 +345,9 @@ def _misfits(imu: ImuSamples, own: Sequence[Any], lags: Array) -> tuple[list[flo
     And twice the number of steps between fixes that this is the root mean square of.
     """
     t, v_n, place = fixes(own)
-    if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
+    known = np.isfinite(v_n).all(axis=1) & np.isfinite(place).all(axis=1)
+    t, v_n, place = t[known], v_n[known], place[known]
+    if len(t) < LEAST_FIXES:
         return [], 0
     gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv))
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
