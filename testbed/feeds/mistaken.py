@@ -11,8 +11,9 @@ import numpy as np
 from nav.earth import STANDARD_GRAVITY, displacement_n
 from nav.samples import Array, GnssSample, ImuSamples
 from testbed.feeds.axes import unlike
+from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Log
-from testbed.feeds.survey import between, fixes, phases
+from testbed.feeds.survey import between, phases
 
 STRETCH_S = 5.0  # over which a way, and a turn, are added up: fixes may be told to a metre only
 LEAST_STRETCHES = 10

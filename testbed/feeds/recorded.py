@@ -15,13 +15,14 @@ from nav.samples import Array, GnssSample, ImuSamples, Sample
 from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
+from testbed.feeds.lateness import latency, velocity_lag
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.samples import Fixes
 from testbed.feeds.scatter import misjudged
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
-from testbed.feeds.survey import latency, usual_step, velocity_lag
+from testbed.feeds.survey import usual_step
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario

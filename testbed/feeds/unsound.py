@@ -9,9 +9,10 @@ import numpy as np
 
 from nav.earth import pressure_altitude
 from nav.samples import Array, BarometerSample, MagnetometerSample
+from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Log
 from testbed.feeds.reference import is_flown
-from testbed.feeds.survey import Phase, Survey, between, fixes
+from testbed.feeds.survey import Phase, Survey, between
 from testbed.sensors.magnetometer import WMM_YEARS, geomagnetic_field_n
 from testbed.sensors.units import MICROTESLA
 

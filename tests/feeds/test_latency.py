@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from nav.samples import GnssSample, ImuSamples
+from testbed.feeds.lateness import latency
 from testbed.feeds.samples import Fixes
-from testbed.feeds.survey import latency
 
 RATE_HZ, LASTS = 100.0, 240.0
 

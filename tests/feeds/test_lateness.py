@@ -12,7 +12,8 @@ import pytest
 from nav.samples import FixType, GnssSample
 from testbed import Scenario, run
 from testbed.feeds import draft, formats
-from testbed.feeds.survey import survey, velocity_lag
+from testbed.feeds.lateness import velocity_lag
+from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
 
 LASTS, SPEED, SWING = 180.0, 12.0, 0.6

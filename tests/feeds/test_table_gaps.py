@@ -12,9 +12,9 @@ from nav.samples import ImuSamples
 from testbed import Scenario, run
 from testbed.errors import UserError
 from testbed.feeds import formats
+from testbed.feeds.lateness import latency
 from testbed.feeds.log import Log
 from testbed.feeds.samples import Fixes
-from testbed.feeds.survey import latency
 from testbed.motion.logged import LogTruth
 
 IMU: dict[str, Any] = {"time": "t", "gyro": "w", "accel": "f"}
