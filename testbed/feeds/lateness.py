@@ -1,13 +1,14 @@
 """How late a receiver's velocities are: by the inertial unit, and by the positions beside them.
 
 Nothing of it needs an estimate of attitude: the velocity that the inertial unit gains from fix to fix, in axes that do
-not turn, is as long as the change of GNSS velocity less gravity, however the vehicle lies.
+not turn, is as long as the change of GNSS velocity less gravity, however the vehicle lies. That of an antenna is
+v + C (w x l): v of the unit, C its attitude, w its rate and l the arm to the antenna, in its axes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,10 @@ from nav._jit import njit
 from nav.earth import gravity, radii
 from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
 from nav.samples import Array, ImuSamples
-from testbed.sensors.gnss import GRADES
+from testbed.feeds.log import Log
+from testbed.sensors import SensorConfig
+from testbed.sensors.gnss import GRADES, GnssConfig
+from testbed.sensors.imu import ImuConfig
 
 LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s],
 FURTHER = np.append(0.0, np.arange(0.6, 3.01, 0.02))  # and where the last of these fits best: a clock is off then
@@ -36,27 +40,49 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
     return t, v_n, np.array([(one.lat, one.lon, one.h) for one in found]).reshape(-1, 3)
 
 
+def late_by_imu(log: Log, name: str, own: Sequence[Any], sections: Mapping[str, SensorConfig]) -> float | None:
+    """`latency` of the samples ``own`` of a receiver by a log's first unit, of what ``sections`` tell of both."""
+    unit, imu = next(iter(log.imus.items()))
+    receiver, mounted = sections.get(name), sections.get(unit)
+    arm_s = receiver.errors().lever_arm_b if isinstance(receiver, GnssConfig) else np.zeros(3)
+    if isinstance(mounted, ImuConfig):
+        e = mounted.errors()
+        arm_s = e.C_sb @ (arm_s - e.lever_arm_b)
+    return latency(imu, own, arm_s)
+
+
 @njit
-def _gained(dtheta: Array, dv: Array) -> Array:
-    """Velocity (N + 1, 3) [m/s] that increments (N, 3) add up to, in the body axes of the beginning."""
-    total = np.zeros((len(dv) + 1, 3))
+def _gained(dtheta: Array, dv: Array, swung: Array) -> Array:
+    """Velocity (N + 1, 3) [m/s] that increments (N, 3) add up to, in the body axes of the beginning.
+
+    And what an antenna has beside, ``swung`` (N + 1, 3), in the body axes of each time.
+    """
+    total, found = np.zeros(3), np.zeros((len(dv) + 1, 3))
+    found[0] = swung[0]
     q = np.array([1.0, 0.0, 0.0, 0.0])
     for k in range(len(dv)):
         half = quat_normalise(quat_multiply(q, quat_from_rotvec(0.5 * dtheta[k])))
-        push = quat_rotate(half, dv[k])
-        for i in range(3):
-            total[k + 1, i] = total[k, i] + push[i]
+        total = total + quat_rotate(half, dv[k])
         q = quat_normalise(quat_multiply(q, quat_from_rotvec(dtheta[k])))
-    return total
+        found[k + 1] = total + quat_rotate(q, swung[k + 1])
+    return found
 
 
-def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
+def _swung(imu: ImuSamples, arm_s: Array) -> Array:
+    """Velocity (N + 1, 3) [m/s] w x l of an antenna about the unit, at the ends of its increments, in its axes."""
+    if not arm_s.any():
+        return np.zeros((len(imu) + 1, 3))
+    rates = np.nan_to_num(imu.dtheta) / imu.dt[:, None]
+    return np.cross(0.5 * (np.vstack([rates[:1], rates]) + np.vstack([rates, rates[-1:]])), arm_s)
+
+
+def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array) -> float | None:
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
 
-    0 is said where that, or the next lag that is tried, fits best, and clearly better than what a grade has, which is
-    taken off where nothing is known.
+    Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. 0 is said where that, or the next lag that is
+    tried, fits best, and clearly better than what a grade has, which is taken off where nothing is known.
     """
-    costs, weight = _misfits(imu, own, LAGS)
+    costs, weight = _misfits(imu, own, arm_s, LAGS)
     if not len(costs):
         return None
 
@@ -66,7 +92,7 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
 
     best, lags = int(np.argmin(costs)), LAGS
     if best == len(LAGS) - 1:
-        lags, (costs, weight) = FURTHER, _misfits(imu, own, FURTHER)
+        lags, (costs, weight) = FURTHER, _misfits(imu, own, arm_s, FURTHER)
         best = int(np.argmin(costs)) if len(costs) else 0
         # Who swings to and fro moves as well a swing later: the first that is no worse.
         least = [k for k in range(1, best) if costs[k] <= min(costs[max(k - NEAR, 0) : k + NEAR])]
@@ -77,7 +103,7 @@ def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
     return 0.0 if none else None
 
 
-def _misfits(imu: ImuSamples, own: Sequence[Any], lags: Array) -> tuple[list[float], int]:
+def _misfits(imu: ImuSamples, own: Sequence[Any], arm_s: Array, lags: Array) -> tuple[list[float], int]:
     """How badly velocities fit what was felt so much earlier, for each of the ``lags`` (K,) [s], none if too few do.
 
     And twice the number of steps between fixes that this is the root mean square of.
@@ -87,7 +113,7 @@ def _misfits(imu: ImuSamples, own: Sequence[Any], lags: Array) -> tuple[list[flo
     t, v_n, place = t[known], v_n[known], place[known]
     if len(t) < LEAST_FIXES:
         return [], 0
-    gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv))
+    gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv), _swung(imu, arm_s))
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
     step = np.diff(t)
     g = gravity(place[:-1, 0], place[:-1, 2])

@@ -13,10 +13,11 @@ import numpy as np
 from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, position_difference_n
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.errors import UserError
-from testbed.feeds.lateness import LEAST_FIXES, fixes, latency, velocity_lag
+from testbed.feeds.lateness import LEAST_FIXES, fixes, late_by_imu, velocity_lag
 from testbed.feeds.log import Log
 from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
+from testbed.sensors import SensorConfig
 
 MOVING = ("moving", "flying")  # the phases in which it does
 ABOUT_S = 20.0  # over which positions tell a speed
@@ -111,8 +112,8 @@ class Survey:
     airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
 
 
-def survey(log: Log) -> Survey:
-    """Measure what is in a log."""
+def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Survey:
+    """Measure what is in a log, with what the ``sections`` of a scenario tell of its sensors, where there is one."""
     found = phases(log)
     resting = max((p for p in found if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
     moving = [p for p in found if p.name in MOVING]
@@ -120,11 +121,10 @@ def survey(log: Log) -> Survey:
     vibration = {name: felt for name, imu in log.imus.items() if (felt := _vibration(log, imu, moving)) is not None}
     times = {name: imu.t for name, imu in log.imus.items()}
     times |= {name: np.array([one.t for one in own]) for name, own in log.samples.items()}
-    main = next(iter(log.imus.values()))
     late, behind, spheres, scales = {}, {}, {}, {}
     for name, own in log.samples.items():
         if isinstance(own[0], GnssSample):
-            if (lag := latency(main, own)) is not None:
+            if (lag := late_by_imu(log, name, own, sections or {})) is not None:
                 late[name] = lag
             if (lag := velocity_lag(own)) is not None:
                 behind[name] = lag

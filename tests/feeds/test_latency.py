@@ -1,36 +1,110 @@
-"""How late a receiver's velocities are by the inertial unit, of a flight that is known by formula."""
+"""How late a receiver's velocities are by the inertial unit, of flights that are known by formula."""
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+import testbed.__main__ as cli
 from nav.samples import GnssSample, ImuSamples
-from testbed.feeds.lateness import latency
+from testbed import Scenario, run
+from testbed.feeds.lateness import late_by_imu, latency
+from testbed.feeds.log import Log
 from testbed.feeds.samples import Fixes
+from testbed.sensors.gnss import GnssConfig
+from testbed.sensors.imu import ImuConfig
 
-RATE_HZ, LASTS = 100.0, 240.0
+RATE_HZ, LASTS, SPEED = 100.0, 240.0, 12.0
+ARM, NONE = (1.5, 0.8, -0.5), np.zeros(3)
+TURNS, SWINGS = np.array([1.3, 0.47]), np.array([0.5, 0.4])  # of the course [rad/s, rad]
 
 
-def swinging(late: float, noise: float = 0.05) -> tuple[ImuSamples, list[GnssSample]]:
-    """A level vehicle that is pushed to and fro, by two swings, and a receiver of 5 Hz that is so late [s]."""
-    turns, pushes = 2 * np.pi / np.array([2.9, 7.3]), np.array([3.0, 5.0])
+def receiver(t: np.ndarray, v_n: np.ndarray, noise: float = 0.05) -> list[GnssSample]:
+    told = Fixes(t, np.full(len(t), 0.8), np.full(len(t), 0.1), np.full(len(t), 500.0))
+    told.v_n = v_n + noise * np.random.default_rng(1).standard_normal((len(t), 3))
+    return told.samples("gnss")  # type: ignore[return-value]
 
-    def velocity(t: np.ndarray) -> np.ndarray:
-        return np.column_stack([np.cos(t[:, None] * turns) @ (-pushes / turns), 0 * t, 0 * t])
+
+def weaving(late: float, arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> tuple[ImuSamples, list[GnssSample]]:
+    """A level vehicle whose course swings, and a receiver of 5 Hz that is so late [s], its antenna at ``arm_b`` [m]."""
+
+    def course(t: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(t[:, None] * TURNS) @ SWINGS)
 
     edges = np.arange(round(LASTS * RATE_HZ) + 1) / RATE_HZ
-    dv = np.diff(velocity(edges), axis=0) - [0.0, 0.0, 9.8 / RATE_HZ]
-    imu = ImuSamples(edges[1:], np.diff(edges), np.zeros_like(dv), dv)
-    at = np.arange(0.0, LASTS, 0.2)
-    told = Fixes(at, np.full(len(at), 0.8), np.full(len(at), 0.1), np.full(len(at), 500.0))
-    told.v_n = velocity(at - late) + noise * np.random.default_rng(1).standard_normal((len(at), 3))
-    return imu, told.samples("gnss")  # type: ignore[return-value]
+    turn = np.diff(course(edges))
+    push = np.column_stack([0 * turn, SPEED * turn, np.full(len(turn), -9.8 / RATE_HZ)])
+    imu = ImuSamples(edges[1:], np.diff(edges), turn[:, None] * [0.0, 0.0, 1.0], push)
+    at = np.arange(1.0, LASTS, 0.2)
+    heading, rate = course(at - late), np.cos((at - late)[:, None] * TURNS) @ (SWINGS * TURNS)
+    ahead, aside = SPEED - rate * arm_b[1], rate * arm_b[0]
+    east = np.sin(heading) * ahead + np.cos(heading) * aside
+    return imu, receiver(at, np.column_stack([np.cos(heading) * ahead - np.sin(heading) * aside, east, 0 * at]))
 
 
 def test_velocities_that_are_unknown_hide_no_latency() -> None:
     """One of a thousand did, and the whole log was taken for a receiver without velocities."""
-    imu, own = swinging(0.36)
+    imu, own = weaving(0.36)
     for k in (3, *range(200, 230), 700):
         own[k].v_n[:] = np.nan
-    assert latency(imu, own) == pytest.approx(0.36, abs=0.011)
+    assert latency(imu, own, NONE) == pytest.approx(0.36, abs=0.011)
+
+
+@pytest.mark.parametrize("arm", [ARM, (-1.0, 0.0, 0.0)])
+def test_an_antenna_swings_about_the_unit(arm: tuple[float, float, float]) -> None:
+    """One that is ahead of the unit moves aside before that does: its latency seemed less."""
+    imu, own = weaving(0.2, arm)
+    assert latency(imu, own, np.array(arm)) == pytest.approx(0.2, abs=0.011)
+    assert abs((latency(imu, own, NONE) or 0.0) - 0.2) > 0.05
+
+
+def test_a_unit_has_a_place_and_a_mounting_of_its_own() -> None:
+    """The arm is from the unit to the antenna, in the axes of the unit."""
+    angles = (10.0, -20.0, 130.0)
+    roll, pitch, heading = angles
+    C_bs = Rotation.from_euler("ZYX", [heading, pitch, roll], degrees=True).as_matrix()
+    imu, own = weaving(0.2, ARM)
+    imu = ImuSamples(imu.t, imu.dt, imu.dtheta @ C_bs, imu.dv @ C_bs)
+    at = (0.4, -0.3, 0.2)
+    told = GnssConfig.model_validate({"lever_arm_m": tuple(np.add(ARM, at).tolist())})
+    mounted = ImuConfig.model_validate({"lever_arm_m": at, "mounting_deg": angles})
+    log = Log(Path("a.npz"), "table", {"imu": imu}, {"gnss": own}, None, 0.0, {})
+    assert late_by_imu(log, "gnss", own, {"gnss": told, "imu": mounted}) == pytest.approx(0.2, abs=0.011)
+
+
+def written(folder: Path, late: float, told: str, arm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
+    """The scenario of a table with a flight that weaves, its receiver ``told`` so."""
+    imu, own = weaving(late, arm)
+    columns = {"at": np.array([one.t for one in own]), "v": np.array([one.v_n for one in own])}
+    place = {key: np.array([getattr(one, key) for one in own]) for key in ("lat", "lon", "h")}
+    rates = {"t": imu.t, "gyro": RATE_HZ * imu.dtheta, "accel": RATE_HZ * imu.dv}
+    np.savez(folder / "flight.npz", **rates, **columns, **place)  # type: ignore[arg-type]
+    path = folder / "flight.toml"
+    path.write_text(
+        'title = "weaving"\nduration_s = 230\n[truth]\nsource = "log"\nfile = "flight.npz"\n'
+        '[truth.columns.imu]\ntime = "t"\ngyro = "gyro"\naccel = "accel"\n[truth.columns.gnss]\ntime = "at"\n'
+        'lat = "lat"\nlon = "lon"\nheight = "h"\nvelocity = "v"\n[sensors.imu]\n'
+        f'[sensors.gnss]\ngrade = "u-blox-m8"\n{told}\n'
+    )
+    return path
+
+
+def test_a_told_lever_arm_is_known_to_the_survey_and_the_reference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, 0.2, f"lever_arm_m = {list(ARM)}", ARM)
+    monkeypatch.setattr("sys.argv", ["testbed", "log", str(path)])
+    monkeypatch.setenv("COLUMNS", "200")
+    with suppress(SystemExit):
+        cli.main()
+    shown = re.search(r"velocity is told of later than the motion by │ ([\d.]+) s", capsys.readouterr().out)
+    assert shown is not None
+    assert float(shown[1]) == pytest.approx(0.2, abs=0.011)
+    found = re.search(r", ([\d.]+) s late by the IMU", run(Scenario.load(path)).dataset.attrs["reference"])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(0.2, abs=0.011)
