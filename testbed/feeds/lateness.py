@@ -41,14 +41,16 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 
 def late_by_imu(log: Log, name: str, own: Sequence[Any], sections: Mapping[str, SensorConfig]) -> float | None:
-    """`latency` of the samples ``own`` of a receiver by a log's first unit, of what ``sections`` tell of both."""
+    """`latency` of the samples ``own`` of a receiver by a log's first unit, with what ``sections`` tell of both."""
     unit, imu = next(iter(log.imus.items()))
     receiver, mounted = sections.get(name), sections.get(unit)
-    arm_s = receiver.errors().lever_arm_b if isinstance(receiver, GnssConfig) else np.zeros(3)
+    arm_s, told = np.zeros(3), USUAL_S
+    if isinstance(receiver, GnssConfig):
+        arm_s, told = receiver.errors().lever_arm_b, receiver.latency_s + receiver.velocity_lag_s
     if isinstance(mounted, ImuConfig):
         e = mounted.errors()
         arm_s = e.C_sb @ (arm_s - e.lever_arm_b)
-    return latency(imu, own, arm_s)
+    return latency(imu, own, arm_s, told)
 
 
 @njit
@@ -76,11 +78,12 @@ def _swung(imu: ImuSamples, arm_s: Array) -> Array:
     return np.cross(0.5 * (np.vstack([rates[:1], rates]) + np.vstack([rates, rates[-1:]])), arm_s)
 
 
-def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array) -> float | None:
+def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USUAL_S) -> float | None:
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
 
-    Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. 0 is said where that, or the next lag that is
-    tried, fits best, and clearly better than what a grade has, which is taken off where nothing is known.
+    Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. What fits best is believed if it fits clearly
+    better than 0, or than what is ``told`` [s], which is taken off where nothing is known. The lag next to 0 is 0, and
+    that is believed too if it fits clearly better than what a grade has.
     """
     costs, weight = _misfits(imu, own, arm_s, LAGS)
     if not len(costs):
@@ -99,8 +102,9 @@ def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array) -> float | None:
         best = next((k for k in least if not clearer(best, k)), best)
     if 0 < best < len(lags) - 1 and clearer(best, 0):
         return float(lags[best])
-    none = lags is LAGS and best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S))))
-    return 0.0 if none else None
+    found, others = (best, [told]) if best > 1 else (0, [told, USUAL_S])
+    shown = lags is LAGS and any(clearer(found, int(np.argmin(np.abs(LAGS - one)))) for one in others)
+    return float(LAGS[found]) if shown else None
 
 
 def _misfits(imu: ImuSamples, own: Sequence[Any], arm_s: Array, lags: Array) -> tuple[list[float], int]:

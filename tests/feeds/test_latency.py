@@ -24,13 +24,15 @@ ARM, NONE = (1.5, 0.8, -0.5), np.zeros(3)
 TURNS, SWINGS = np.array([1.3, 0.47]), np.array([0.5, 0.4])  # of the course [rad/s, rad]
 
 
-def receiver(t: np.ndarray, v_n: np.ndarray, noise: float = 0.05) -> list[GnssSample]:
+def receiver(t: np.ndarray, v_n: np.ndarray, noise: float) -> list[GnssSample]:
     told = Fixes(t, np.full(len(t), 0.8), np.full(len(t), 0.1), np.full(len(t), 500.0))
     told.v_n = v_n + noise * np.random.default_rng(1).standard_normal((len(t), 3))
     return told.samples("gnss")  # type: ignore[return-value]
 
 
-def weaving(late: float, arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> tuple[ImuSamples, list[GnssSample]]:
+def weaving(
+    late: float, arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0), noise: float = 0.05
+) -> tuple[ImuSamples, list[GnssSample]]:
     """A level vehicle whose course swings, and a receiver of 5 Hz that is so late [s], its antenna at ``arm_b`` [m]."""
 
     def course(t: np.ndarray) -> np.ndarray:
@@ -44,7 +46,7 @@ def weaving(late: float, arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)) ->
     heading, rate = course(at - late), np.cos((at - late)[:, None] * TURNS) @ (SWINGS * TURNS)
     ahead, aside = SPEED - rate * arm_b[1], rate * arm_b[0]
     east = np.sin(heading) * ahead + np.cos(heading) * aside
-    return imu, receiver(at, np.column_stack([np.cos(heading) * ahead - np.sin(heading) * aside, east, 0 * at]))
+    return imu, receiver(at, np.column_stack([np.cos(heading) * ahead - np.sin(heading) * aside, east, 0 * at]), noise)
 
 
 def test_velocities_that_are_unknown_hide_no_latency() -> None:
@@ -77,9 +79,11 @@ def test_a_unit_has_a_place_and_a_mounting_of_its_own() -> None:
     assert late_by_imu(log, "gnss", own, {"gnss": told, "imu": mounted}) == pytest.approx(0.2, abs=0.011)
 
 
-def written(folder: Path, late: float, told: str, arm: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Path:
+def written(
+    folder: Path, late: float, told: str, arm: tuple[float, float, float] = (0.0, 0.0, 0.0), noise: float = 0.05
+) -> Path:
     """The scenario of a table with a flight that weaves, its receiver ``told`` so."""
-    imu, own = weaving(late, arm)
+    imu, own = weaving(late, arm, noise)
     columns = {"at": np.array([one.t for one in own]), "v": np.array([one.v_n for one in own])}
     place = {key: np.array([getattr(one, key) for one in own]) for key in ("lat", "lon", "h")}
     rates = {"t": imu.t, "gyro": RATE_HZ * imu.dtheta, "accel": RATE_HZ * imu.dv}
@@ -108,3 +112,14 @@ def test_a_told_lever_arm_is_known_to_the_survey_and_the_reference(
     found = re.search(r", ([\d.]+) s late by the IMU", run(Scenario.load(path)).dataset.attrs["reference"])
     assert found is not None
     assert float(found[1]) == pytest.approx(0.2, abs=0.011)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.03])
+def test_a_flight_that_contradicts_the_told_latency_is_believed(late: float, tmp_path: Path) -> None:
+    """It was asked only whether it speaks against the least of the grades, 0.1 s, which noise of 0.4 m/s hides."""
+    path = written(tmp_path, late, "latency_s = 0.3", noise=0.4)
+    found = re.search(r", ([\d.]+) s late by the IMU", run(Scenario.load(path)).dataset.attrs["reference"])
+    assert found is not None
+    assert float(found[1]) == pytest.approx(late, abs=0.05)
+    as_told = run(Scenario.load(path, {"sensors.gnss.latency_s": late}))
+    assert "late by the IMU" not in as_told.dataset.attrs["reference"]
