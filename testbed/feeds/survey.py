@@ -132,7 +132,7 @@ def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Surv
             field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
             if (sphere := _sphere(field)) is not None:
                 spheres[name] = sphere
-        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
+        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own, found)) is not None:
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
     return Survey(log, rates, found, noise, vibration, late, behind, spheres, scales)
@@ -298,7 +298,7 @@ def _sphere(field: Array) -> Sphere | None:
     return Sphere(scale * residual, scale * radius, scale * off, scale * doubt)
 
 
-def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
+def _airspeed_scale(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> float | None:
     """True airspeed over the sensor's, of the wind and scale that fit GNSS velocity best while it flies."""
     receiver = log.receiver
     if receiver is None:
@@ -306,7 +306,9 @@ def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
     t, v_n, place = fixes(log.samples[receiver])
     told = np.interp(t, [one.t for one in own], [one.eas for one in own], left=np.nan, right=np.nan)
     told = told * np.sqrt(SEA_LEVEL_DENSITY / isa_density(place[:, 2]))
-    flown = (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
+    flying = [(t >= log.t0 + one.start) & (t < log.t0 + one.end) for one in flight if one.name == "flying"]
+    moves = np.hypot(v_n[:, 0], v_n[:, 1]) > REST_SPEED  # heights alone may drift, of one whose propeller turns
+    flown = np.any(flying, axis=0) & moves & (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
     if flown.sum() < LEAST_FIXES:
         return None
     v, air = v_n[flown], told[flown]
