@@ -177,11 +177,10 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth, out).items()]
     for name, keys in own.items():
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
-    main = next(iter(log.imus))
     for kind in USUAL_AIDS:
         if kind != "ins" or log.receiver is not None:
             used = [first[one] for one in USUAL_AIDS[kind] if one in first]
-            lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
+            lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{log.unit}"']
             lines.append(f"aids = {_inline(used)}")
             lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was
             if kind == "ahrs" and "magnetometer" not in first:

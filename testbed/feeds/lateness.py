@@ -41,16 +41,15 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
 
 
 def late_by_imu(log: Log, name: str, own: Sequence[Any], sections: Mapping[str, SensorConfig]) -> float | None:
-    """`latency` of the samples ``own`` of a receiver by a log's first unit, with what ``sections`` tell of both."""
-    unit, imu = next(iter(log.imus.items()))
-    receiver, mounted = sections.get(name), sections.get(unit)
+    """`latency` of the samples ``own`` of a receiver by a log's unit, with what ``sections`` tell of both."""
+    receiver, mounted = sections.get(name), sections.get(log.unit)
     arm_s, told = np.zeros(3), USUAL_S
     if isinstance(receiver, GnssConfig):
         arm_s, told = receiver.errors().lever_arm_b, receiver.latency_s + receiver.velocity_lag_s
     if isinstance(mounted, ImuConfig):
         e = mounted.errors()
         arm_s = e.C_sb @ (arm_s - e.lever_arm_b)
-    return latency(imu, own, arm_s, told)
+    return latency(log.imus[log.unit], own, arm_s, told)
 
 
 @njit

@@ -281,7 +281,7 @@ def _by_imu(solution: Reference, log: Log, sections: Mapping[str, SensorConfig])
     if {"lat", "v_n"} <= set(solution.columns) and log.imus:
         rows = Fixes(solution.t, *(solution.columns[key] for key in ("lat", "lon", "h")))
         rows.v_n = solution.columns["v_n"]
-        shown = latency(next(iter(log.imus.values())), rows.samples(log.receiver), np.zeros(3), late)
+        shown = latency(log.imus[log.unit], rows.samples(log.receiver), np.zeros(3), late)
         late, by = (late, by) if shown is None else (shown, "by the IMU")
     return replace(solution, name=f"{solution.name}, its dates {late:.2f} s late {by}", t=solution.t - late)
 

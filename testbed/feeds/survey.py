@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -113,7 +113,15 @@ class Survey:
 
 
 def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Survey:
-    """Measure what is in a log, with what the ``sections`` of a scenario tell of its sensors, where there is one."""
+    """Measure what is in a log, with what the ``sections`` of a scenario tell of its sensors, where there is one.
+
+    Inertial units of which no sample can be used are left out, with a note.
+    """
+    mute = [
+        f"{name}: none of its samples can be used: it is left out" for name, imu in log.imus.items() if not len(imu)
+    ]
+    heard = {name: imu for name, imu in log.imus.items() if len(imu)}
+    log = replace(log, imus=heard, notes=[*log.notes, *mute])
     found = phases(log)
     resting = max((p for p in found if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
     moving = [p for p in found if p.name in MOVING]
@@ -160,7 +168,7 @@ def _rate(t: Array) -> Rate:
 
 def phases(log: Log) -> list[Phase]:
     """Rest by the inertial unit, flight by GNSS speed or height. Raises UserError where its times can't be seconds."""
-    imu = next(iter(log.imus.values()))
+    imu = log.imus[log.unit]
     if len(imu) > 1 and (step := usual_step(imu.t)) > SLOWEST_IMU_S:
         told = f"its IMU reports every {step:.3g} s, for {imu.t[-1] - imu.t[0]:.3g} s"
         raise UserError(f'{log.path}: {told}: give truth.columns.<sensor>.time a unit, such as "ms" or "us"')

@@ -113,7 +113,7 @@ def _against(found: Survey, fields: list[MagnetometerSample]) -> Iterator[str]:
 
 def _inclination(log: Log, phase: Phase, field_b: Array) -> float:
     """How far a field (3,) points below the horizon [rad], as the accelerometers feel that in a rest."""
-    imu = next(iter(log.imus.values()))
+    imu = log.imus[log.unit]
     down = -np.nansum(imu.dv[between(log, imu, phase)], axis=0)
     across = float(np.linalg.norm(down) * np.linalg.norm(field_b))
     return math.asin(min(max(float(down @ field_b) / across, -1.0), 1.0)) if across else 0.0

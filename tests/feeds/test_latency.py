@@ -123,3 +123,10 @@ def test_a_flight_that_contradicts_the_told_latency_is_believed(late: float, tmp
     assert float(found[1]) == pytest.approx(late, abs=0.05)
     as_told = run(Scenario.load(path, {"sensors.gnss.latency_s": late}))
     assert "late by the IMU" not in as_told.dataset.attrs["reference"]
+
+
+def test_a_latency_is_by_a_unit_that_feels_something() -> None:
+    imu, own = weaving(0.2)
+    dead = ImuSamples(imu.t, imu.dt, 0 * imu.dtheta, 0 * imu.dv)
+    log = Log(Path("a.npz"), "table", {"dead": dead, "imu": imu}, {"gnss": own}, None, 0.0, {})
+    assert late_by_imu(log, "gnss", own, {}) == pytest.approx(0.2, abs=0.011)

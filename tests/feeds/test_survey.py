@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from nav.samples import AirspeedSample, ImuSamples
+from testbed.feeds import draft
 from testbed.feeds.log import Log
 from testbed.feeds.samples import Fixes
 from testbed.feeds.survey import survey
@@ -45,3 +47,18 @@ def flown(shakes: bool, drifts: bool) -> Log:
 def test_a_pitot_that_is_blown_on_the_ground_says_nothing_of_its_scale(shakes: bool, drifts: bool) -> None:
     """It was fitted as if it flew, and made 0.8 of one, or in a run that never flew 0.04."""
     assert survey(flown(shakes, drifts)).airspeed_scale["airspeed"] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("samples", [0, None], ids=["mute", "dead"])
+def test_a_log_is_surveyed_by_a_unit_that_feels_something(samples: int | None, tmp_path: Path) -> None:
+    """By the first, of which no sample was of use, there was a traceback, and by one of zeros all went by these."""
+    log = flown(shakes=False, drifts=False)
+    imu = log.imus["imu"]
+    first = ImuSamples(*(own[:samples] for own in (imu.t, imu.dt, 0 * imu.dtheta, 0 * imu.dv)))
+    alone, found = survey(log), survey(replace(log, imus={"first": first, "imu": imu}))
+    assert found.phases == alone.phases
+    assert str(found.noise["imu"]) == str(alone.noise["imu"])
+    text = draft.scenario(found, tmp_path / "draft.toml", None)
+    assert text.count('imu = "imu"') == 2
+    assert ("[sensors.first]" in text) == bool(len(first))
+    assert any("none of its samples can be used" in note for note in found.log.notes) == (not len(first))
