@@ -86,8 +86,9 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
 
 def _receiver_keys(own: Sequence[Any], grade: str) -> dict[str, Any]:
     """The grade of a receiver, and how well its latency is known: `rtk` of one that claims what only that can have."""
-    claims = [float(np.max(one.sigma_position_n[:2])) for one in own if one.has_fix]
-    if not claims or not np.median(claims) <= MOST_RTK_CLAIM:  # nor where it claims nothing
+    claims = np.array([np.max(one.sigma_position_n[:2]) for one in own if one.has_fix])
+    claims = claims[np.isfinite(claims)]
+    if not len(claims) or not np.median(claims) <= MOST_RTK_CLAIM:
         return {"grade": grade, **otherwise(own, RECEIVERS[grade])}
     return {"grade": "rtk", **otherwise(own, RECEIVERS["rtk"]), **UNSURE}
 
