@@ -132,7 +132,7 @@ def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Surv
     late, behind, spheres, scales = {}, {}, {}, {}
     for name, own in log.samples.items():
         if isinstance(own[0], GnssSample):
-            if (lag := late_by_imu(log, name, own, sections or {})) is not None:
+            if (lag := late_by_imu(log, name, _as_told(log, own), sections or {})) is not None:
                 late[name] = lag
             if (lag := velocity_lag(own)) is not None:
                 behind[name] = lag
@@ -144,6 +144,11 @@ def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Surv
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
     return Survey(log, rates, found, noise, vibration, late, behind, spheres, scales)
+
+
+def _as_told(log: Log, own: Sequence[Any]) -> Sequence[Any]:
+    """The samples of a sensor at the times when they were told."""
+    return [replace(one, t=one.t_arrival) for one in own] if log.valid_times else own
 
 
 def usual_step(t: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from testbed import Scenario, run
 from testbed.feeds.lateness import late_by_imu, latency
 from testbed.feeds.log import Log
 from testbed.feeds.samples import Fixes
+from testbed.feeds.survey import survey
+from testbed.score import likeness
 from testbed.sensors.gnss import GnssConfig
 from testbed.sensors.imu import ImuConfig
 
@@ -130,3 +133,15 @@ def test_a_latency_is_by_a_unit_that_feels_something() -> None:
     dead = ImuSamples(imu.t, imu.dt, 0 * imu.dtheta, 0 * imu.dv)
     log = Log(Path("a.npz"), "table", {"dead": dead, "imu": imu}, {"gnss": own}, None, 0.0, {})
     assert late_by_imu(log, "gnss", own, {}) == pytest.approx(0.2, abs=0.011)
+
+
+def test_a_receiver_of_the_testbeds_own_record_is_as_late_as_in_a_log_of_it() -> None:
+    """A record says of each fix when it was valid and when it arrived; by the first of them none is late."""
+    imu, own = weaving(0.2)
+    written = Log(Path("a.bin"), "dataflash", {"imu": imu}, {"gnss": own}, None, 0.0, {})
+    valid = [replace(one, t=one.t - 0.2, t_arrival=one.t) for one in own]
+    record = replace(written, samples={"gnss": valid}, valid_times=True)
+    late = [survey(log).latency_s["gnss"] for log in (written, record)]
+    assert late == pytest.approx([0.2, 0.2], abs=0.011)
+    rows = likeness.compare(survey(written), survey(record))
+    assert next(row for row in rows if row.what == "velocity is told of later by").alike
