@@ -13,9 +13,11 @@ from testbed.commands.shared import Force, console
 from testbed.errors import UserError, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from datetime import date as Date
 
     from testbed.motion.logged import LogTruth
+    from testbed.sensors import SensorConfig
 
 LogFile = Annotated[
     Path,
@@ -40,7 +42,7 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     from testbed.feeds.survey import survey
     from testbed.report import log as pages
 
-    file, truth, date = _named(file)
+    file, truth, date, sections = _named(file)
     if scenario is not None:
         _require_free(scenario, force)
     place = file if truth is None else Path(truth.file)
@@ -55,13 +57,13 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         print("Say in [truth.columns.<sensor>] of a scenario what they are, and give that in place of the table.")
         return
     read = formats.read(place, {}) if truth is None else formats.open_log(truth)
-    found = survey(read if date is None else replace(read, date=date))
+    found = survey(read if date is None else replace(read, date=date), sections)
     if compare is not None:
         from testbed.score import likeness
 
-        other, columns, _ = _named(compare)
+        other, columns, _, told = _named(compare)
         simulated = formats.read(other, {}) if columns is None else formats.open_log(columns)
-        console().print(pages.beside(likeness.compare(found, survey(simulated))))
+        console().print(pages.beside(likeness.compare(found, survey(simulated, told))))
     else:
         for table in pages.tables(found):
             console().print(table)
@@ -72,8 +74,8 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")
 
 
-def _named(file: Path) -> tuple[Path, LogTruth | None, Date | None]:
-    """A log by its path, or shipped; of a scenario, what that says of its log, and the date if it says one."""
+def _named(file: Path) -> tuple[Path, LogTruth | None, Date | None, Mapping[str, SensorConfig]]:
+    """A log by its path, or shipped; of a scenario, what that says of its log, the date if it says one, and sensors."""
     from testbed.data import data_dir
     from testbed.motion.logged import LogTruth
     from testbed.scenario import Scenario
@@ -81,11 +83,12 @@ def _named(file: Path) -> tuple[Path, LogTruth | None, Date | None]:
     if not file.exists() and (data_dir("scenarios") / file).is_file():
         file = data_dir("scenarios") / file
     if file.suffix != ".toml":
-        return file, None, None
+        return file, None, None, {}
     loaded = Scenario.load(file)
     if not isinstance(loaded.truth, LogTruth):
         raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
-    return file, loaded.truth, loaded.date if "date" in loaded.model_fields_set else None
+    date = loaded.date if "date" in loaded.model_fields_set else None
+    return file, loaded.truth, date, loaded.sensors
 
 
 def _require_free(scenario: Path, force: bool) -> None:

@@ -25,8 +25,8 @@ from nav._jit import njit
 from nav.earth import STANDARD_GRAVITY
 from nav.rotation import dcm_from_quat, quat_from_rotvec, quat_multiply, quat_normalise
 from nav.samples import Array, ImuSamples, MagnetometerSample
+from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Log
-from testbed.feeds.survey import fixes
 
 WINDOW_S, WINDOWS = 2.0, 5  # of a push, and so many after another for one attitude
 STEP_S, LEAST_ANGLE = 0.5, 0.05  # between two fields, and what a vehicle turns by meanwhile, at least [s, rad]

@@ -10,11 +10,11 @@ import numpy as np
 from nav._jit import njit
 from nav.rotation import quat_rotate_components
 from nav.samples import Array, GnssSample, ImuSamples
+from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Reference, Samples
 from testbed.feeds.mistaken import gone_otherwise
 from testbed.feeds.reference import LONGEST_STEP_S, ReferenceMotion, doubt, elsewhere_in_height, silence
 from testbed.feeds.rest import tilted
-from testbed.feeds.survey import fixes
 from testbed.feeds.turning import turns_otherwise
 
 STRETCH_S, STEP_S = 20.0, 1.0  # over which changes of velocity are compared, and of which length they are

@@ -86,8 +86,9 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
 
 def _receiver_keys(own: Sequence[Any], grade: str) -> dict[str, Any]:
     """The grade of a receiver, and how well its latency is known: `rtk` of one that claims what only that can have."""
-    claims = [float(np.max(one.sigma_position_n[:2])) for one in own if one.has_fix]
-    if not claims or not np.median(claims) <= MOST_RTK_CLAIM:  # nor where it claims nothing
+    claims = np.array([np.max(one.sigma_position_n[:2]) for one in own if one.has_fix])
+    claims = claims[np.isfinite(claims)]
+    if not len(claims) or not np.median(claims) <= MOST_RTK_CLAIM:
         return {"grade": grade, **otherwise(own, RECEIVERS[grade])}
     return {"grade": "rtk", **otherwise(own, RECEIVERS["rtk"]), **UNSURE}
 
@@ -177,11 +178,10 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth, out).items()]
     for name, keys in own.items():
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
-    main = next(iter(log.imus))
     for kind in USUAL_AIDS:
         if kind != "ins" or log.receiver is not None:
             used = [first[one] for one in USUAL_AIDS[kind] if one in first]
-            lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{main}"']
+            lines += ["", "[[estimator]]", f'name = "{kind}"', f'kind = "{kind}"', f'imu = "{log.unit}"']
             lines.append(f"aids = {_inline(used)}")
             lines += ['profile = "any_motion"'] if kind == "ahrs" else []  # nobody knows what vehicle it was
             if kind == "ahrs" and "magnetometer" not in first:

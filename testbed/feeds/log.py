@@ -6,6 +6,7 @@ A format is one file beside this one, with ``read(path, columns) -> Log`` and a 
 from __future__ import annotations
 
 import datetime as dt
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY
 from nav.samples import (
     AirspeedSample,
     Array,
@@ -46,6 +48,7 @@ SAMPLES: Mapping[str, type[Sample]] = {
 }
 
 TABLE = "table"  # the format of what has columns, which a scenario names
+LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, that a unit feels mostly: recorded ones 0.81 to 1.08
 LONGEST_WAIT_S = 600.0  # for an inertial unit, of a log whose other sensors are heard before it
 
 Samples: TypeAlias = Sequence[Sample]
@@ -103,6 +106,12 @@ class Log:
         return [*self.imus, *self.samples]
 
     @property
+    def unit(self) -> str:
+        """The first inertial unit that mostly feels gravity; where none does, the first that was heard."""
+        heard = [name for name, imu in self.imus.items() if len(imu)] or [*self.imus]
+        return next((name for name in heard if feels_gravity(self.imus[name])), heard[0])
+
+    @property
     def receiver(self) -> str | None:
         """The first GNSS receiver with at least half as many fixes as the one with the most, None without a fix."""
         fixes = {
@@ -110,6 +119,18 @@ class Log:
         }
         most = max(fixes.values(), default=0)
         return next((name for name, count in fixes.items() if most and 2 * count >= most), None)
+
+
+def usual_force(imu: ImuSamples) -> float:
+    """The median size of the specific force that a unit feels [m/s^2]; NaN where nothing of it is known."""
+    size = np.linalg.norm(imu.dv, axis=1) / imu.dt
+    known = size[np.isfinite(size)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def feels_gravity(imu: ImuSamples) -> bool:
+    """Whether a unit's usual force is about as much as gravity."""
+    return LEAST_FORCE < usual_force(imu) / STANDARD_GRAVITY < MOST_FORCE
 
 
 def beginning(

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from nav.earth import STANDARD_GRAVITY, displacement_n
+from nav.earth import displacement_n
 from nav.samples import Array, GnssSample, ImuSamples
 from testbed.feeds.axes import unlike
-from testbed.feeds.log import Log
-from testbed.feeds.survey import between, fixes, phases
+from testbed.feeds.lateness import fixes
+from testbed.feeds.log import Log, feels_gravity, usual_force
+from testbed.feeds.survey import between, phases
 
 STRETCH_S = 5.0  # over which a way, and a turn, are added up: fixes may be told to a metre only
 LEAST_STRETCHES = 10
@@ -21,10 +22,9 @@ LEAST_TURN = math.radians(360)  # of the course
 # What 56 logs have, of which one receiver was jammed and two IMUs were not right: positions are 1 to 4 % of their way
 # off what velocities say (0.29 and 0.54 of bad ones), heights 6 to 31 % (0.44 and 0.65); km/h make 72 %, exchanged axes
 # more, and a sign 200 %. Gyros feel 1.1 to 5 times what the course turns, 0.2 to 1.4 rad/s; deg/s for rad/s are 57
-# times as much. Accelerometers feel 0.81 to 1.08 of gravity.
+# times as much.
 MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
 LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
-LEAST_FORCE, MOST_FORCE = 0.6, 2.0  # of gravity, as the median
 MOST_STEP, STEP_SHARE = math.radians(5), 0.95  # from one sample to the next; no more in this share of them
 FASTEST = 100.0  # of one step [rad/s]
 ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
@@ -84,9 +84,8 @@ def _stretches(t: Array, v_n: Array, place: Array) -> Iterator[tuple[Array, Arra
 
 def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
     """Where gravity, or the turns of a receiver's course, are not what it feels."""
-    size = np.linalg.norm(imu.dv, axis=1) / imu.dt
-    usual = float(np.median(size[np.isfinite(size)])) if np.isfinite(size).any() else STANDARD_GRAVITY
-    if not LEAST_FORCE < usual / STANDARD_GRAVITY < MOST_FORCE:
+    usual = usual_force(imu)
+    if math.isfinite(usual) and not feels_gravity(imu):
         yield f"it feels {usual:.3g} m/s² mostly, where gravity is 9.8: is the unit of its accelerometers right?"
     elif _lies_on_its_back(log, imu):
         yield "at rest it lies on its back: are its axes forward, right and down?"
@@ -98,6 +97,8 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
     if log.receiver is None:
         return
     t, v_n, _ = fixes(log.samples[log.receiver])
+    known = np.isfinite(v_n).all(axis=1)
+    t, v_n = t[known], v_n[known]
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
     turned = np.minimum(turned, FASTEST * imu.dt)  # a row that is wrong is no wrong unit
     felt = np.concatenate([[0.0], np.cumsum(turned)])

@@ -15,13 +15,14 @@ from nav.samples import Array, GnssSample, ImuSamples, Sample
 from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.feed import Turn
+from testbed.feeds.lateness import late_by_imu, latency, velocity_lag
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
 from testbed.feeds.samples import Fixes
 from testbed.feeds.scatter import misjudged
 from testbed.feeds.stamps import Loss, at_times, begun, bridged
-from testbed.feeds.survey import latency, usual_step, velocity_lag
+from testbed.feeds.survey import usual_step
 from testbed.motion.logged import LogTruth, Place
 from testbed.motion.table import MotionSource
 from testbed.scenario import Scenario
@@ -160,7 +161,7 @@ class Recorded:
             doubt = f"{apart} of the run: nothing is judged by it"
         scattered = [misjudged(one, log.samples[one], sections[one]) for one in self.receptions if one in log.samples]
         lost = _losses(log, [*scenario.sensors, *references(truth)])
-        late = [_later(name, section, log) for name, section in sections.items() if name == log.receiver]
+        late = [_later(name, section, log, sections) for name, section in sections.items() if name == log.receiver]
         told = [doubt, *mistaken(_as_used(log, sections)), *late, *scattered, *lost]
         self._remark = "; ".join(one for one in told if one)
 
@@ -210,7 +211,7 @@ class Recorded:
             told = self._samples.get(receiver) or _samples_of(section, log, receiver, self._start)
             arm_b = np.array(section.lever_arm_m) if isinstance(section, GnssConfig) else np.zeros(3)
             found = of_receiver([one for one in told if isinstance(one, GnssSample)], receiver, arm_b)
-            found = _when_felt(found, section, log, receiver)
+            found = _when_felt(found, section, log, receiver, sections)
             if solution is not None and "q_nb" in solution.columns:  # attitude is nothing that a receiver knows
                 found = _with_attitude(found, solution, self._start)
         if not self._imus:
@@ -288,12 +289,14 @@ def _by_imu(solution: Reference, log: Log, sections: Mapping[str, SensorConfig])
     if {"lat", "v_n"} <= set(solution.columns) and log.imus:
         rows = Fixes(solution.t, *(solution.columns[key] for key in ("lat", "lon", "h")))
         rows.v_n = solution.columns["v_n"]
-        shown = latency(next(iter(log.imus.values())), rows.samples(log.receiver))
+        shown = latency(log.imus[log.unit], rows.samples(log.receiver), np.zeros(3), late)
         late, by = (late, by) if shown is None else (shown, "by the IMU")
     return replace(solution, name=f"{solution.name}, its dates {late:.2f} s late {by}", t=solution.t - late)
 
 
-def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Reference:
+def _when_felt(
+    found: Reference, section: Any, log: Log, receiver: str, sections: Mapping[str, SensorConfig]
+) -> Reference:
     """A receiver's reference at the times when the IMU felt its velocities, of one whose latency is not known well.
 
     No estimator has a part in it: one that finds a latency must not be judged by what it was told. Velocities are older
@@ -302,7 +305,7 @@ def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Refer
     lag = section.velocity_lag_s
     if log.valid_times or not section.latency_sigma_s or not log.imus:
         return _lagging(found, lag)
-    late = latency(next(iter(log.imus.values())), log.samples[receiver])
+    late = late_by_imu(log, receiver, log.samples[receiver], sections)
     if late is None:
         return _lagging(found, lag)
     shown = velocity_lag(log.samples[receiver])
@@ -311,9 +314,9 @@ def _when_felt(found: Reference, section: Any, log: Log, receiver: str) -> Refer
     return replace(_lagging(found, lag), name=f"{found.name}, {by}", t=found.t + section.latency_s - (late - lag))
 
 
-def _later(name: str, section: Any, log: Log) -> str:
+def _later(name: str, section: Any, log: Log, sections: Mapping[str, SensorConfig]) -> str:
     """What there is to say of a receiver that is much later than it is told to be, or sooner; else nothing."""
-    found = latency(next(iter(log.imus.values())), log.samples[name]) if log.imus else None
+    found = late_by_imu(log, name, log.samples[name], sections) if log.imus else None
     told = 0.0 if log.valid_times else section.latency_s + section.velocity_lag_s
     if found is None or abs(found - told) < OTHER_CLOCK_S:
         return ""

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from nav.earth import radii
 from nav.samples import Array
-from testbed.feeds.survey import fixes, usual_step
+from testbed.feeds.lateness import fixes
+from testbed.feeds.survey import usual_step
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 

@@ -1,45 +1,32 @@
-"""What is in a log, measured: rates and gaps, phases of the flight, noise at rest, vibration, latencies, calibrations.
-
-Nothing of it needs an estimate of attitude: the velocity that the inertial unit gains from fix to fix, in axes that do
-not turn, is as long as the change of GNSS velocity less gravity, however the vehicle lies.
-"""
+"""What is in a log, measured: rates, gaps, phases of the flight, noise at rest, vibration, latencies, calibrations."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from nav._jit import njit
-from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, position_difference_n, radii
-from nav.rotation import quat_from_rotvec, quat_multiply, quat_normalise, quat_rotate
+from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, position_difference_n
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.errors import UserError
+from testbed.feeds.lateness import LEAST_FIXES, fixes, late_by_imu, velocity_lag
 from testbed.feeds.log import Log
 from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
-from testbed.sensors.gnss import GRADES
+from testbed.sensors import SensorConfig
 
 MOVING = ("moving", "flying")  # the phases in which it does
 ABOUT_S = 20.0  # over which positions tell a speed
 FLYING_SPEED, FLYING_HEIGHT = 6.0, 8.0  # of GNSS [m/s, m]
 LEAST_REST_S = 20.0  # to say anything of noise
-LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s],
-FURTHER = np.append(0.0, np.arange(0.6, 3.01, 0.02))  # and where the last of these fits best: a clock is off then
-CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
-USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
-LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # [s], -, [m]
 TOGETHER = 10  # steps
 ROUNDING_S = 1e-9  # of times that are numbers
 SLOWEST_IMU_S = 2.0  # between its samples: more is another unit of time
-NEAR = 10  # lags to either side, of which one is the least
-OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_LINE = 6.0  # times the median of the spectrum about it
-LEAST_FIXES = 60
 ERRORS = 20  # of a magnetometer in a flight that are independent: each lasts
 LEAST_SPREAD = 0.05  # of a field about its mean, over its median size, in the direction of the least
 ACROSS = 0.1  # share of the flight across its main direction, to tell wind from scale
@@ -125,8 +112,16 @@ class Survey:
     airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
 
 
-def survey(log: Log) -> Survey:
-    """Measure what is in a log."""
+def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Survey:
+    """Measure what is in a log, with what the ``sections`` of a scenario tell of its sensors, where there is one.
+
+    Inertial units of which no sample can be used are left out, with a note.
+    """
+    mute = [
+        f"{name}: none of its samples can be used: it is left out" for name, imu in log.imus.items() if not len(imu)
+    ]
+    heard = {name: imu for name, imu in log.imus.items() if len(imu)}
+    log = replace(log, imus=heard, notes=[*log.notes, *mute])
     found = phases(log)
     resting = max((p for p in found if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
     moving = [p for p in found if p.name in MOVING]
@@ -134,11 +129,10 @@ def survey(log: Log) -> Survey:
     vibration = {name: felt for name, imu in log.imus.items() if (felt := _vibration(log, imu, moving)) is not None}
     times = {name: imu.t for name, imu in log.imus.items()}
     times |= {name: np.array([one.t for one in own]) for name, own in log.samples.items()}
-    main = next(iter(log.imus.values()))
     late, behind, spheres, scales = {}, {}, {}, {}
     for name, own in log.samples.items():
         if isinstance(own[0], GnssSample):
-            if (lag := latency(main, own)) is not None:
+            if (lag := late_by_imu(log, name, _as_told(log, own), sections or {})) is not None:
                 late[name] = lag
             if (lag := velocity_lag(own)) is not None:
                 behind[name] = lag
@@ -146,10 +140,15 @@ def survey(log: Log) -> Survey:
             field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
             if (sphere := _sphere(field)) is not None:
                 spheres[name] = sphere
-        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own)) is not None:
+        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own, found)) is not None:
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
     return Survey(log, rates, found, noise, vibration, late, behind, spheres, scales)
+
+
+def _as_told(log: Log, own: Sequence[Any]) -> Sequence[Any]:
+    """The samples of a sensor at the times when they were told."""
+    return [replace(one, t=one.t_arrival) for one in own] if log.valid_times else own
 
 
 def usual_step(t: Array) -> float:
@@ -172,17 +171,9 @@ def _rate(t: Array) -> Rate:
     return Rate(len(t), 1 / usual, jitter, len(steps) - len(ordinary), float(steps.max()))
 
 
-def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
-    """Times (N,), velocities (N, 3) and places (N, 3) of the samples of a receiver that have a fix."""
-    found = [one for one in own if one.has_fix]
-    t = np.array([one.t for one in found])
-    v_n = np.array([one.v_n for one in found]).reshape(-1, 3)
-    return t, v_n, np.array([(one.lat, one.lon, one.h) for one in found]).reshape(-1, 3)
-
-
 def phases(log: Log) -> list[Phase]:
     """Rest by the inertial unit, flight by GNSS speed or height. Raises UserError where its times can't be seconds."""
-    imu = next(iter(log.imus.values()))
+    imu = log.imus[log.unit]
     if len(imu) > 1 and (step := usual_step(imu.t)) > SLOWEST_IMU_S:
         told = f"its IMU reports every {step:.3g} s, for {imu.t[-1] - imu.t[0]:.3g} s"
         raise UserError(f'{log.path}: {told}: give truth.columns.<sensor>.time a unit, such as "ms" or "us"')
@@ -298,108 +289,6 @@ def _vibration(log: Log, imu: ImuSamples, moving: Sequence[Phase]) -> Vibration 
     return Vibration(math.sqrt(float(total[fast].sum()) * step), lines)
 
 
-@njit
-def _gained(dtheta: Array, dv: Array) -> Array:
-    """Velocity (N + 1, 3) [m/s] that increments (N, 3) add up to, in the body axes of the beginning."""
-    total = np.zeros((len(dv) + 1, 3))
-    q = np.array([1.0, 0.0, 0.0, 0.0])
-    for k in range(len(dv)):
-        half = quat_normalise(quat_multiply(q, quat_from_rotvec(0.5 * dtheta[k])))
-        push = quat_rotate(half, dv[k])
-        for i in range(3):
-            total[k + 1, i] = total[k, i] + push[i]
-        q = quat_normalise(quat_multiply(q, quat_from_rotvec(dtheta[k])))
-    return total
-
-
-def latency(imu: ImuSamples, own: Sequence[Any]) -> float | None:
-    """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
-
-    0 is said where that, or the next lag that is tried, fits best, and clearly better than what a grade has, which is
-    taken off where nothing is known.
-    """
-    costs, weight = _misfits(imu, own, LAGS)
-    if not len(costs):
-        return None
-
-    def clearer(one: int, other: int) -> bool:
-        found = weight * math.log(costs[other] / costs[one]) if costs[one] else math.inf
-        return bool(found > CLEARER)
-
-    best, lags = int(np.argmin(costs)), LAGS
-    if best == len(LAGS) - 1:
-        lags, (costs, weight) = FURTHER, _misfits(imu, own, FURTHER)
-        best = int(np.argmin(costs)) if len(costs) else 0
-        # Who swings to and fro moves as well a swing later: the first that is no worse.
-        least = [k for k in range(1, best) if costs[k] <= min(costs[max(k - NEAR, 0) : k + NEAR])]
-        best = next((k for k in least if not clearer(best, k)), best)
-    if 0 < best < len(lags) - 1 and clearer(best, 0):
-        return float(lags[best])
-    none = lags is LAGS and best <= 1 and clearer(0, int(np.argmin(np.abs(LAGS - USUAL_S))))
-    return 0.0 if none else None
-
-
-def _misfits(imu: ImuSamples, own: Sequence[Any], lags: Array) -> tuple[list[float], int]:
-    """How badly velocities fit what was felt so much earlier, for each of the ``lags`` (K,) [s], none if too few do.
-
-    And twice the number of steps between fixes that this is the root mean square of.
-    """
-    t, v_n, place = fixes(own)
-    if len(t) < LEAST_FIXES or not np.isfinite(v_n).all():
-        return [], 0
-    gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv))
-    at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
-    step = np.diff(t)
-    g = gravity(place[:-1, 0], place[:-1, 2])
-    change = np.diff(v_n, axis=0)
-    change[:, 2] -= g * step
-    told = np.linalg.norm(change, axis=1)
-    steady = (step < 2 * np.median(step)) & (t[:-1] - lags[-1] > at[0]) & (t[1:] < at[-1])
-    if steady.sum() < LEAST_FIXES:
-        return [], 0
-    costs = []
-    for lag in lags:
-        moved = np.column_stack([np.interp(t - lag, at, column) for column in gained.T])
-        felt = np.linalg.norm(np.diff(moved, axis=0), axis=1)
-        apart = ((felt - told) / step)[steady]
-        apart = np.abs(apart - np.median(apart))
-        costs.append(float(np.sqrt(np.mean(np.minimum(apart, OUTLYING * np.median(apart)) ** 2))))
-    return costs, int(2 * steady.sum())
-
-
-def velocity_lag(own: Sequence[Any]) -> float | None:
-    """How much older a receiver's velocities are than the positions beside them [s]; None where that is not shown.
-
-    Positions p move by what velocities of that age add up to: sum v dt - dp = -lag dv, level, over `LAG_S` each. Least
-    squares, what does not fit counting for less; it is believed from 5 sigma on, its residuals lasting so long, too.
-    """
-    t, v_n, place = fixes(own)
-    known = np.isfinite(v_n[:, :2]).all(axis=1) & np.isfinite(place).all(axis=1)
-    t, v, place = t[known], v_n[known, :2], place[known]
-    if len(t) < LEAST_FIXES:
-        return None
-    step = np.diff(t)
-    n = max(1, round(LAG_S / float(np.median(step))))
-    lat, lon, h = place.T
-    R_M, R_N = radii(lat)
-    east = (lon - lon[0] + math.pi) % (2 * math.pi) - math.pi
-    p = np.column_stack([(lat - lat[0]) * (R_M + h), east * (R_N + h) * np.cos(lat)])
-    way = np.vstack([np.zeros((1, 2)), np.cumsum(0.5 * (v[1:] + v[:-1]) * step[:, None], axis=0)])
-    gaps = np.concatenate([[0], np.cumsum(step > 2 * np.median(step))])
-    whole = gaps[n:] == gaps[:-n]
-    apart, gained = (((way - p)[n:] - (way - p)[:-n])[whole], (v[n:] - v[:-n])[whole])
-    if len(apart) < LEAST_FIXES or not gained.any():
-        return None
-    weights, lag, left = np.ones(len(apart)), 0.0, np.zeros(len(apart))
-    for _ in range(FIT_ROUNDS):
-        told = float(weights @ np.sum(gained**2, axis=1))
-        lag = -float(weights @ np.sum(apart * gained, axis=1)) / told
-        left = np.linalg.norm(apart + lag * gained, axis=1)
-        weights = np.minimum(1.0, OUTLYING * np.median(left) / np.maximum(left, TINY))
-    variance = float(weights @ left**2) / len(left) / 2 * n / told
-    return lag if lag**2 > CLEARER * variance else None
-
-
 def _sphere(field: Array) -> Sphere | None:
     """The sphere that fits magnetic fields (N, 3) [T]; None where the vehicle did not turn enough to tell."""
     known = field[np.isfinite(field).all(axis=1)]
@@ -422,7 +311,7 @@ def _sphere(field: Array) -> Sphere | None:
     return Sphere(scale * residual, scale * radius, scale * off, scale * doubt)
 
 
-def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
+def _airspeed_scale(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> float | None:
     """True airspeed over the sensor's, of the wind and scale that fit GNSS velocity best while it flies."""
     receiver = log.receiver
     if receiver is None:
@@ -430,7 +319,9 @@ def _airspeed_scale(log: Log, own: Sequence[Any]) -> float | None:
     t, v_n, place = fixes(log.samples[receiver])
     told = np.interp(t, [one.t for one in own], [one.eas for one in own], left=np.nan, right=np.nan)
     told = told * np.sqrt(SEA_LEVEL_DENSITY / isa_density(place[:, 2]))
-    flown = (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
+    flying = [(t >= log.t0 + one.start) & (t < log.t0 + one.end) for one in flight if one.name == "flying"]
+    moves = np.hypot(v_n[:, 0], v_n[:, 1]) > REST_SPEED  # heights alone may drift, of one whose propeller turns
+    flown = np.any(flying, axis=0) & moves & (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
     if flown.sum() < LEAST_FIXES:
         return None
     v, air = v_n[flown], told[flown]

@@ -9,9 +9,10 @@ import numpy as np
 
 from nav.earth import pressure_altitude
 from nav.samples import Array, BarometerSample, MagnetometerSample
+from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Log
 from testbed.feeds.reference import is_flown
-from testbed.feeds.survey import Phase, Survey, between, fixes
+from testbed.feeds.survey import Phase, Survey, between
 from testbed.sensors.magnetometer import WMM_YEARS, geomagnetic_field_n
 from testbed.sensors.units import MICROTESLA
 
@@ -112,7 +113,7 @@ def _against(found: Survey, fields: list[MagnetometerSample]) -> Iterator[str]:
 
 def _inclination(log: Log, phase: Phase, field_b: Array) -> float:
     """How far a field (3,) points below the horizon [rad], as the accelerometers feel that in a rest."""
-    imu = next(iter(log.imus.values()))
+    imu = log.imus[log.unit]
     down = -np.nansum(imu.dv[between(log, imu, phase)], axis=0)
     across = float(np.linalg.norm(down) * np.linalg.norm(field_b))
     return math.asin(min(max(float(down @ field_b) / across, -1.0), 1.0)) if across else 0.0

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pymap3d
 import pytest
 
-from nav.samples import FixType, GnssSample
+from nav.samples import FixType, GnssSample, ImuSamples
 from testbed import Scenario, run
 from testbed.feeds import draft, formats
-from testbed.feeds.survey import survey, velocity_lag
+from testbed.feeds.lateness import velocity_lag
+from testbed.feeds.log import Log
+from testbed.feeds.survey import Survey, survey
 from testbed.motion.logged import LogTruth
 
 LASTS, SPEED, SWING = 180.0, 12.0, 0.6
@@ -135,6 +138,16 @@ def test_velocities_of_the_reference_are_as_old_as_is_told(tmp_path):
 @pytest.mark.parametrize(("sigma", "grade"), [(0.02, "rtk"), (0.5, "u-blox-m8")])
 def test_the_grade_of_a_receiver_is_by_what_it_claims(sigma, grade, tmp_path):
     assert drafted(tmp_path, lag=0.0, late=0.1, sigma=sigma).sensors["gnss"].grade == grade
+
+
+def test_a_claim_that_is_missing_hides_no_others():
+    """One of a thousand made the median of them no number, and an RTK receiver a u-blox M8."""
+    imu = ImuSamples(np.array([0.1, 0.2]), np.full(2, 0.1), np.zeros((2, 3)), np.full((2, 3), -0.5))
+    own = [replace(one, sigma_position_n=np.full(3, 0.02)) for one in samples(0.0)]
+    own[2] = replace(own[2], sigma_position_n=np.full(3, np.nan))
+    log = Log(Path("a.npz"), "table", {"imu": imu}, {"gnss": own}, None, 0.0, {})
+    found = Survey(log, {}, [], {}, {}, {}, {}, {}, {})
+    assert draft.sections(found)["gnss"]["grade"] == "rtk"
 
 
 @pytest.mark.parametrize("late", [1.0, 2.4])

@@ -213,3 +213,11 @@ def test_a_unit_that_is_told_to_be_mounted_on_its_back_is_sound(tmp_path):
     assert "at rest it lies on its back" in shown(on_its_back)
     assert "at rest it lies on its back" in Recorded(on_its_back, 1).remark()
     assert Recorded(table(tmp_path, (1, -1, -1), sensors="mounting_deg = [180, 0, 0]\n"), 1).remark() == ""
+
+
+def test_a_velocity_that_is_unknown_is_no_warning() -> None:
+    """The console had numpy's, of a division of what is no number."""
+    fixes = list(FIXES)
+    fixes[300] = replace(fixes[300], v_n=np.full(3, np.nan))
+    with np.errstate(all="raise"):
+        assert mistaken(log(fixes=fixes)) == []
