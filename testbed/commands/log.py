@@ -39,6 +39,7 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
     """Show what is in a recorded flight: rates, gaps, phases, noise, vibration, latencies; propose grades."""
     from testbed.data import write_file
     from testbed.feeds import draft, formats
+    from testbed.feeds.doubted import mounted
     from testbed.feeds.survey import survey
     from testbed.report import log as pages
 
@@ -57,18 +58,19 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         print("Say in [truth.columns.<sensor>] of a scenario what they are, and give that in place of the table.")
         return
     read = formats.read(place, {}) if truth is None else formats.open_log(truth)
-    found = survey(read if date is None else replace(read, date=date), sections)
+    found = survey(mounted(read if date is None else replace(read, date=date), sections), _in_body_axes(sections))
     if compare is not None:
         from testbed.score import likeness
 
         other, columns, _, told = _named(compare)
         simulated = formats.read(other, {}) if columns is None else formats.open_log(columns)
-        console().print(pages.beside(likeness.compare(found, survey(simulated, told))))
+        other_found = survey(mounted(simulated, told), _in_body_axes(told))
+        console().print(pages.beside(likeness.compare(found, other_found)))
     else:
         for table in pages.tables(found):
             console().print(table)
     if scenario is not None:
-        write_file(scenario, draft.scenario(found, scenario, truth, date).encode())
+        write_file(scenario, draft.scenario(found, scenario, truth, date, sections).encode())
         print(printable(f"scenario: {scenario}"))
         if (truth is None or truth.start is None) and not draft.is_placed(found.log):
             print("The log does not say where the flight was: a place is assumed. Give the right one, in start.")
@@ -89,6 +91,14 @@ def _named(file: Path) -> tuple[Path, LogTruth | None, Date | None, Mapping[str,
         raise UserError(f"{file}: is a scenario without a log: its truth.source is {loaded.truth.source!r}")
     date = loaded.date if "date" in loaded.model_fields_set else None
     return file, loaded.truth, date, loaded.sensors
+
+
+def _in_body_axes(sections: Mapping[str, SensorConfig]) -> Mapping[str, SensorConfig]:
+    """The same of units whose increments are in body axes already."""
+    from testbed.sensors.imu import ImuConfig
+
+    plain = {"mounting_deg": (0.0, 0.0, 0.0)}
+    return {name: one.model_copy(update=plain) if isinstance(one, ImuConfig) else one for name, one in sections.items()}
 
 
 def _require_free(scenario: Path, force: bool) -> None:

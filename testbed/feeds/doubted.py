@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,11 +12,13 @@ from nav._jit import njit
 from nav.rotation import quat_rotate_components
 from nav.samples import Array, GnssSample, ImuSamples
 from testbed.feeds.lateness import fixes
-from testbed.feeds.log import Reference, Samples
+from testbed.feeds.log import TABLE, Log, Reference, Samples
 from testbed.feeds.mistaken import gone_otherwise
 from testbed.feeds.reference import LONGEST_STEP_S, ReferenceMotion, doubt, elsewhere_in_height, silence
 from testbed.feeds.rest import tilted
 from testbed.feeds.turning import turns_otherwise
+from testbed.sensors import SensorConfig
+from testbed.sensors.imu import ImuConfig
 
 STRETCH_S, STEP_S = 20.0, 1.0  # over which changes of velocity are compared, and of which length they are
 KNOWN_SHARE = 0.95  # of a stretch, in which increments and attitude are known
@@ -62,6 +65,20 @@ def contradicted(
         ways = gone_otherwise(reference.t, own["v_n"], place)
         said += [f"{reference.name}: {way}: are units, columns and axes right?" for way in ways]
     return "; ".join(one for one in said if one)
+
+
+def mounted(log: Log, sections: Mapping[str, SensorConfig]) -> Log:
+    """A log in body axes, of units that ``sections`` say are mounted otherwise, with what speaks against it then."""
+    imus = dict(log.imus)
+    for name, imu in log.imus.items():
+        section = sections.get(name)
+        if isinstance(section, ImuConfig) and any(section.mounting_deg):
+            C_sb = section.errors().C_sb
+            imus[name] = replace(imu, dtheta=imu.dtheta @ C_sb, dv=imu.dv @ C_sb)
+    if all(imus[name] is imu for name, imu in log.imus.items()):
+        return log
+    against = contradicted if log.format == TABLE else remark
+    return replace(log, imus=imus, remark=against(log.solution, imus, log.samples))
 
 
 def turned(solution: Reference, imus: Mapping[str, ImuSamples], samples: Mapping[str, Samples]) -> str:

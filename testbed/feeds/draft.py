@@ -24,6 +24,7 @@ from testbed.feeds.survey import Noise, Sphere, Survey
 from testbed.feeds.unsound import magnetometers
 from testbed.motion.logged import LogTruth
 from testbed.motion.terrain import JACKSBORO
+from testbed.sensors import SensorConfig
 from testbed.sensors.airspeed import GRADES as AIRSPEEDS
 from testbed.sensors.gnss import GRADES as RECEIVERS
 from testbed.sensors.imu_grades import GRADES as IMUS
@@ -138,10 +139,17 @@ def _margin(key: str) -> float:
     return BIAS_SIGMAS if key.endswith(("turn_on_degph", "turn_on_mg")) else NOISE_MARGIN
 
 
-def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | None = None) -> str:
+def scenario(
+    found: Survey,
+    out: Path,
+    truth: LogTruth | None,
+    date: dt.date | None = None,
+    told: Mapping[str, SensorConfig] | None = None,
+) -> str:
     """The text of a scenario file at ``out``; of a table, ``truth`` has its columns.
 
-    What ``truth`` says, and a ``date`` that is given, are kept before what the log says.
+    What ``truth`` says, and a ``date`` that is given, are kept before what the log says; so is where its sensors are
+    ``told`` to be, and how mounted, which no log can tell.
     """
     log = found.log
     end = min(float(own.t[-1]) for own in log.imus.values()) - log.t0
@@ -177,6 +185,7 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
     if truth is not None and truth.columns:
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth, out).items()]
     for name, keys in own.items():
+        keys |= _installed(told[name]) if told and name in told else {}
         lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
     for kind in USUAL_AIDS:
         if kind != "ins" or log.receiver is not None:
@@ -188,6 +197,15 @@ def scenario(found: Survey, out: Path, truth: LogTruth | None, date: dt.date | N
                 lines.append(_heading(log))
     lines += ["", "[record]", f"rate_hz = {RECORD_HZ:g}", ""]
     return "\n".join(lines)
+
+
+def _installed(section: SensorConfig) -> dict[str, Any]:
+    """Where a sensor is, and how it is mounted, as far as that is said."""
+    return {
+        key: list(getattr(section, key))
+        for key in ("lever_arm_m", "mounting_deg")
+        if key in section.model_fields_set and any(getattr(section, key))
+    }
 
 
 def _is_elsewhere(log: Log, named: bool) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from nav.samples import Array, GnssSample, ImuSamples, Sample
 from testbed.errors import UserError
 from testbed.feeds import formats
+from testbed.feeds.doubted import mounted
 from testbed.feeds.feed import Turn
 from testbed.feeds.lateness import late_by_imu, latency, velocity_lag
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
@@ -156,13 +157,14 @@ class Recorded:
         self._denied = {name: one.denied for name, one in sections.items() if isinstance(one, InterruptedTiming)}
         self.faults = Faults(scenario.fault, sections, seed)
         self._remarked = False
-        doubt = log.remark if truth.reference == "solution" else ""
+        used = _as_used(log, sections)
+        doubt = used.remark if truth.reference == "solution" else ""
         if apart := silence(reference, 0.0, min((rows - 1) / truth.rate_hz, scenario.duration_s)):
             doubt = f"{apart} of the run: nothing is judged by it"
         scattered = [misjudged(one, log.samples[one], sections[one]) for one in self.receptions if one in log.samples]
         lost = _losses(log, [*scenario.sensors, *references(truth)])
         late = [_later(name, section, log, sections) for name, section in sections.items() if name == log.receiver]
-        told = [doubt, *mistaken(_as_used(log, sections)), *late, *scattered, *lost]
+        told = [doubt, *mistaken(used), *late, *scattered, *lost]
         self._remark = "; ".join(one for one in told if one)
 
     def advance(self, ticks: int, wanted: Sequence[int]) -> Turn:
@@ -267,12 +269,9 @@ def references(truth: LogTruth) -> list[str]:
 
 def _as_used(log: Log, sections: Mapping[str, SensorConfig]) -> Log:
     """The log of the sensors that a run makes use of, its units in body axes."""
-    imus = {}
-    for name, section in sections.items():
-        if isinstance(section, ImuConfig):
-            own, C_sb = log.imus[name], section.errors().C_sb
-            imus[name] = replace(own, dtheta=own.dtheta @ C_sb, dv=own.dv @ C_sb)
-    return replace(log, imus=imus, samples={name: own for name, own in log.samples.items() if name in sections})
+    turned = mounted(log, sections)
+    imus = {name: turned.imus[name] for name, section in sections.items() if isinstance(section, ImuConfig)}
+    return replace(turned, imus=imus, samples={name: own for name, own in log.samples.items() if name in sections})
 
 
 def _losses(log: Log, streams: Collection[str]) -> list[str]:
