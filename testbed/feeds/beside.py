@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from testbed.errors import UserError
+from testbed.feeds.clocks import Clocks
 from testbed.feeds.doubted import contradicted
 from testbed.feeds.log import Log
 from testbed.feeds.samples import newly
@@ -39,7 +40,7 @@ def judged_by(log: Log, columns: Mapping[str, Stream]) -> Log:
         raise UserError(f"truth.columns.{name}.time: {told}")
     zero, pace = (log.utc, 1.0) if dated and log.utc is not None else (0.0, log.pace)
     heard = float(imu.t[0]) * pace + zero, float(imu.t[-1]) * pace + zero
-    t, values = quantities(Tables(tables, path), name, "reference", stream, heard, notes)
+    t, values = quantities(Tables(tables, path), name, "reference", stream, Clocks(heard), notes)
     if not len(t):
         raise UserError(f"truth.columns.{name}: {path} has no row with a time and anything else")
     found = known_motion(*newly(name, (t - zero) / pace, values, log.imus, notes), notes)

@@ -23,36 +23,32 @@ class Leader(NamedTuple):
 
 
 class Clocks:
-    """The clock of streams, the first of which, an inertial unit, leads."""
+    """The clock of streams, the first of which, an inertial unit, leads.
 
-    def __init__(self) -> None:
+    ``heard`` is when such a one was heard [s]: no silence of another in that time is too long.
+    """
+
+    def __init__(self, heard: tuple[float, float] | None = None) -> None:
+        self.heard = heard
         self._leader: Leader | None = None
 
-    def ordered(
-        self,
-        name: str,
-        column: Any,
-        rows: Rows,
-        stamps: Array,
-        notes: list[str],
-        heard: tuple[float, float] | None = None,
-    ) -> tuple[Array, Rows]:
+    def ordered(self, name: str, column: Any, rows: Rows, stamps: Array, notes: list[str]) -> tuple[Array, Rows]:
         """As `testbed.feeds.stamps.ordered` of the stamps (N,) [s], which are at ``rows`` (N,) of a ``column``.
 
         Streams of one column agree by its rows. Of others that which is not known is told.
         """
         leader = self._leader
         if leader is None:
-            t, kept, course = in_parts(name, stamps, notes, heard, Course())
+            t, kept, course = in_parts(name, stamps, notes, self.heard, Course())
             if len(t):
                 self._leader = Leader(name, column, t, rows[kept], course)
             return t, kept
         if column == leader.column:
             inside = np.flatnonzero(_of_its_part(name, rows, leader, notes))
-            t, kept, course = in_parts(name, stamps[inside], notes, heard, Course())
+            t, kept, course = in_parts(name, stamps[inside], notes, self.heard, Course())
             kept = inside[kept]
             return t + _turns_by_rows(t, rows[kept], course, leader), kept
-        t, kept, course = in_parts(name, stamps, notes, heard, leader.course)
+        t, kept, course = in_parts(name, stamps, notes, self.heard, leader.course)
         if leader.course.parts > 1 and course.parts != leader.course.parts:
             told = f"its time goes back {course.parts - 1} times, that of {leader.name} {leader.course.parts - 1} times"
             unknown = f"{told}: what is kept may be of another flight: leave all but one out of the file"

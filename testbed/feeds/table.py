@@ -133,8 +133,10 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     # Inertial units first: what is held on at their times is known by them.
     for name, stream in sorted(columns.items(), key=lambda one: (one[1].kind or one[0]) != "imu"):
         kind = stream.kind or name
-        heard = next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
-        t, values = quantities(Tables(of_files, path), name, kind, stream, heard, notes, clocks)
+        clocks.heard = (
+            next(((imu.t[0], imu.t[-1]) for imu in imus.values() if len(imu)), None) if kind != "imu" else None
+        )
+        t, values = quantities(Tables(of_files, path), name, kind, stream, clocks, notes)
         if kind == "imu":
             t, values = _whole(name, t, values, stream, notes)
             imu = integrated(t, values["gyro"], values["accel"], stream.form)
@@ -308,17 +310,11 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def quantities(
-    tables: Tables,
-    name: str,
-    kind: str,
-    stream: Stream,
-    heard: tuple[float, float] | None,
-    notes: list[str],
-    clocks: Clocks | None = None,
+    tables: Tables, name: str, kind: str, stream: Stream, clocks: Clocks, notes: list[str]
 ) -> tuple[Array, dict[str, Array]]:
     """Ascending times and the quantities of one sensor, SI. Raises UserError when it has not what its kind needs.
 
-    ``heard`` is when the inertial unit was, as of `ordered`; ``clocks`` are those of the sensors before it.
+    ``clocks`` are those of the sensors before it.
     """
     where = f"truth.columns.{name}"
     if kind not in NEEDED:
@@ -348,7 +344,7 @@ def quantities(
     rows = np.flatnonzero(~blank)  # a table of several sensors is blank where one says nothing
     apart = spaced(name, stamps[rows], notes) if stream.form == "increments" else stamps[rows]
     source = (stream.time.file or stream.file, stream.time)
-    t, kept = (clocks or Clocks()).ordered(name, source, rows, apart, notes, heard)
+    t, kept = clocks.ordered(name, source, rows, apart, notes)
     return t, {key: array[rows[kept]] for key, array in values.items()}
 
 
