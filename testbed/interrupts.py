@@ -69,11 +69,11 @@ def wait_for_nobody(code: object) -> None:
     """
     if not _program:
         return
-    threading.Thread(target=_end_alone, args=(code if isinstance(code, int) else 0,), daemon=True, name="end").start()
+    number = code if isinstance(code, int) else int(code is not None)
+    threading.Thread(target=_end_alone, args=(number,), daemon=True, name="end").start()
 
 
 def _end_alone(code: int) -> None:
-    threading.main_thread().join()
     time.sleep(GRACE_S)
     going_on = [one.name for one in threading.enumerate() if not (one.daemon or one is threading.main_thread())]
     if not going_on:

@@ -81,16 +81,28 @@ def withdraw(path: Path) -> None:
 def beside(folder: Path, names: Collection[str], force: bool = False) -> Iterator[None]:
     """Files of these names are written by somebody while a run makes ``folder`` anew: they are listed when it is over.
 
-    Raises UserError as `require_own` does.
+    What was not listed before, and is as it was, is not. Raises UserError as `require_own` does.
     """
-    require_own(folder, names, force)
-    if before := _listed(folder).intersection(names):
-        _list(folder, _listed(folder) - before)  # or the run would remove them
+    listed = _listed(folder)
+    before = {name: _stamp(folder / name) for name in names if name not in listed}
+    if not force:
+        require_own(folder, names)
+    if listed.intersection(names):
+        _list(folder, listed.difference(names))  # or the run would remove them
     try:
         yield
     finally:
-        if there := [name for name in names if (folder / name).exists()]:
-            enter(folder, there)
+        written = [name for name in names if (now := _stamp(folder / name)) and now != before.get(name)]
+        if written:
+            enter(folder, written)
+
+
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """What changes when a file is written; None when there is none."""
+    with suppress(OSError):
+        status = path.stat()
+        return status.st_ino, status.st_mtime_ns, status.st_size
+    return None
 
 
 def start_anew(folder: Path, names: Iterable[str] = ()) -> None:

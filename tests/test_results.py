@@ -85,8 +85,11 @@ def test_what_somebody_writes_meanwhile_stays_and_is_listed_in_the_end(tmp_path:
     (tmp_path / "mine.tlog").write_bytes(b"mine")
     with pytest.raises(UserError, match=r"there is mine\.tlog already"), beside(tmp_path, ["mine.tlog"]):
         pass
+    with pytest.raises(UserError, match="no log"), beside(tmp_path, ["mine.tlog"], force=True):
+        raise UserError("it is no log")
+    assert "mine.tlog" not in listed(tmp_path)
     with beside(tmp_path, ["mine.tlog"], force=True):
-        pass
+        (tmp_path / "mine.tlog").write_bytes(b"now")
     assert "mine.tlog" in listed(tmp_path)
 
 

@@ -28,6 +28,7 @@ CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm,
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
 LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # [s], -, [m]
 NEAR = 10  # lags to either side, of which one is the least
+ALIKE = 5  # lags that both halves of a flight may be from the whole
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_FIXES = 60
 
@@ -81,8 +82,8 @@ def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USU
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
 
     Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. What fits best is believed if it fits clearly
-    better than 0, or than what is ``told`` [s], which is taken off where nothing is known. The lag next to 0 is 0, and
-    that is believed too if it fits clearly better than what a grade has.
+    better than 0; or, where both halves of the flight agree, than what is ``told`` [s], which is taken off where nothing
+    is known. The lag next to 0 is 0, and that is believed too if it fits clearly better than what a grade has.
     """
     costs, weight = _misfits(imu, own, arm_s, LAGS)
     if not len(costs):
@@ -101,9 +102,18 @@ def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USU
         best = next((k for k in least if not clearer(best, k)), best)
     if 0 < best < len(lags) - 1 and clearer(best, 0):
         return float(lags[best])
-    found, others = (best, [told]) if best > 1 else (0, [told, USUAL_S])
-    shown = lags is LAGS and any(clearer(found, int(np.argmin(np.abs(LAGS - one)))) for one in others)
-    return float(LAGS[found]) if shown else None
+    if lags is FURTHER:
+        return None
+    otherwise = [int(np.argmin(np.abs(LAGS - one))) for one in (told, USUAL_S)]
+    if best <= 1:
+        return 0.0 if any(clearer(0, one) for one in otherwise) else None
+    return float(LAGS[best]) if clearer(best, otherwise[0]) and _is_steady(imu, own, arm_s, best) else None
+
+
+def _is_steady(imu: ImuSamples, own: Sequence[Any], arm_s: Array, best: int) -> bool:
+    """Whether each half of the flight has its least misfit near the ``best`` of the lags: noise has it anywhere."""
+    halves = (_misfits(imu, half, arm_s, LAGS)[0] for half in (own[: len(own) // 2], own[len(own) // 2 :]))
+    return all(len(costs) and abs(int(np.argmin(costs)) - best) <= ALIKE for costs in halves)
 
 
 def _misfits(imu: ImuSamples, own: Sequence[Any], arm_s: Array, lags: Array) -> tuple[list[float], int]:

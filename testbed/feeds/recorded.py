@@ -77,7 +77,10 @@ def _require_sensors(scenario: Scenario, log: Log, start_s: float) -> None:
     for name, section in scenario.sensors.items():
         kind = section.kind
         there = log.imus.get(name) if kind == "imu" else log.samples.get(name)
-        if there is None or not len(there):
+        if there is not None and not len(there):
+            why = "; ".join(note for note in log.notes if note.startswith(f"{name}:"))
+            raise UserError(f"sensors.{name}: of {log.path} none of its samples can be used{why and ': ' + why}")
+        if there is None:
             known = ", ".join(log.names)
             raise UserError(f"sensors.{name}: {log.path} has no {kind} of that name: it has {known}")
         if kind != "imu" and not isinstance(there[0], SAMPLES.get(kind, object)):  # type: ignore[index]

@@ -148,8 +148,8 @@ def _astray(t: Array) -> Mask:
             ways.append((most[best[found - 1]], best[found - 1]))
         for j in range(max(k - STRAY, 0), k):
             if last[j] - late > begin:
-                anew = _begins_anew(t[edges[k] :], last[j], usual, few)
-                ways.append((most[j] - (0 if anew else few), j))
+                anew = _begins_anew(t, int(edges[k]), last[j], usual, few)
+                ways.append((most[j] - (0 if anew else few + 1), j))
         rows, before[k] = max(ways)
         most[k] += rows
         place = bisect.bisect_right(ends, last[k])
@@ -179,11 +179,20 @@ def _wrap(before: float, after: float, usual: float) -> float:
     return 0.0
 
 
-def _begins_anew(t: Array, before: float, usual: float, few: int) -> bool:
-    """Whether times (N,) are those of a counter that began anew after ``before``: a ``few`` rows on it is not back."""
-    wrap = _wrap(before, float(t[0]), usual)
-    soon = t[: 1 + min(few, int(wrap / 2 / max(usual, EDGE_S)))]
-    return wrap > 0 and not ((soon >= before) & (soon < before + wrap / 2)).any()
+def _begins_anew(t: Array, row: int, before: float, usual: float, few: int) -> bool:
+    """Whether times (N,) from a ``row`` on are those of a counter that began anew after ``before``.
+
+    Those of a ``few`` rows on are not back there, nor have most of a few rows before been where it goes on. If no more
+    than these are left they go on at once.
+    """
+    after = float(t[row])
+    wrap = _wrap(before, after, usual)
+    rows = 1 + min(few, int(wrap / 2 / max(usual, EDGE_S)))
+    soon, past = t[row : row + rows], t[max(row - rows, 0) : row]
+    back = ((soon >= before) & (soon < before + wrap / 2)).any()
+    there = 2 * np.sum((past > after - wrap / 2) & (past <= after)) >= len(past)
+    late = len(t) - row <= few and after + wrap - before > _gap(usual)
+    return wrap > 0 and not (back or there or late)
 
 
 def _unwrapped(name: str, t: Array, notes: list[str]) -> tuple[Array, dict[float, int]]:

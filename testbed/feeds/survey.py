@@ -115,13 +115,13 @@ class Survey:
 def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Survey:
     """Measure what is in a log, with what the ``sections`` of a scenario tell of its sensors, where there is one.
 
-    Inertial units of which no sample can be used are left out, with a note.
+    Sensors of which no sample can be used are left out, with a note.
     """
-    mute = [
-        f"{name}: none of its samples can be used: it is left out" for name, imu in log.imus.items() if not len(imu)
-    ]
-    heard = {name: imu for name, imu in log.imus.items() if len(imu)}
-    log = replace(log, imus=heard, notes=[*log.notes, *mute])
+    streams: dict[str, Any] = {**log.imus, **log.samples}
+    mute = [f"{name}: none of its samples can be used: it is left out" for name, own in streams.items() if not len(own)]
+    imus = {name: imu for name, imu in log.imus.items() if len(imu)}
+    samples = {name: own for name, own in log.samples.items() if len(own)}
+    log = replace(log, imus=imus, samples=samples, notes=[*log.notes, *mute])
     found = phases(log)
     resting = max((p for p in found if p.name == "rest"), key=lambda p: p.end - p.start, default=None)
     moving = [p for p in found if p.name in MOVING]

@@ -46,11 +46,11 @@ def not_as_planned(dataset: xarray.DataTree) -> list[str]:
         scenario = scenario_of(dataset)
     except UserError:  # `metrics.unscored` says so
         return []
-    if not isinstance(scenario.truth, FlightTruth):
+    t = column(dataset, "truth/time")
+    if not isinstance(scenario.truth, FlightTruth) or not len(t):
         return []
     said = [f"leg {k}/{len(scenario.plan)} {leg.leg.replace('_', ' ')}" for k, leg in enumerate(scenario.plan, 1)]
     number = int(column(dataset, "truth/leg")[-1])
-    t = column(dataset, "truth/time")
     cut = len(t) > 1 and t[-1] + 2 * (t[-1] - t[-2]) > scenario.duration_s
     found = _turned_round(dataset, scenario.plan, said)
     if cut and 0 <= number < len(scenario.plan):  # of an early end something else is told

@@ -320,8 +320,9 @@ def _ends(truth: TruthBlock) -> float:
 
 def _unrecordable(kind: Any) -> str:
     """What the record can't have of a class of samples, a name or a text of its metadata; empty without."""
+    taken = {*TAKEN, *(f"{one.name}_component" for one in dataclasses.fields(kind))}
     for one in dataclasses.fields(kind):
-        if one.name in TAKEN:
+        if one.name in taken:
             return f"a sample with a field {one.name}, which the record has already: give it another name"
         for key in ("unit", "meaning"):
             text = str(one.metadata.get(key, ""))

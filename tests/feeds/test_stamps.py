@@ -108,6 +108,33 @@ def test_stray_stamps_side_by_side_or_often_cost_their_own_rows_alone(strays: di
     assert f"imu: {len(strays)} times are far off those before and after, and left out" in notes
 
 
+@pytest.mark.parametrize("off", [65.536, 4294.967296, 86_400.0, 604_800.0, -65.536, -86_400.0])
+def test_a_stray_that_is_off_by_a_turn_of_a_counter_is_a_stray(off: float) -> None:
+    """The step back from it was taken for the counter's, and half of the log with it."""
+    stamps = 1e6 + LONG
+    stamps[9000] += off
+    t, kept = ordered("imu", stamps, [])
+    np.testing.assert_array_equal(kept, np.delete(np.arange(len(LONG)), 9000))
+    np.testing.assert_array_equal(t, np.delete(stamps, 9000))
+
+
+@pytest.mark.parametrize("end", [0.0, 3.0])
+def test_a_last_stamp_near_zero_begins_no_new_week(end: float) -> None:
+    stamps = np.append(604_000.0 + LONG, end)
+    t, kept = ordered("imu", stamps, [])
+    np.testing.assert_array_equal(kept, np.arange(len(LONG)))
+    np.testing.assert_array_equal(t, stamps[:-1])
+
+
+@pytest.mark.parametrize("off", [500.0, -500.0])
+@pytest.mark.parametrize("rows", [300, 1200, 20_000])
+def test_as_many_strays_side_by_side_as_may_be_cost_no_others(rows: int, off: float) -> None:
+    stamps, count, first = 1000.0 + LONG[:rows].copy(), max(8, rows // 100), rows // 3
+    stamps[first : first + count] += off
+    _, kept = ordered("imu", stamps, [])
+    np.testing.assert_array_equal(kept, np.delete(np.arange(rows), np.arange(first, first + count)))
+
+
 def test_rows_that_are_swapped_by_more_than_a_gap_cost_two_rows_each() -> None:
     order = np.arange(len(LONG))
     for row in range(300, 24_000, 400):

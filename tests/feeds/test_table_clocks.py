@@ -11,6 +11,7 @@ import pytest
 from testbed.feeds import formats
 from testbed.feeds.log import Log
 from testbed.feeds.stamps import Loss
+from testbed.feeds.survey import survey
 from testbed.motion.logged import LogTruth
 
 UNIT: dict[str, Any] = {"time": "t", "gyro": "w", "accel": "f"}
@@ -64,6 +65,9 @@ def test_rows_of_one_time_column_are_of_the_units_part(tmp_path: Path) -> None:
             )
         log = read(tmp_path, unit(t) | blank, gnss=SHARED)
         assert len(log.samples["gnss"]) == pytest.approx(count, abs=1)
+        found = survey(log)  # and goes on without it
+        assert ("gnss" in found.rates) == (count > 0)
+        assert ("gnss: none of its samples can be used: it is left out" in found.log.notes) == (count == 0)
         assert all(one.h < 1000 for one in log.samples["gnss"])
 
 
