@@ -82,8 +82,8 @@ def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USU
     """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
 
     Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. What fits best is believed if it fits clearly
-    better than 0; or, where both halves of the flight agree, than what is ``told`` [s], which is taken off where nothing
-    is known. The lag next to 0 is 0, and that is believed too if it fits clearly better than what a grade has.
+    better than 0; or, where both halves of the flight agree, than what is ``told`` [s], which is taken off where
+    nothing is known. The lag next to 0 is 0, and that is believed too if it fits clearly better than what a grade has.
     """
     costs, weight = _misfits(imu, own, arm_s, LAGS)
     if not len(costs):
