@@ -84,7 +84,7 @@ def beside(folder: Path, names: Collection[str], force: bool = False) -> Iterato
     What was not listed before, and is as it was, is not. Raises UserError as `require_own` does.
     """
     listed = _listed(folder)
-    before = {name: _stamp(folder / name) for name in names if name not in listed}
+    before = {name: stamp(folder / name) for name in names if name not in listed}
     if not force:
         require_own(folder, names)
     if listed.intersection(names):
@@ -92,12 +92,12 @@ def beside(folder: Path, names: Collection[str], force: bool = False) -> Iterato
     try:
         yield
     finally:
-        written = [name for name in names if (now := _stamp(folder / name)) and now != before.get(name)]
+        written = [name for name in names if (now := stamp(folder / name)) and now != before.get(name)]
         if written:
             enter(folder, written)
 
 
-def _stamp(path: Path) -> tuple[int, int, int] | None:
+def stamp(path: Path) -> tuple[int, int, int] | None:
     """What changes when a file is written; None when there is none."""
     with suppress(OSError):
         status = path.stat()

@@ -7,7 +7,7 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -25,7 +25,7 @@ from testbed.commands.shared import (
     remark,
 )
 from testbed.errors import UserError
-from testbed.results import MANIFEST, METRICS, RECORD, beside, held, require_own, withdraw
+from testbed.results import MANIFEST, METRICS, RECORD, beside, held, require_own, stamp, withdraw
 
 if TYPE_CHECKING:
     from testbed.bridges.gps_input import GpsInput
@@ -303,10 +303,10 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
     from testbed.loop import keyboard, loop
     from testbed.many import progress
 
-    record, before = folder / RECORD, _stamp(folder / RECORD)
+    record, before = folder / RECORD, stamp(folder / RECORD)
     with (
         interrupts.leaving(
-            lambda: _kept(record) if _stamp(record) != before and _has_rows(record) else _nothing(record, before)
+            lambda: _kept(record) if stamp(record) != before and _has_rows(record) else _nothing(record, before)
         ),
         keyboard.keys() if realtime else nullcontext() as keys,
         progress.shown(console(stderr=True), scenario.title) as tell,
@@ -323,18 +323,10 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
                 **options,
             )
         except UserError as error:
-            raise UserError(f"{error}\n{_kept(record)}" if _stamp(record) != before else str(error)) from None
+            raise UserError(f"{error}\n{_kept(record)}" if stamp(record) != before else str(error)) from None
     for text in result.remarks:
         remark(text)
     return result
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """What changes when a file is written or made anew; None when there is none."""
-    with suppress(OSError):
-        status = path.stat()
-        return status.st_ino, status.st_mtime_ns
-    return None
 
 
 def _has_rows(record: Path) -> bool:
@@ -350,9 +342,9 @@ def _has_rows(record: Path) -> bool:
         return record.is_file() and record.stat().st_size > 0
 
 
-def _nothing(record: Path, before: tuple[int, int] | None) -> str:
+def _nothing(record: Path, before: tuple[int, int, int] | None) -> str:
     """That there is no record, once one without a row is gone."""
-    if _stamp(record) != before:
+    if stamp(record) != before:
         withdraw(record)
     return "nothing was recorded"
 
