@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FLUSH_WALL_S = 1.0  # a killed run loses at most this much work
-ENDING = 1.5  # times that, and as much more is lost, when it is about to end: all is written anew then
+ENDING = 2.5  # times that, and as much more is lost, when it is about to end: all is written anew then
 UNTENDED_S = 5.0  # or this much of a live one, which writes when there is time, if there was none
 PIECE_S = 0.004  # what one piece of that work may take, on a busy machine
 COPY_BYTES = 1 << 20  # at a time, from a file to a larger one
@@ -118,7 +118,7 @@ class Recorder:
             self.flush()
 
     def _ending(self) -> bool:
-        """Whether all will be written soon anyway, at the pace so far: most runs take no longer than two seconds."""
+        """Whether all will be written soon anyway, at the pace so far: most runs take no longer than three seconds."""
         elapsed = time.monotonic() - self._began
         return not self._tended and elapsed * (self._duration - self._t) < ENDING * FLUSH_WALL_S * self._t
 
