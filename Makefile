@@ -43,10 +43,10 @@ wheel-test: $(VENV)/.ready $(LOWEST)/.ready
 	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall $(LOWEST)/dist/*.whl
 	$(LOWEST)/bin/python -m pip check
 	folder=$$(mktemp -d) && cd $$folder && trap "rm -rf $$folder" EXIT \
-		&& $(abspath $(LOWEST))/bin/testbed run static_bench --set duration_s=90 \
-		&& $(abspath $(LOWEST))/bin/testbed check regression \
-		&& $(abspath $(LOWEST))/bin/testbed init mine \
-		&& $(abspath $(LOWEST))/bin/testbed check mine/first.toml
+		&& "$(CURDIR)/$(LOWEST)/bin/testbed" run static_bench --set duration_s=90 \
+		&& "$(CURDIR)/$(LOWEST)/bin/testbed" check regression \
+		&& "$(CURDIR)/$(LOWEST)/bin/testbed" init mine \
+		&& "$(CURDIR)/$(LOWEST)/bin/testbed" check mine/first.toml
 
 setup: $(VENV)/.ready
 
