@@ -15,8 +15,8 @@ import pytest
 from worlds.programs import free_port
 
 from testbed import Scenario, run
-from testbed.commands.run import _has_rows
-from testbed.results import MANIFEST, METRICS, RECORD, withdraw, write_result
+from testbed.commands.run import _has_rows, _nothing
+from testbed.results import MANIFEST, METRICS, RECORD, stamp, start_anew, withdraw, write_result
 
 COMMANDS = {
     "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
@@ -184,6 +184,17 @@ def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([METRICS, MANIFEST])
     withdraw(tmp_path / METRICS)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_record_that_was_to_come_is_no_longer_listed(tmp_path: Path) -> None:
+    """Interrupted in its first turn a run left a manifest of a record that was not there."""
+    record = tmp_path / RECORD
+    start_anew(tmp_path, [RECORD])
+    assert _nothing(record, None) == "nothing was recorded"
+    assert not [*tmp_path.iterdir()]
+    write_result(record, b"of an earlier run")
+    assert _nothing(record, stamp(record)) == "nothing was recorded"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [RECORD, MANIFEST]
 
 
 GOING_ON = """

@@ -343,8 +343,8 @@ def _has_rows(record: Path) -> bool:
 
 
 def _nothing(record: Path, before: tuple[int, int, int] | None) -> str:
-    """That there is no record, once one without a row is gone."""
-    if stamp(record) != before:
+    """That there is no record, once one without a row is gone, or the word of one that was to come."""
+    if stamp(record) != before or before is None:
         withdraw(record)
     return "nothing was recorded"
 
