@@ -200,7 +200,7 @@ def report(run_file: RunFile, force: Force = False) -> None:
     try:
         computed = metrics.compute(dataset)
     except UserError as error:
-        raise UserError(f"{run_file}: {error}") from None
+        raise error.within(str(run_file)) from None
     for text in remarks(dataset, computed):
         remark(text)
     kept = run_file.parent / METRICS

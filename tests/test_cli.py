@@ -658,3 +658,16 @@ def test_own_files_are_named_before_a_run_and_left(testbed: Testbed, tmp_path: P
 def test_what_a_file_name_may_hold_is_not_obeyed_by_the_terminal(testbed: Testbed) -> None:
     ended = testbed("report", "\x1b[31mred.nc")
     assert (ended.code, ended.err.startswith(r"testbed: \x1b[31mred.nc: no such file")) == (2, True)
+    ended = testbed("run", "two\nlines.toml")
+    assert (ended.code, ended.err.startswith(r"testbed: two\nlines.toml: no such file")) == (2, True)
+    assert len(ended.err.splitlines()) == 1
+
+
+def test_each_mistake_of_a_scenario_is_a_line_whatever_its_file_is_called(tmp_path: Path) -> None:
+    with pytest.raises(UserError) as told:
+        Scenario.parse("title = 3", path=tmp_path / "two\nlines.toml")
+    lines = str(told.value).splitlines()
+    assert len(lines) == len(told.value.args) > 1
+    assert all(r"two\nlines.toml" in line for line in lines)
+    within = str(told.value.within("run.nc")).splitlines()
+    assert within == [f"run.nc: {lines[0]}", *lines[1:]]

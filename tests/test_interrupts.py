@@ -14,7 +14,7 @@ import h5py
 import pytest
 from worlds.programs import free_port
 
-from testbed import Scenario, run
+from testbed import Scenario, interrupts, run
 from testbed.commands.run import _has_rows, _nothing
 from testbed.results import MANIFEST, METRICS, RECORD, stamp, start_anew, withdraw, write_result
 
@@ -175,6 +175,15 @@ def test_one_that_somebody_swallowed_is_told_at_the_end() -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # that in the background of a shell is ignored
     )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
+
+
+def test_what_is_left_behind_is_told_on_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(interrupts, "_announced", False)
+    with pytest.raises(SystemExit), interrupts.leaving(lambda: "the record is two\nlines"):
+        raise interrupts.Interrupted
+    assert capsys.readouterr().err == "testbed: interrupted: the record is two\\nlines\n"
 
 
 def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:

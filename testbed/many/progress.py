@@ -39,7 +39,7 @@ def shown(console: Console, title: str) -> Iterator[Tell]:
         TextColumn("{task.fields[text]}", markup=False),
     )
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=1.0, text="starting; the first time, kernels are compiled")
+        task = bar.add_task(printable(title), total=1.0, text="starting; the first time, kernels are compiled")
         yield lambda fraction, text: bar.update(task, completed=fraction, text=pace.with_remaining(fraction, text))
 
 
