@@ -79,6 +79,7 @@ def _main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that is not UTF-8 lacks signs of ours
+            stream.close = stream.flush  # type: ignore[method-assign]  # in code of the user's: we go on to speak
     try:
         with interrupts.heeded():
             app(_explicit(sys.argv[1:]))

@@ -237,20 +237,58 @@ class Pooled(Mine):
 """
 
 
+def flown(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
+    """How a run on the bench has ended, with a class of mine.py in a folder as its estimator."""
+    bench = (Path(__file__).parents[1] / "scenarios/static_bench.toml").read_text().partition("[[estimator]]")[0]
+    (folder / "mine.toml").write_text(f'{bench}\n[[estimator]]\nname = "mine"\nkind = "./mine.py:{name}"\n')
+    return subprocess.run(
+        [sys.executable, "-m", "testbed", "run", "mine.toml", "--no-report", "--set", "duration_s=1"],
+        cwd=folder, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True, text=True, check=False, timeout=100,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "daemon", "code"), [("Mine", False, 0), ("Mine", True, 0), ("Lacking", False, 2), ("Pooled", False, 0)]
 )
 def test_a_thread_of_the_users_does_not_outlive_its_command(tmp_path: Path, name: str, daemon: bool, code: int) -> None:
     """All was printed, and then the command hung."""
     (tmp_path / "mine.py").write_text(GOING_ON.format(daemon=daemon))
-    bench = (Path(__file__).parents[1] / "scenarios/static_bench.toml").read_text().partition("[[estimator]]")[0]
-    (tmp_path / "mine.toml").write_text(f'{bench}\n[[estimator]]\nname = "mine"\nkind = "./mine.py:{name}"\n')
-    ended = subprocess.run(
-        [sys.executable, "-m", "testbed", "run", "mine.toml", "--no-report", "--set", "duration_s=1"],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        capture_output=True, text=True, check=False, timeout=100,
-    )  # fmt: skip
+    ended = flown(tmp_path, name)
     assert ended.returncode == code, ended.stderr
     assert code or ended.stdout.splitlines()[-1].startswith("record: ")
     told = "testbed: ended, though threads still ran: reader"
     assert ended.stderr.splitlines()[-1].startswith(told) == (not daemon)
+
+
+CLOSING = """
+import sys
+from nav.samples import Estimate
+
+
+class Mine:
+    def __init__(self, rig):
+        self.t = 0.0
+
+    def propagate(self, imu):
+        self.t = float(imu.t[-1])
+        print("mine")
+        sys.stdout.close()
+        sys.stderr.close()
+
+    def update(self, sample): ...
+
+    def estimate(self):
+        return Estimate.of(self.t)
+"""
+
+
+def test_who_closes_the_output_takes_it_from_nobody(tmp_path: Path) -> None:
+    """All was flown, and then there was a traceback in place of tables and report, or no metrics."""
+    (tmp_path / "mine.py").write_text(CLOSING)
+    ended = flown(tmp_path, "Mine")
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines()[0] == "mine"
+    assert ended.stdout.splitlines()[-1].startswith("record: ")
+    assert "testbed: mine: its errors are not scored" in ended.stderr
+    assert (tmp_path / "runs/mine" / METRICS).exists()
