@@ -79,6 +79,7 @@ def _main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal that is not UTF-8 lacks signs of ours
+            stream.close = stream.flush  # type: ignore[method-assign]  # in code of the user's: we go on to speak
     try:
         with interrupts.heeded():
             app(_explicit(sys.argv[1:]))
@@ -200,7 +201,7 @@ def report(run_file: RunFile, force: Force = False) -> None:
     try:
         computed = metrics.compute(dataset)
     except UserError as error:
-        raise UserError(f"{run_file}: {error}") from None
+        raise error.within(str(run_file)) from None
     for text in remarks(dataset, computed):
         remark(text)
     kept = run_file.parent / METRICS

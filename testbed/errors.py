@@ -12,8 +12,16 @@ CHOICES_SHOWN = 16
 class UserError(Exception):
     """A mistake in what the user gave: the message names the file, the key or the address, and what to do.
 
-    The command line prints it and ends with exit code 2.
+    The command line prints it and ends with exit code 2. Each argument is a line, in which is escaped what does not
+    print: the name of a file may hold anything.
     """
+
+    def __str__(self) -> str:
+        return "\n".join(printable(str(line)) for line in self.args)
+
+    def within(self, where: str) -> UserError:
+        """The same mistake, found in something else, which is named first."""
+        return UserError(f"{where}: {self.args[0]}", *self.args[1:])
 
 
 def printable(text: str) -> str:

@@ -205,7 +205,7 @@ def _tell() -> None:
     global _announced
     _announced = True
     what = _left[-1]() if _left else ""
-    print(f"testbed: interrupted{': ' if what else ''}{what}", file=sys.stderr, flush=True)
+    print(f"testbed: interrupted{': ' if what else ''}{printable(what)}", file=sys.stderr, flush=True)
 
 
 def _watch(heard: int) -> None:

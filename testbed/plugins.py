@@ -8,6 +8,7 @@ import importlib.util
 import os
 import sys
 import sysconfig
+import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -31,11 +32,19 @@ T = TypeVar("T")
 
 
 def confined(call: Callable[..., T], /, *given: Any, **options: Any) -> T:
-    """What the user's code gives. Working folder and error state of NumPy, which are everybody's, are put back."""
+    """What the user's code gives. Working folder and error state of NumPy, which are everybody's, are put back.
+
+    Python tells an interrupt to the main thread: in another, as in that of a campaign's worker, one is an error as any.
+    """
     folder = _working_folder()
     with np.errstate():
         try:
             return call(*given, **options)
+        except KeyboardInterrupt as error:
+            if threading.current_thread() is threading.main_thread():
+                raise
+            told = RuntimeError("KeyboardInterrupt, where nobody interrupted")
+            raise told.with_traceback(error.__traceback__) from None
         finally:
             if folder and folder != _working_folder():
                 os.chdir(folder)

@@ -67,9 +67,9 @@ def enter(folder: Path, names: Iterable[str]) -> None:
 
 
 def withdraw(path: Path) -> None:
-    """Remove a file that was written and shows nothing, and what is said of it."""
+    """Remove a file that was written and shows nothing, if it was, and what is said of it."""
     with suppress(OSError, UserError):
-        path.unlink()
+        path.unlink(missing_ok=True)
         rest = _listed(path.parent) - {path.name}
         if rest:
             _list(path.parent, rest)

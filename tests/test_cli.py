@@ -13,9 +13,10 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -612,6 +613,35 @@ def test_progress_on_a_terminal_is_a_bar() -> None:
     assert "1:00:00 of 1:00:00  87.7 × real time  leg [2]" in out.getvalue()
 
 
+def remaining(monkeypatch: pytest.MonkeyPatch, points: Iterable[tuple[float, float]]) -> list[str]:
+    """What is told, to whoever reads along in a pipe, of wall times [s] and fractions that are done then."""
+    clock = [0.0]
+    monkeypatch.setattr("testbed.many.progress.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    out = io.StringIO()
+    with progress.shown(Console(file=out), "a title") as tell:
+        for clock[0], fraction in points:
+            tell(fraction, "0/1000 runs")
+    return out.getvalue().splitlines()
+
+
+def test_how_long_the_rest_takes_is_told_before_the_first_of_many_long_runs_is_in(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing was said before half a percent of the whole was done."""
+    pace = 1e-6  # of 1000 runs, one in 1000 s
+    lines = remaining(monkeypatch, [(t, pace * max(t - 8, 0)) for t in range(31)])
+    assert lines[:2] == ["  0 %  0/1000 runs", "  0 %  0/1000 runs"]  # it starts
+    assert set(lines[2:]) == {"  0 %  0/1000 runs  about 12 days to go"}
+    assert len(lines) == 6
+
+
+def test_a_halt_is_not_told_as_the_pace_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels are compiled after the first rows of a run: 40 s without a step are soon behind it."""
+    lines = remaining(monkeypatch, [(t, 1e-5 if 1 <= t < 41 else 1e-4 * max(t - 40, 0)) for t in range(201)])
+    assert lines[2:7] == ["  0 %  0/1000 runs"] * 5
+    assert lines[-1] == "  2 %  0/1000 runs  about 3 h to go"
+
+
 def test_own_files_are_named_before_a_run_and_left(testbed: Testbed, tmp_path: Path) -> None:
     mine = [tmp_path / name for name in ("flight.png", "ins_biases.png", "report.html", "photo.png")]
     for path in mine:
@@ -628,3 +658,16 @@ def test_own_files_are_named_before_a_run_and_left(testbed: Testbed, tmp_path: P
 def test_what_a_file_name_may_hold_is_not_obeyed_by_the_terminal(testbed: Testbed) -> None:
     ended = testbed("report", "\x1b[31mred.nc")
     assert (ended.code, ended.err.startswith(r"testbed: \x1b[31mred.nc: no such file")) == (2, True)
+    ended = testbed("run", "two\nlines.toml")
+    assert (ended.code, ended.err.startswith(r"testbed: two\nlines.toml: no such file")) == (2, True)
+    assert len(ended.err.splitlines()) == 1
+
+
+def test_each_mistake_of_a_scenario_is_a_line_whatever_its_file_is_called(tmp_path: Path) -> None:
+    with pytest.raises(UserError) as told:
+        Scenario.parse("title = 3", path=tmp_path / "two\nlines.toml")
+    lines = str(told.value).splitlines()
+    assert len(lines) == len(told.value.args) > 1
+    assert all(r"two\nlines.toml" in line for line in lines)
+    within = str(told.value.within("run.nc")).splitlines()
+    assert within == [f"run.nc: {lines[0]}", *lines[1:]]

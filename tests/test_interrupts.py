@@ -14,9 +14,9 @@ import h5py
 import pytest
 from worlds.programs import free_port
 
-from testbed import Scenario, run
-from testbed.commands.run import _has_rows
-from testbed.results import MANIFEST, METRICS, RECORD, withdraw, write_result
+from testbed import Scenario, interrupts, run
+from testbed.commands.run import _has_rows, _nothing
+from testbed.results import MANIFEST, METRICS, RECORD, stamp, start_anew, withdraw, write_result
 
 COMMANDS = {
     "run": (["run", "static_bench", "--set", "duration_s=36000"], r"nothing was recorded|the record so far is .*"),
@@ -177,6 +177,15 @@ def test_one_that_somebody_swallowed_is_told_at_the_end() -> None:
     assert (ended.returncode, ended.stderr) == (130, "testbed: interrupted\n")
 
 
+def test_what_is_left_behind_is_told_on_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(interrupts, "_announced", False)
+    with pytest.raises(SystemExit), interrupts.leaving(lambda: "the record is two\nlines"):
+        raise interrupts.Interrupted
+    assert capsys.readouterr().err == "testbed: interrupted: the record is two\\nlines\n"
+
+
 def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:
     write_result(tmp_path / RECORD, b"")
     write_result(tmp_path / METRICS, b"{}")
@@ -184,6 +193,17 @@ def test_a_record_without_a_row_is_withdrawn(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([METRICS, MANIFEST])
     withdraw(tmp_path / METRICS)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_record_that_was_to_come_is_no_longer_listed(tmp_path: Path) -> None:
+    """Interrupted in its first turn a run left a manifest of a record that was not there."""
+    record = tmp_path / RECORD
+    start_anew(tmp_path, [RECORD])
+    assert _nothing(record, None) == "nothing was recorded"
+    assert not [*tmp_path.iterdir()]
+    write_result(record, b"of an earlier run")
+    assert _nothing(record, stamp(record)) == "nothing was recorded"
+    assert sorted(path.name for path in tmp_path.iterdir()) == [RECORD, MANIFEST]
 
 
 GOING_ON = """
@@ -217,20 +237,58 @@ class Pooled(Mine):
 """
 
 
+def flown(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
+    """How a run on the bench has ended, with a class of mine.py in a folder as its estimator."""
+    bench = (Path(__file__).parents[1] / "scenarios/static_bench.toml").read_text().partition("[[estimator]]")[0]
+    (folder / "mine.toml").write_text(f'{bench}\n[[estimator]]\nname = "mine"\nkind = "./mine.py:{name}"\n')
+    return subprocess.run(
+        [sys.executable, "-m", "testbed", "run", "mine.toml", "--no-report", "--set", "duration_s=1"],
+        cwd=folder, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True, text=True, check=False, timeout=100,
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "daemon", "code"), [("Mine", False, 0), ("Mine", True, 0), ("Lacking", False, 2), ("Pooled", False, 0)]
 )
 def test_a_thread_of_the_users_does_not_outlive_its_command(tmp_path: Path, name: str, daemon: bool, code: int) -> None:
     """All was printed, and then the command hung."""
     (tmp_path / "mine.py").write_text(GOING_ON.format(daemon=daemon))
-    bench = (Path(__file__).parents[1] / "scenarios/static_bench.toml").read_text().partition("[[estimator]]")[0]
-    (tmp_path / "mine.toml").write_text(f'{bench}\n[[estimator]]\nname = "mine"\nkind = "./mine.py:{name}"\n')
-    ended = subprocess.run(
-        [sys.executable, "-m", "testbed", "run", "mine.toml", "--no-report", "--set", "duration_s=1"],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        capture_output=True, text=True, check=False, timeout=100,
-    )  # fmt: skip
+    ended = flown(tmp_path, name)
     assert ended.returncode == code, ended.stderr
     assert code or ended.stdout.splitlines()[-1].startswith("record: ")
     told = "testbed: ended, though threads still ran: reader"
     assert ended.stderr.splitlines()[-1].startswith(told) == (not daemon)
+
+
+CLOSING = """
+import sys
+from nav.samples import Estimate
+
+
+class Mine:
+    def __init__(self, rig):
+        self.t = 0.0
+
+    def propagate(self, imu):
+        self.t = float(imu.t[-1])
+        print("mine")
+        sys.stdout.close()
+        sys.stderr.close()
+
+    def update(self, sample): ...
+
+    def estimate(self):
+        return Estimate.of(self.t)
+"""
+
+
+def test_who_closes_the_output_takes_it_from_nobody(tmp_path: Path) -> None:
+    """All was flown, and then there was a traceback in place of tables and report, or no metrics."""
+    (tmp_path / "mine.py").write_text(CLOSING)
+    ended = flown(tmp_path, "Mine")
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines()[0] == "mine"
+    assert ended.stdout.splitlines()[-1].startswith("record: ")
+    assert "testbed: mine: its errors are not scored" in ended.stderr
+    assert (tmp_path / "runs/mine" / METRICS).exists()

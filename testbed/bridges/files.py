@@ -50,7 +50,7 @@ def write(source: Path, format: str, out: Path | None = None, force: bool = Fals
     try:
         content: bytes = importlib.import_module(f"testbed.{one.module}").content(scenario, one.version)
     except UserError as error:
-        raise UserError(f"{source}: {error}") from None
+        raise error.within(str(source)) from None
     target = target if out is None else out
     write_one(target, content, force)
     return target

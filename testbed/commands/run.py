@@ -177,7 +177,7 @@ def _again(run_file: Path, overrides: Sequence[str], anew: bool) -> _Flight:
         scenario = scenario_of(dataset, overrides)
         flown = None if anew else played(dataset)
     except UserError as error:
-        raise UserError(f"{run_file}: {error}") from None
+        raise error.within(str(run_file)) from None
     other = [f"{name} {version}" for name, version in versions if installed().get(name) != version]
     if other:
         remark(f"{run_file}: was made with {', '.join(other)}: bits may differ")
@@ -323,7 +323,7 @@ def _fly(scenario: Scenario, folder: Path, realtime: float | None, **options: An
                 **options,
             )
         except UserError as error:
-            raise UserError(f"{error}\n{_kept(record)}" if stamp(record) != before else str(error)) from None
+            raise UserError(*error.args, *([_kept(record)] if stamp(record) != before else [])) from None
     for text in result.remarks:
         remark(text)
     return result
@@ -343,8 +343,8 @@ def _has_rows(record: Path) -> bool:
 
 
 def _nothing(record: Path, before: tuple[int, int, int] | None) -> str:
-    """That there is no record, once one without a row is gone."""
-    if stamp(record) != before:
+    """That there is no record, once one without a row is gone, or the word of one that was to come."""
+    if stamp(record) != before or before is None:
         withdraw(record)
     return "nothing was recorded"
 

@@ -119,7 +119,7 @@ def export(run_file: Path, format: str, out: Path | None = None, force: bool = F
             f"--format {format}: needs the package {error.name}: install the extra {one.extra!r} of navigation-testbed"
         ) from None
     except UserError as error:
-        raise UserError(f"{run_file}: {error}") from None
+        raise error.within(str(run_file)) from None
     if isinstance(content, bytes):
         write_one(target, content, force)
     else:

@@ -36,7 +36,8 @@ class Fixes:
     """What a receiver said at times ``t`` (N,) [s]: latitude, longitude [rad], height [m], all (N,).
 
     What else it says is given afterwards, and NaN until then: velocity and 1-sigmas (N, 3) NED, type of fix,
-    satellites, dilutions (N,). Without a type there is a fix where there is a position.
+    satellites, dilutions (N,). Without a type there is a fix where there is a position. In samples satellites that are
+    not known are -1.
     """
 
     def __init__(self, t: Array, lat: Array, lon: Array, h: Array) -> None:
@@ -45,7 +46,7 @@ class Fixes:
         self.v_n, self.sigma_position_n, self.sigma_velocity_n = (np.full((n, 3), np.nan) for _ in range(3))
         known = np.isfinite(lat) & np.isfinite(lon) & np.isfinite(h)
         self.fix = np.where(known, int(FixType.FIX_3D), int(FixType.NO_FIX)).astype(float)
-        self.satellites, self.hdop, self.vdop = np.zeros(n), np.full(n, np.nan), np.full(n, np.nan)
+        self.satellites, self.hdop, self.vdop = (np.full(n, np.nan) for _ in range(3))
 
     def samples(self, name: str, notes: list[str] | None = None) -> list[Sample]:
         """The same as samples of the receiver ``name``; a velocity of which not all is known is none, and noted."""
@@ -65,7 +66,7 @@ class Fixes:
         return GnssSample(
             t, t, float(self.lat[k]), float(self.lon[k]), float(self.h[k]), self.v_n[k].copy(),
             _positive(self.sigma_position_n[k]), _positive(self.sigma_velocity_n[k]), FixType.FIX_3D,
-            int(np.nan_to_num(self.satellites[k])), hdop, vdop, name,
+            int(np.nan_to_num(self.satellites[k], nan=-1.0)), hdop, vdop, name,
         )  # fmt: skip
 
 

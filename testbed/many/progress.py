@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, TypeAlias
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 
 PLAIN_LINES = 10  # for the whole
 PLAIN_EVERY_S = 5.0  # wall time
-PACE_S, PACE_DONE = 2.0, 0.005  # wall time, and share of the whole, before it is said how long the rest will take
+PACE_S = 5.0  # wall time of work before it is said how long the rest will take
 
 Tell: TypeAlias = Callable[[float, str], None]
 
@@ -37,7 +39,7 @@ def shown(console: Console, title: str) -> Iterator[Tell]:
         TextColumn("{task.fields[text]}", markup=False),
     )
     with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task(title, total=1.0, text="starting; the first time, kernels are compiled")
+        task = bar.add_task(printable(title), total=1.0, text="starting; the first time, kernels are compiled")
         yield lambda fraction, text: bar.update(task, completed=fraction, text=pace.with_remaining(fraction, text))
 
 
@@ -47,20 +49,29 @@ def say(text: str) -> None:
 
 
 class _Pace:
-    """How long the rest will take, if it goes on as it has from the first that was told."""
+    """How long the rest will take, if it goes on as in the latter half of the time since the first of it was done.
+
+    To start and to compile is once, and soon forgotten so.
+    """
 
     def __init__(self) -> None:
-        self._began: tuple[float, float] | None = None  # wall time, and the fraction that was done then
+        self._told: deque[tuple[float, float]] = deque()  # wall times, and the fractions that were done then
+        self._began = 0.0, math.inf  # wall time when no more was done than at first, and the fraction then
 
     def with_remaining(self, fraction: float, text: str) -> str:
         """The text, and how long it will take, once that can be said."""
         now = time.monotonic()
-        if self._began is None:
+        if fraction <= self._began[1]:
             self._began = now, fraction
-        elapsed, done = now - self._began[0], fraction - self._began[1]
-        if elapsed < PACE_S or done < PACE_DONE or fraction >= 1.0:
+            self._told.clear()
+        self._told.append((now, fraction))
+        elapsed = now - self._began[0]
+        while self._told[0][0] < now - elapsed / 2:
+            self._told.popleft()
+        done = fraction - self._told[0][1]
+        if elapsed < PACE_S or done <= 0 or fraction >= 1.0:
             return text
-        return f"{text}  {_about(elapsed / done * (1.0 - fraction))} to go"
+        return f"{text}  {_about((now - self._told[0][0]) / done * (1.0 - fraction))} to go"
 
 
 def _about(seconds: float) -> str:

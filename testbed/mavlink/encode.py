@@ -61,6 +61,7 @@ _UNKNOWN: dict[tuple[str, str], int] = {
     ("GPS_RAW_INT", "epv"): 2**16 - 1,
     ("GPS_RAW_INT", "vel"): 2**16 - 1,
     ("GPS_RAW_INT", "cog"): 2**16 - 1,
+    ("GPS_RAW_INT", "satellites_visible"): 2**8 - 1,
     ("GPS_RAW_INT", "h_acc"): 2**32 - 1,
     ("GPS_RAW_INT", "v_acc"): 2**32 - 1,
     ("GPS_RAW_INT", "vel_acc"): 2**32 - 1,

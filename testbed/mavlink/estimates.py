@@ -108,6 +108,7 @@ def wind_cov(s: Snapshot) -> Fields | None:
     if s.wind is None or s.point is None:
         return None
     wind, sigma = s.wind
+    accuracy = root(sigma * sigma)
     return {
         "time_usec": s.usec,
         "wind_x": float(wind[0]),
@@ -116,8 +117,8 @@ def wind_cov(s: Snapshot) -> Fields | None:
         "var_horiz": math.nan,
         "var_vert": math.nan,
         "wind_alt": s.point[2],
-        "horiz_accuracy": root(sigma * sigma),
-        "vert_accuracy": 0,  # unknown
+        "horiz_accuracy": accuracy if math.isfinite(accuracy) else 0,  # unknown, as the vertical one
+        "vert_accuracy": 0,
     }
 
 

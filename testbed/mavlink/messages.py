@@ -187,7 +187,7 @@ def gps_raw_int(s: Snapshot) -> Fields | None:
             "time_usec": microseconds(sample.t) if sample else s.usec,
             "fix_type": mav.GPS_FIX_TYPE_NO_FIX,
             **dict.fromkeys(("lat", "lon", "alt", "eph", "epv", "vel", "cog", "alt_ellipsoid"), math.nan),
-            "satellites_visible": sample.satellites if sample else 0,
+            "satellites_visible": _satellites(sample) if sample else math.nan,
             **dict.fromkeys(("h_acc", "v_acc", "vel_acc"), math.nan),
             "hdg_acc": 0,
             "yaw": 0,
@@ -204,7 +204,7 @@ def gps_raw_int(s: Snapshot) -> Fields | None:
         "epv": fix.vdop * 100,
         "vel": math.hypot(north, east) * 100,
         "cog": centidegrees(math.atan2(east, north)),
-        "satellites_visible": fix.satellites,
+        "satellites_visible": _satellites(fix),
         "alt_ellipsoid": fix.h * 1e3,
         "h_acc": root(variance[:2]) * 1e3,
         "v_acc": root(variance[2:]) * 1e3,
@@ -212,6 +212,11 @@ def gps_raw_int(s: Snapshot) -> Fields | None:
         "hdg_acc": 0,
         "yaw": 0,  # not measured
     }
+
+
+def _satellites(sample: GnssSample) -> float:
+    """How many, NaN where a log does not say."""
+    return sample.satellites if sample.satellites >= 0 else math.nan
 
 
 def gnss_integrity(s: Snapshot) -> Fields | None:

@@ -361,6 +361,11 @@ class Rows:
         return self._of(lambda one: one.truth[name])
 
     @cached_property
+    def true_point(self) -> Array:
+        """True lat, lon [rad], h [m] (N, 3); a log may not know them."""
+        return np.column_stack([self.truth(name) for name in ("lat", "lon", "h")])
+
+    @cached_property
     def true_euler(self) -> Array:
         """True roll, pitch, heading (N, 3) [rad]."""
         return _euler_rows(self.truth("q_nb"))
@@ -375,8 +380,7 @@ class Rows:
     @cached_property
     def errors(self) -> dict[str, Array]:
         """Estimate less truth, and the estimator's own idea of it."""
-        true = np.column_stack([self.truth(name) for name in ("lat", "lon", "h")])
-        position = position_difference_n(*self.point.T, *true.T)
+        position = position_difference_n(*self.point.T, *self.true_point.T)
         velocity = self.v_n - self.truth("v_n")
         turn = _turns(self.q_nb, self.truth("q_nb"))
         return {

@@ -99,9 +99,9 @@ STREAMS = (
     Stream("GNSS_INTEGRITY", 1, messages.gnss_integrity, _STATUS),
     Stream("HIGHRES_IMU", 10, messages.highres_imu, _RAW, needs=()),
     Stream("SCALED_PRESSURE", 1, messages.scaled_pressure, _RAW),
-    Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE, needs=()),
-    Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE, needs=()),
-    Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE, needs=()),
+    Stream("HIL_STATE_QUATERNION", 10, estimates.hil_state_quaternion, _ATTITUDE, needs=("true_point",)),
+    Stream("SIMSTATE", 5, estimates.simstate, _ATTITUDE, needs=("true_point",)),
+    Stream("SIM_STATE", 1, estimates.sim_state, _ATTITUDE, needs=("true_point",)),
     Stream("AHRS2", OTHERS_HZ, estimates.ahrs2, _ATTITUDE, needs=("second",)),
     Stream("AHRS3", OTHERS_HZ, estimates.ahrs3, _ATTITUDE, needs=("third",)),
     *(

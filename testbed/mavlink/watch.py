@@ -122,7 +122,6 @@ class Picture:
         self._t = math.nan
         self._latest: dict[str, Any] = {}
         self._values: dict[str, float] = {}
-        self._leg = ""
         self._texts: deque[tuple[str, str]] = deque(maxlen=TEXTS)
         self._chunks: dict[int, bytes] = {}
 
@@ -159,8 +158,6 @@ class Picture:
             return None
         readable = text.decode(errors="replace")
         readable = "".join(character if character.isprintable() else " " for character in readable)
-        if readable.startswith("leg "):
-            self._leg = readable.removeprefix("leg ")
         style = "bold red" if message.severity <= mav.MAV_SEVERITY_ERROR else ""
         style = "yellow" if message.severity == mav.MAV_SEVERITY_WARNING else style
         said = f"{self._time():>8}  {readable}"
@@ -229,13 +226,12 @@ class Picture:
         return f"{mavutil.mode_string_v10(heartbeat)}, {armed}"
 
     def _progress(self) -> str:
-        """Number and name of the leg; the name is only told as it begins."""
+        """Number of the leg, and of how many; its name is only told in a text, as it begins."""
         current, heartbeat = self._latest.get("MISSION_CURRENT"), self._latest.get("HEARTBEAT")
         if current is None or heartbeat is None or not current.total:
-            return self._leg
+            return ""
         home_first = heartbeat.autopilot == mav.MAV_AUTOPILOT_ARDUPILOTMEGA
-        number = f"{current.seq + (not home_first)}/{current.total}"
-        return self._leg if self._leg.startswith(f"{number} ") else number
+        return f"{current.seq + (not home_first)}/{current.total}"
 
     def _solution(self) -> str:
         status = self._latest.get("ESTIMATOR_STATUS")

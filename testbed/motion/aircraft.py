@@ -221,7 +221,7 @@ def load(name_or_path: str) -> Envelope:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UserError(f"{file}: can't be read: {error}") from None
     except ValidationError as error:
-        raise UserError("\n".join(f"{file}: {line}" for line in _mistakes(error))) from None
+        raise UserError(*(f"{file}: {line}" for line in _mistakes(error))) from None
 
 
 def digest(name_or_path: str) -> str:

@@ -98,7 +98,7 @@ SAMPLE = {
             "flag_meanings": " ".join(f.name.lower() for f in FixType),
         },
     ),
-    "satellites": Variable("1", "satellites used, -1 where nothing was written", dtype="<i4"),
+    "satellites": Variable("1", "satellites used, -1 where nothing was written, or a log does not say", dtype="<i4"),
     "hdop": Variable("1", "horizontal dilution of precision"),
     "vdop": Variable("1", "vertical dilution of precision"),
     "pressure": Variable("Pa", "measured static pressure"),

@@ -137,7 +137,7 @@ def scenario_of(dataset: xarray.DataTree, overrides: Sequence[str] = ()) -> Scen
         if overrides:
             scenario_of(dataset)  # raises where it is the record that is not read
             raise
-        raise UserError(f"a record of {_writer(dataset)}, whose scenario is no longer read: {error}") from None
+        raise error.within(f"a record of {_writer(dataset)}, whose scenario is no longer read") from None
 
 
 def _writer(dataset: xarray.DataTree) -> str:

@@ -34,8 +34,8 @@ class Written(NamedTuple):
     folder: Path
 
 
-def report(error: ValidationError, root: type[BaseModel], written: Written) -> str:
-    """Every error on a line of its own: file, line, key path, what is wrong and what to do; ``root`` is the whole's."""
+def report(error: ValidationError, root: type[BaseModel], written: Written) -> list[str]:
+    """Every error, each a line: file, line, key path, what is wrong and what to do; ``root`` is the whole's."""
     _, text, place, set_paths, _ = written
     said: dict[KeyPath, list[str]] = {}
     misspelt: set[KeyPath] = set()
@@ -60,7 +60,7 @@ def report(error: ValidationError, root: type[BaseModel], written: Written) -> s
     told = [message for _, message in messages[:ERRORS_SHOWN]]
     if len(messages) > ERRORS_SHOWN:
         told.append(f"{place}: and {len(messages) - ERRORS_SHOWN} more")
-    return "\n".join(told)
+    return told
 
 
 def _locate(details: ErrorDetails, root: type[BaseModel], written: Written) -> tuple[KeyPath, list[type[BaseModel]]]:

@@ -142,7 +142,7 @@ def _aircraft_mistakes(named: str) -> Iterator[tuple[KeyPath, str]]:
     try:
         aircraft.load(named)
     except UserError as error:
-        yield ("truth", "aircraft"), str(error)
+        yield ("truth", "aircraft"), "; ".join(error.args)
 
 
 def _track_mistakes(truth: KinematicTruth) -> Iterator[tuple[KeyPath, str]]:

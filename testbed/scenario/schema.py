@@ -255,9 +255,8 @@ class Scenario(Section):
             folder = path.parent if path else Path()
             scenario = cls.model_validate(_frozen(data), strict=True, context={"folder": folder, **context})
         except ValidationError as error:
-            raise UserError(
-                messages.report(error, cls, messages.Written(data, text, place, set_paths, folder))
-            ) from None
+            written = messages.Written(data, text, place, set_paths, folder)
+            raise UserError(*messages.report(error, cls, written)) from None
         except RecursionError:
             raise UserError(f"{place}: tables or lists are nested too deeply") from None
         scenario._text, scenario._path, scenario._overrides = text, path, tuple(overrides)

@@ -19,6 +19,7 @@ import nav.aids
 import nav.samples
 from nav.aids.base import Measurement, OperatingPoint
 from nav.error_model import Block
+from nav.samples import Array
 from testbed import plugins
 from testbed.errors import UserError, shown
 from testbed.interrupts import INTERRUPTS
@@ -203,7 +204,7 @@ def _no_measurement(given: Any, axes: int, states: int) -> str:
         return f"{_type(given)} where a Measurement or None was expected"
     for what, value, shape in (("nu", given.nu, (axes,)), ("H", given.H, (axes, states)), ("R", given.R, (axes,))):
         try:
-            numbers = np.asarray(value, dtype=float)
+            numbers = _numbers(value)
         except (TypeError, ValueError):
             return f"{what} = {shown(value)}, which are no numbers,"
         if numbers.shape != shape:
@@ -298,7 +299,7 @@ class Guard:
         for name, of in ((field.name, field.type) for field in dataclasses.fields(sample) if field.name != "sensor"):
             value = getattr(sample, name)
             try:
-                shape = np.asarray(value, dtype=float).shape
+                shape = _numbers(value).shape
             except OverflowError:
                 return f"a sample whose {name} is an integer beyond 1.8e308: it must be a number or a list of them"
             except (TypeError, ValueError):
@@ -311,6 +312,15 @@ class Guard:
             if len(shape) > 1 or self._shapes.setdefault(name, shape) != shape:
                 return f"a sample whose {name} has shape {shape}: it must be a number, or as many in every sample"
         return ""
+
+
+def _numbers(value: Any) -> Array:
+    """A number, or an array of them. Raises TypeError or ValueError: text is none, though NumPy would read "1.5"."""
+    given = np.asarray(value)
+    ones = given.flat if given.dtype.kind == "O" else ()
+    if given.dtype.kind not in "fiubO" or any(isinstance(one, str | bytes) for one in ones):
+        raise TypeError
+    return given.astype(float)
 
 
 def _ends(truth: TruthBlock) -> float:

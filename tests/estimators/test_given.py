@@ -3,6 +3,7 @@
 import dataclasses
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -388,6 +389,14 @@ def test_a_method_that_cant_be_called_so_is_named() -> None:
 def test_who_stops_the_run_stops_it() -> None:
     with pytest.raises(KeyboardInterrupt):
         Adapter(Raising(KeyboardInterrupt()), TICK_S).listening  # noqa: B018
+
+
+def test_in_a_thread_there_is_no_interrupt_but_its_own() -> None:
+    """A campaign's worker died of it, and was said to be out of memory."""
+    adapter = Adapter(Raising(KeyboardInterrupt()), TICK_S)
+    with ThreadPoolExecutor(1) as pool:
+        assert not pool.submit(lambda: adapter.listening).result()
+    assert adapter.failure.startswith("RuntimeError: KeyboardInterrupt, where nobody interrupted (test_given.py, line")
 
 
 UNUSUAL = """

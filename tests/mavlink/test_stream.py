@@ -1,6 +1,7 @@
 """What a ground station hears: pymavlink listens, and its decoded numbers are compared with what went in."""
 
 import collections
+import dataclasses
 import math
 import socket
 import subprocess
@@ -41,6 +42,7 @@ from nav.samples import (
     UpdateReport,
 )
 from testbed import Scenario
+from testbed.feeds.samples import Fixes
 from testbed.mavlink import MavlinkPublisher
 
 
@@ -308,6 +310,34 @@ def test_gnss_with_a_fix(tmp_path):
     assert heard["GNSS_INTEGRITY"][0].jamming_state == mav.GPS_JAMMING_STATE_NOT_JAMMED
 
 
+def test_a_receiver_of_a_log_may_not_say_how_good_it_is(tmp_path):
+    """Of a table without such columns 0 satellites were told."""
+    t = np.arange(0.0, 1.0, 0.2)
+    fixes = Fixes(t, *np.full((3, len(t)), 0.5)).samples("gnss")
+    heard = log_of(tmp_path, range(6), samples=lambda now: {"gnss": fixes[int(now / 0.2)]})
+    gps = heard["GPS_RAW_INT"][1]
+    assert (gps.fix_type, gps.satellites_visible, gps.eph, gps.epv, gps.vel, gps.cog) == (3, 255, *4 * [65535])
+
+
+def test_a_place_that_a_log_does_not_know_is_not_told(tmp_path):
+    """Where its reference is silent the vehicle was told to be at latitude and longitude 0."""
+
+    def lost(t):
+        row = truth_row(t)
+        row.lat[0] = row.lon[0] = row.h[0] = math.nan
+        return row
+
+    heard = log_of(tmp_path, range(50), truth=lambda t: truth_row(t) if t < 1.0 else lost(t))
+    assert [len(heard[name]) for name in ("HIL_STATE_QUATERNION", "SIMSTATE", "SIM_STATE")] == [10, 5, 1]
+    assert len(heard["ATTITUDE"]) == 50
+
+
+def test_a_wind_may_have_no_sigma(tmp_path):
+    wind = {"wind": (np.array([4.0, -3.0]), np.full(2, math.nan))}
+    heard = log_of(tmp_path, range(6), estimate=lambda t: dataclasses.replace(estimate(t), extra=wind))
+    assert (heard["WIND_COV"][0].wind_x, heard["WIND_COV"][0].horiz_accuracy) == (4.0, 0.0)
+
+
 def denied(t):
     return samples_at(t, fix=False)
 
@@ -316,8 +346,8 @@ def silent(t):
     return samples_at(0.0) | {"barometer": BarometerSample(t, t, 90000.0)}
 
 
-@pytest.mark.parametrize("samples", [denied, silent])
-def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples):
+@pytest.mark.parametrize(("samples", "satellites"), [(denied, 0), (silent, 255)])
+def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples, satellites):
     start = 150  # six seconds in
     publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], SCENARIO)
     publish(publisher, range(start, start + 25), samples=samples)
@@ -325,7 +355,7 @@ def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples):
     heard = {message.get_type(): message for _, message in read_log(tmp_path / "run.tlog")}
     gps = heard["GPS_RAW_INT"]
     assert (gps.fix_type, gps.eph, gps.epv, gps.vel, gps.cog) == (1, 65535, 65535, 65535, 65535)
-    assert (gps.satellites_visible, gps.lat, gps.lon) == (0, 0, 0)
+    assert (gps.satellites_visible, gps.lat, gps.lon) == (satellites, 0, 0)
     status = heard["SYS_STATUS"]
     assert status.onboard_control_sensors_present & mav.MAV_SYS_STATUS_SENSOR_GPS
     assert not status.onboard_control_sensors_health & mav.MAV_SYS_STATUS_SENSOR_GPS

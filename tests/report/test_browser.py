@@ -317,3 +317,19 @@ def test_odd_runs_open_without_a_complaint(tab: Page, tmp_path: Path, made: Any)
     assert tab.run("page.panels.every((panel) => panel.view)")
     tab.key("ArrowRight")
     assert tab.complaints == []
+
+
+@pytest.mark.slow
+def test_the_map_is_grey_where_a_reference_is_silent(tab: Page, tmp_path: Path) -> None:
+    """That of a log goes with the fixes: there was no grey but in the legend."""
+    silent = synthetic_run.dataset(60.0, {"ins": Errors()}, denied=((20.0, 30.0),))
+    inside = (silent["truth/time"].values > 20.0) & (silent["truth/time"].values < 30.0)
+    for axis in ("lat", "lon", "h"):
+        silent[f"truth/{axis}"].values[inside] = np.nan
+    grey = "page.planes[0].figure.renderers.find((one) => one.glyph.line_width?.value == 11)"
+    tab.open(write(silent, tmp_path / "report.html"), WHOLE)
+    places = tab.run(f"(() => {{ const {{ x, y }} = {grey}.data_source.data; return [[...x], [...y]] }})()")
+    known = np.array([[np.nan if one is None else one for one in axis] for axis in places], float).T
+    known = known[np.isfinite(known).all(axis=1)]
+    assert len(known) >= 0.9 * inside.sum()
+    assert np.ptp(known, axis=0).max() > 1.0  # m

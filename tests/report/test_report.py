@@ -343,6 +343,22 @@ def test_a_short_track_is_in_metres(grown: float, unit: str) -> None:
     assert unit == "km" or ax.xaxis.get_major_formatter()(0.5, 0) == "500"
 
 
+def test_the_track_is_grey_where_a_reference_is_silent() -> None:
+    """That of a log goes with the fixes: the legend told of grey that was nowhere."""
+    run = synthetic_run.dataset(100.0, {"ins": Errors()}, denied=((40.0, 60.0),))
+    inside = (run["truth/time"].values > 40.0) & (run["truth/time"].values < 60.0)
+    for axis in ("lat", "lon", "h"):
+        run[f"truth/{axis}"].values[inside] = np.nan
+    figure = flight.ground_track(Run(run))
+    assert "no GNSS fix" in labels(figure)
+    [grey] = [line for line in figure.axes[0].lines if line.get_color() == style.SHADE]
+    places = np.column_stack(grey.get_data())
+    known = np.isfinite(places).all(axis=1)
+    assert known.sum() >= inside.sum()
+    steps = np.diff(places[known], axis=0)[1:-1]
+    np.testing.assert_allclose(steps, np.tile(steps.mean(axis=0), (len(steps), 1)), atol=1e-3)  # [km]
+
+
 def labels(figure: Figure | None) -> set[str]:
     """What the legend of a figure names."""
     assert figure is not None

@@ -134,7 +134,7 @@ class HeightAid:
             case "aid R0":
                 R[0] = 0.0
             case "aid text":
-                R = ["wide"]
+                R = ["1.0"]
             case "aid lists":
                 nu, H, R = [0], H.tolist(), [1]
             case "aid write":
@@ -374,7 +374,7 @@ def test_what_is_no_aid_ends_the_run_with_a_line(scenario: Path, how: str, says:
         ("aid H", "measure gave H of shape (1, 3), not (1, "),
         ("aid R", 'measure gave variances R = [-1.0], not above 0, of "radar" at '),
         ("aid R0", 'measure gave variances R = [0.0], not above 0, of "radar" at '),
-        ("aid text", "measure gave R = "),
+        ("aid text", 'measure gave R = ["1.0"], which are no numbers, of "radar" at '),
     ],
 )
 def test_what_is_no_measurement_ends_the_run_with_a_line(scenario: Path, how: str, says: str) -> None:

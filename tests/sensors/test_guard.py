@@ -144,6 +144,12 @@ def test_a_list_or_a_tuple_is_an_array(given: Any) -> None:
     ("sample", "says"),
     [
         (of([]), "a sample whose value is []: it must be a number or a list of them"),
+        (of("1.5"), 'a sample whose value is "1.5": it must be a number or a list of them'),
+        (of(["1", "2"]), 'a sample whose value is ["1", "2"]: it must be a number'),
+        (of([1.0, "2"]), 'a sample whose value is [1.0, "2"]: it must be a number'),
+        (of(np.array(["1", 2], dtype=object)), "a sample whose value is \"['1' 2]\": it must be a number"),
+        (of(b"1"), "a sample whose value is \"b'1'\": it must be a number"),
+        (of(np.datetime64("2020-01-01", "s")), 'a sample whose value is "2020-01-01T00:00:00": it must be'),
         (of(10**400), "a sample whose value is an integer beyond 1.8e308: it must be a number"),
         (of([10**5000]), "a sample whose value is an integer beyond 1.8e308: it must be a number"),
         (of(1.0, "time"), "a sample with a field time, which the record has already: give it another name"),

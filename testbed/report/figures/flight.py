@@ -75,7 +75,7 @@ def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> Non
         fixes = run.track(*(column(run.dataset, f"sensors/{name}/{axis}") for axis in ("lat", "lon")))
         ax.plot(fixes[:, 1], fixes[:, 0], ".", color=GUIDE, ms=2, label=f"{name}, as used", zorder=1)
     if denied.any():
-        gap = np.where(denied[:, None], truth, np.nan)
+        gap = np.where(denied[:, None], _bridged(run.t, truth), np.nan)
         wide = 12 if believed else 7
         ax.plot(gap[:, 1], gap[:, 0], color=SHADE, lw=wide, solid_capstyle="round", zorder=0)
     for rank, (name, points) in enumerate(believed.items()):
@@ -83,6 +83,13 @@ def _tracks(run: Run, ax: Axes, truth: Array, believed: dict[str, Array]) -> Non
     known = truth[np.isfinite(truth).all(axis=1)]
     ax.plot(known[0, 1], known[0, 0], "o", color=TRUTH, ms=7, label="start", zorder=5)
     ax.plot(known[-1, 1], known[-1, 0], "s", color=TRUTH, ms=7, label="end", zorder=5)
+
+
+def _bridged(t: Array, truth: Array) -> Array:
+    """The same, straight on between places where the reference is silent, as that of a log is without fixes."""
+    known = np.isfinite(truth).all(axis=1)
+    axes = (np.interp(t, t[known], axis[known], left=np.nan, right=np.nan) for axis in truth.T)
+    return np.column_stack([*axes])
 
 
 def _distances(ax: Axes) -> str:
@@ -156,7 +163,8 @@ PLOTS = (
     Plot(
         "ground_track",
         "Ground track. Thin black line: truth, drawn over all else; coloured lines: where each estimator thought it"
-        " was, wider below narrower so that none hides another. Wide grey line: no GNSS fix.",
+        " was, wider below narrower so that none hides another. Wide grey line: no GNSS fix, straight on where truth is"
+        " not known either.",
         ground_track,
         timed=False,
     ),

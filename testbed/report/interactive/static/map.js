@@ -20,6 +20,18 @@ function ellipse([nn, ne, ee], x, y, sigmas) {
   return corners;
 }
 
+/** The same values, straight on between those that are known: a log knows none while its reference is silent. */
+function bridged(t, values) {
+  const known = [...values.keys()].filter((k) => Number.isFinite(values[k]));
+  let next = 0; // of those that are known
+  return Array.from(values, (value, k) => {
+    while (known[next] < k) next += 1;
+    const [before, after] = [known[next - 1], known[next]];
+    if (after == k || before == undefined || after == undefined) return value;
+    return values[before] + ((values[after] - values[before]) * (t[k] - t[before])) / (t[after] - t[before]);
+  });
+}
+
 /** A square view of places; ranges are set so that a metre is as long in both directions. */
 class Plane {
   constructor(place, name, x_axis_label, y_axis_label) {
@@ -144,7 +156,7 @@ class Chart extends Plane {
     const inside = (at) => PAGE.windows.some(([start, end]) => at >= start && at < end);
     const renderer = this.line(-2, () => {
       const { t, n, e } = this.truths[0];
-      const cut = (values) => values.map((value, k) => (inside(t[k]) ? value : NaN));
+      const cut = (values) => bridged(t, values).map((value, k) => (inside(t[k]) ? value : NaN));
       return { x: cut(e), y: cut(n) };
     }, { line_width: 11, line_cap: "round", line_color: "#DDDDDD" });
     this.themed.push(() => renderer.glyph.setv({ line_color: colours().denied }));
