@@ -28,7 +28,7 @@ from testbed.feeds.log import Log, Reference, Samples, at_pace, beginning, requi
 from testbed.feeds.reference import is_flown
 from testbed.feeds.rest import refusal
 from testbed.feeds.samples import Fixes, airspeeds, barometers, magnetometers, quaternions, spread
-from testbed.feeds.stamps import integrated, joined, ordered, pace
+from testbed.feeds.stamps import Course, in_parts, integrated, joined, left_out, ordered, pace
 from testbed.motion.logged import Stream
 from testbed.sensors.gnss import GPS_EPOCH, LEAPS, WEEK_S
 
@@ -54,6 +54,7 @@ TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in
 RESOLUTION_DEG = 0.02  # of logged angles, and of what is added to them
 LAST_PAGE = 528  # of a log that is written by pages, which may be empty [bytes]
 LEAST_RUNNING = 0.5  # of the log
+PLACE = "place in the file"  # as a field of each message
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
 
@@ -62,6 +63,8 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     """Read a DataFlash log. Raises UserError when it is damaged, or has no inertial data."""
     notes: list[str] = []
     messages = _messages(path, notes)
+    found = {name: len(rows) for name, rows in messages.items()}
+    messages = _of_one_boot(messages, notes)
     units = _units(messages)
     imus: dict[str, ImuSamples] = {}
     for name, rows in units.get("imu", {}).items():
@@ -69,7 +72,6 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
         imus[name] = integrated(t, _vector(rows, "Gyr", kept), _vector(rows, "Acc", kept), "averaged")
     if not imus:
         imus = _raw_units(units, notes)
-    found = {name: len(rows) for name, rows in messages.items()}
     require_imu(path, imus, found, NEEDED, notes)
     samples = _aiding(units, notes)
     solution = None
@@ -124,7 +126,7 @@ def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], in
     from pymavlink import DFReader  # type: ignore[import-untyped]
 
     found: dict[str, list[dict[str, Any]]] = {}
-    size = 0
+    size = count = 0
     wanted = {name for names in KINDS.values() for name in names} | {*SOLUTIONS, *PLACES, "PARM"}
     try:
         reader = (DFReader.DFReader_text if text else DFReader.DFReader_binary)(str(path))
@@ -132,7 +134,9 @@ def _parsed(path: Path, text: bool) -> tuple[dict[str, list[dict[str, Any]]], in
             while (message := reader.recv_msg()) is not None:
                 name = message.get_type()
                 size += getattr(message.fmt, "len", 0)
-                found.setdefault(name, []).append(_fields(message) if name in wanted else {})
+                fields = _fields(message) if name in wanted else {}
+                count += 1
+                found.setdefault(name, []).append(fields and {**fields, PLACE: count})
     except Exception as error:  # whatever a damaged file makes the reader raise
         return found, size, f"{type(error).__name__} {error}"
     return found, size, ""
@@ -144,6 +148,28 @@ def _fields(message: Any) -> dict[str, Any]:
         return {key: getattr(message, key) for key in message.get_fieldnames()}
     except (AttributeError, TypeError, ValueError, UnicodeDecodeError):
         return {}
+
+
+def _of_one_boot(messages: dict[str, list[dict[str, Any]]], notes: list[str]) -> dict[str, list[dict[str, Any]]]:
+    """The messages of the boot of which the inertial unit was heard for longest, of a file that has several.
+
+    Parameters of all are kept: they are told before the unit is heard.
+    """
+    named = (messages.get(name, []) for kind in ("imu", "gyr") for name in KINDS[kind])
+    own = next((found for one in named if (found := [fields for fields in one if fields])), [])
+    rows = _rows([one for one in own if one.get("I") == own[0].get("I")])
+    _, kept, course = in_parts("imu", _stamps(rows), [], None, Course())
+    if course.parts == 1:
+        return messages
+    first, last = rows[PLACE][kept].min(), rows[PLACE][kept].max()
+    boot = {
+        name: [one for one in every if name == "PARM" or not one or first <= one[PLACE] <= last]
+        for name, every in messages.items()
+    }
+    told = f"time goes back {course.parts - 1} times: of all sensors that is kept which is of its longest part"
+    lost = len(rows[PLACE]) - len(kept)
+    notes.append(left_out("imu", f"{told}, {lost} rows of its own are left out", lost, len(rows[PLACE])))
+    return boot
 
 
 def _units(messages: Mapping[str, list[dict[str, Any]]]) -> dict[str, dict[str, Rows]]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nav.samples import Array
-from testbed.feeds.stamps import Course, Rows, in_parts, left_out
+from testbed.feeds.stamps import Course, Mask, Rows, in_parts, left_out
 
 TOLD_S = 10.0  # by which a stream may be heard before another, and after it
 
@@ -89,14 +89,15 @@ def _turns_by_time(name: str, t: Array, course: Course, leader: Leader, notes: l
         outside = np.maximum(leader.times[0] - begins, 0) + np.maximum(ends - leader.times[-1], 0)
         if outside.min() > max((t[-1] - t[0]) / 2, TOLD_S):  # of another clock, or another time
             continue
-        near = turns[outside <= outside.min() + TOLD_S].tolist()
-        likely = [k for k in near if k >= 0] or near
+        near: Mask = outside <= outside.min() + TOLD_S
+        earlier: Mask = (turns < 0) & (begins > leader.times[0])  # none need be: an offset may have been given for that
+        likely = turns[near & ~earlier].tolist() or turns[near].tolist()
         taken = min(likely, key=abs)
         if len(likely) > 1:
             others = " or ".join(f"{(k - taken) * wrap:g}" for k in likely if k != taken)
             told = f"its clock begins anew after {wrap:g} s, how often before it was heard is not known"
             notes.append(
-                left_out(name, f"{told}: if it is early its time needs an offset of {others} s", len(t), len(t))
+                left_out(name, f"{told}: if it is early or late its time needs an offset of {others} s", len(t), len(t))
             )
         elif taken:
             first = name if taken > 0 else leader.name

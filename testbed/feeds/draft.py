@@ -63,8 +63,8 @@ def sections(found: Survey) -> dict[str, dict[str, Any]]:
         match own[0]:
             case GnssSample():
                 keys = {"kind": "gnss", **_receiver_keys(own, receiver), **keys}
-                if name in found.latency_s and not log.valid_times:
-                    keys |= _lateness(found.latency_s[name], found.velocity_lag_s.get(name, 0.0))
+                if name in found.latency and not log.valid_times:
+                    keys |= _lateness(found.latency[name].s, found.velocity_lag_s.get(name, 0.0))
                 elif log.format == TABLE and not log.valid_times:
                     keys |= {"latency_s": 0.0, **UNSURE}  # mostly times of fixes, in a table that tools have written
             case MagnetometerSample():

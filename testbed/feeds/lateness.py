@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from nav._jit import njit
 from nav.earth import gravity, radii
@@ -22,15 +23,32 @@ from testbed.sensors import SensorConfig
 from testbed.sensors.gnss import GRADES, GnssConfig
 from testbed.sensors.imu import ImuConfig
 
-LAGS = np.arange(0.0, 0.61, 0.01)  # of GNSS that are tried [s],
+LAGS = np.arange(-0.2, 0.605, 0.01)  # of GNSS that are tried [s], some less than there can be, for the way about 0,
 FURTHER = np.append(0.0, np.arange(0.6, 3.01, 0.02))  # and where the last of these fits best: a clock is off then
-CLEARER = 25.0  # must its likelihood be than that of none, twice the logarithm, to believe in one: 5 sigma
+CLEARER = 25.0  # must one fit than none to believe in it, in sigmas squared: 5,
+CLEAREST = 40.0  # and the best of all lags, as of noise alone one of many fits well
 USUAL_S = min(one["latency_s"] for one in GRADES.values() if "latency_s" in one)  # of a receiver: the least of grades
-LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # [s], -, [m]
+LAG_S, FIT_ROUNDS, TINY = 1.0, 5, 1e-9  # over which changes are summed [s], -, [m]
+BOWL_S = 0.2  # to either side of the best lag, of the parabola that has the least misfit where it has its vertex
+APART, LEAST_PARTS = 4, 5  # `LAG_S` that a part of a flight lasts, so that parts know nothing of each other; of these
+KNOWN_S = 0.05  # sigma of a latency that is believed: a filter that is told 0.1 s finds the rest better itself
+SHOWN_S = 0.01  # the least that is said of it: flights do not tell more, whatever the scatter
 NEAR = 10  # lags to either side, of which one is the least
 ALIKE = 5  # lags that both halves of a flight may be from the whole
 OUTLYING = 6.0  # times the median of what does not fit: 4 sigma
 LEAST_FIXES = 60
+
+
+class Late(NamedTuple):
+    """How late a receiver's velocities are, and one sigma of that [s]."""
+
+    s: float
+    sigma: float
+
+    @property
+    def text(self) -> str:
+        """Both to what is known."""
+        return f"{self.s:.2f} ± {max(self.sigma, SHOWN_S):.2f} s"
 
 
 def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
@@ -41,7 +59,7 @@ def fixes(own: Sequence[Any]) -> tuple[Array, Array, Array]:
     return t, v_n, np.array([(one.lat, one.lon, one.h) for one in found]).reshape(-1, 3)
 
 
-def late_by_imu(log: Log, name: str, own: Sequence[Any], sections: Mapping[str, SensorConfig]) -> float | None:
+def late_by_imu(log: Log, name: str, own: Sequence[Any], sections: Mapping[str, SensorConfig]) -> Late | None:
     """`latency` of the samples ``own`` of a receiver by a log's unit, with what ``sections`` tell of both."""
     receiver, mounted = sections.get(name), sections.get(log.unit)
     arm_s, told = np.zeros(3), USUAL_S
@@ -78,72 +96,133 @@ def _swung(imu: ImuSamples, arm_s: Array) -> Array:
     return np.cross(0.5 * (np.vstack([rates[:1], rates]) + np.vstack([rates, rates[-1:]])), arm_s)
 
 
-def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USUAL_S) -> float | None:
-    """How much later than the motion a receiver's velocity is told of [s]; None where the flight does not show it.
+def latency(imu: ImuSamples, own: Sequence[Any], arm_s: Array, told: float = USUAL_S) -> Late | None:
+    """How much later than the motion a receiver's velocity is told of; None where the flight does not show it.
 
-    Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. What fits best is believed if it fits clearly
-    better than 0; or, where both halves of the flight agree, than what is ``told`` [s], which is taken off where
-    nothing is known. The lag next to 0 is 0, and that is believed too if it fits clearly better than what a grade has.
+    Its antenna is ``arm_s`` (3,) [m] from the unit, in the unit's axes. What fits best is believed if it is known to
+    `KNOWN_S` and fits clearly better than 0; or, where both halves of the flight agree, than what is ``told`` [s],
+    which is taken off where nothing is known. About 0 it is believed too if 0 fits clearly better than a grade's.
     """
-    costs, weight = _misfits(imu, own, arm_s, LAGS)
-    if not len(costs):
-        return None
-
-    def clearer(one: int, other: int) -> bool:
-        found = weight * math.log(costs[other] / costs[one]) if costs[one] else math.inf
-        return bool(found > CLEARER)
-
-    best, lags = int(np.argmin(costs)), LAGS
+    lags, misfits = LAGS, _misfits(imu, own, arm_s, LAGS)
+    best = misfits.best(LAGS) if misfits else 0
     if best == len(LAGS) - 1:
-        lags, (costs, weight) = FURTHER, _misfits(imu, own, arm_s, FURTHER)
-        best = int(np.argmin(costs)) if len(costs) else 0
+        lags, misfits = FURTHER, _misfits(imu, own, arm_s, FURTHER)
+        best = misfits.best(FURTHER) if misfits else 0
+    fit = misfits.fit(lags, best) if misfits else None
+    if fit is None:
+        return None
+    if lags is FURTHER:
         # Who swings to and fro moves as well a swing later: the first that is no worse.
+        costs = fit.costs
         least = [k for k in range(1, best) if costs[k] <= min(costs[max(k - NEAR, 0) : k + NEAR])]
-        best = next((k for k in least if not clearer(best, k)), best)
-    if 0 < best < len(lags) - 1 and clearer(best, 0):
-        return float(lags[best])
+        best = next((k for k in least if not fit.clearer(best, k)), best)
+        fit = misfits.fit(lags, best) if misfits else None
+    if fit is None or fit.late.sigma > KNOWN_S:
+        return None
+    none = _nearest(lags, 0.0)
+    if none < best < len(lags) - 1 and fit.clearer(best, none):
+        return fit.late
     if lags is FURTHER:
         return None
-    otherwise = [int(np.argmin(np.abs(LAGS - one))) for one in (told, USUAL_S)]
-    if best <= 1:
-        return 0.0 if any(clearer(0, one) for one in otherwise) else None
-    return float(LAGS[best]) if clearer(best, otherwise[0]) and _is_steady(imu, own, arm_s, best) else None
+    otherwise = [_nearest(LAGS, one) for one in (told, USUAL_S)]
+    if best <= none + 1:
+        return fit.late if any(fit.clearer(none, one) for one in otherwise) else None
+    return fit.late if fit.clearer(best, otherwise[0]) and _is_steady(imu, own, arm_s, best) else None
+
+
+def _nearest(lags: Array, one: float) -> int:
+    return int(np.argmin(np.abs(lags - one)))
 
 
 def _is_steady(imu: ImuSamples, own: Sequence[Any], arm_s: Array, best: int) -> bool:
     """Whether each half of the flight has its least misfit near the ``best`` of the lags: noise has it anywhere."""
-    halves = (_misfits(imu, half, arm_s, LAGS)[0] for half in (own[: len(own) // 2], own[len(own) // 2 :]))
-    return all(len(costs) and abs(int(np.argmin(costs)) - best) <= ALIKE for costs in halves)
+    halves = (_misfits(imu, half, arm_s, LAGS) for half in (own[: len(own) // 2], own[len(own) // 2 :]))
+    return all(one is not None and abs(one.best(LAGS) - best) <= ALIKE for one in halves)
 
 
-def _misfits(imu: ImuSamples, own: Sequence[Any], arm_s: Array, lags: Array) -> tuple[list[float], int]:
-    """How badly velocities fit what was felt so much earlier, for each of the ``lags`` (K,) [s], none if too few do.
+class _Fit(NamedTuple):
+    """The latency of the least misfit, the ``costs`` (K,) of all lags, and what of these one sigma makes."""
 
-    And twice the number of steps between fixes that this is the root mean square of.
+    late: Late
+    costs: Array
+    scale: float
+
+    def clearer(self, one: int, other: int) -> bool:
+        """Whether ``one`` lag fits clearly better than the ``other``."""
+        return bool(self.costs[other] - self.costs[one] > CLEAREST * self.scale)
+
+
+class _Misfits(NamedTuple):
+    """How badly velocities fit what was felt so much earlier: squares (K, N) of K lags and N changes of velocity.
+
+    Of which ``together`` have a part of their time in common, and so of their noise.
+    """
+
+    squares: Array
+    together: int
+
+    def best(self, lags: Array) -> int:
+        """Which of the ``lags`` (K,), of those that can be, has the least mean."""
+        return int(np.argmin(np.where(lags >= -TINY, self.squares.mean(axis=1), math.inf)))
+
+    def fit(self, lags: Array, best: int) -> _Fit | None:
+        """The parabola through the mean squares about the ``best`` of the ``lags`` (K,); None without a vertex there.
+
+        That is off by what the slope there is off by, over twice the curvature. The slope is a mean over all changes,
+        of which each has what noise of the unit, which moves with the lag, and of the receiver make of it: how far that
+        is off is known by how sums over parts of the flight scatter. Over so many lags what moves is small.
+        """
+        near = np.abs(lags - lags[best]) < BOWL_S + SHOWN_S / 2
+        curvature, slope, _ = np.linalg.pinv(np.vander(lags[near] - lags[best], 3))
+        squares, costs = self.squares[near], self.squares.mean(axis=1)
+        parts = np.arange(0, squares.shape[1], APART * self.together)
+        bent = float(curvature @ costs[near])
+        if bent <= 0 or len(parts) < LEAST_PARTS:
+            return None
+        off = -float(slope @ costs[near]) / (2 * bent)
+        slopes = np.add.reduceat((2 * off * curvature + slope) @ squares, parts)
+        sigma = math.sqrt(len(parts) * float(np.var(slopes, ddof=1))) / squares.shape[1] / (2 * bent)
+        late = Late(max(float(lags[best]) + off, 0.0), sigma)
+        return _Fit(late, costs, bent * sigma**2) if abs(off) < BOWL_S else None
+
+
+def _misfits(imu: ImuSamples, own: Sequence[Any], arm_s: Array, lags: Array) -> _Misfits | None:
+    """Those of changes over `LAG_S` each for each of the ``lags`` (K,) [s], None if there are too few of them.
+
+    Over so long noise of an inertial unit that vibrates is small beside what it is moved by, and over one step of a
+    receiver it may not be.
     """
     t, v_n, place = fixes(own)
     known = np.isfinite(v_n).all(axis=1) & np.isfinite(place).all(axis=1)
     t, v_n, place = t[known], v_n[known], place[known]
     if len(t) < LEAST_FIXES:
-        return [], 0
+        return None
+    n, whole = _spans(t)
     gained = _gained(np.nan_to_num(imu.dtheta), np.nan_to_num(imu.dv), _swung(imu, arm_s))
     at = np.concatenate([imu.t[:1] - imu.dt[:1], imu.t])
-    step = np.diff(t)
-    g = gravity(place[:-1, 0], place[:-1, 2])
-    change = np.diff(v_n, axis=0)
-    change[:, 2] -= g * step
+    lasts = t[n:] - t[:-n]
+    change = v_n[n:] - v_n[:-n]
+    change[:, 2] -= gravity(place[:-n, 0], place[:-n, 2]) * lasts
     told = np.linalg.norm(change, axis=1)
-    steady = (step < 2 * np.median(step)) & (t[:-1] - lags[-1] > at[0]) & (t[1:] < at[-1])
+    steady = whole & (t[:-n] - lags[-1] > at[0]) & (t[n:] - lags[0] < at[-1])
     if steady.sum() < LEAST_FIXES:
-        return [], 0
-    costs = []
+        return None
+    squares = []
     for lag in lags:
         moved = np.column_stack([np.interp(t - lag, at, column) for column in gained.T])
-        felt = np.linalg.norm(np.diff(moved, axis=0), axis=1)
-        apart = ((felt - told) / step)[steady]
+        felt = np.linalg.norm(moved[n:] - moved[:-n], axis=1)
+        apart = ((felt - told) / lasts)[steady]
         apart = np.abs(apart - np.median(apart))
-        costs.append(float(np.sqrt(np.mean(np.minimum(apart, OUTLYING * np.median(apart)) ** 2))))
-    return costs, int(2 * steady.sum())
+        squares.append(np.minimum(apart, OUTLYING * np.median(apart)) ** 2)
+    return _Misfits(np.array(squares), n)
+
+
+def _spans(t: Array) -> tuple[int, npt.NDArray[np.bool_]]:
+    """How many steps of ascending times (N,) are `LAG_S`, and in which stretches of so many none is much longer."""
+    step = np.diff(t)
+    n = max(1, round(LAG_S / float(np.median(step))))
+    gaps = np.concatenate([[0], np.cumsum(step > 2 * np.median(step))])
+    return n, gaps[n:] == gaps[:-n]
 
 
 def velocity_lag(own: Sequence[Any]) -> float | None:
@@ -158,14 +237,12 @@ def velocity_lag(own: Sequence[Any]) -> float | None:
     if len(t) < LEAST_FIXES:
         return None
     step = np.diff(t)
-    n = max(1, round(LAG_S / float(np.median(step))))
+    n, whole = _spans(t)
     lat, lon, h = place.T
     R_M, R_N = radii(lat)
     east = (lon - lon[0] + math.pi) % (2 * math.pi) - math.pi
     p = np.column_stack([(lat - lat[0]) * (R_M + h), east * (R_N + h) * np.cos(lat)])
     way = np.vstack([np.zeros((1, 2)), np.cumsum(0.5 * (v[1:] + v[:-1]) * step[:, None], axis=0)])
-    gaps = np.concatenate([[0], np.cumsum(step > 2 * np.median(step))])
-    whole = gaps[n:] == gaps[:-n]
     apart, gained = (((way - p)[n:] - (way - p)[:-n])[whole], (v[n:] - v[:-n])[whole])
     if len(apart) < LEAST_FIXES or not gained.any():
         return None

@@ -16,7 +16,7 @@ from testbed.errors import UserError
 from testbed.feeds import formats
 from testbed.feeds.doubted import mounted
 from testbed.feeds.feed import Turn
-from testbed.feeds.lateness import late_by_imu, latency, velocity_lag
+from testbed.feeds.lateness import Late, late_by_imu, latency, velocity_lag
 from testbed.feeds.log import LONGEST_WAIT_S, SAMPLES, Log, Reference
 from testbed.feeds.mistaken import mistaken
 from testbed.feeds.reference import ReferenceMotion, is_flown, of_receiver, silence, with_rates
@@ -287,13 +287,15 @@ def _by_imu(solution: Reference, log: Log, sections: Mapping[str, SensorConfig])
     if not log.solution_by_utc or log.receiver is None:
         return solution
     section = sections.get(log.receiver)
-    late, by = section.latency_s if isinstance(section, GnssConfig) else 0.0, "as told"
+    late = section.latency_s if isinstance(section, GnssConfig) else 0.0
     if {"lat", "v_n"} <= set(solution.columns) and log.imus:
         rows = Fixes(solution.t, *(solution.columns[key] for key in ("lat", "lon", "h")))
         rows.v_n = solution.columns["v_n"]
         shown = latency(log.imus[log.unit], rows.samples(log.receiver), np.zeros(3), late)
-        late, by = (late, by) if shown is None else (shown, "by the IMU")
-    return replace(solution, name=f"{solution.name}, its dates {late:.2f} s late {by}", t=solution.t - late)
+        if shown is not None:
+            told = f"its dates {shown.text} late by the IMU"
+            return replace(solution, name=f"{solution.name}, {told}", t=solution.t - shown.s)
+    return replace(solution, name=f"{solution.name}, its dates {late:.2f} s late as told", t=solution.t - late)
 
 
 def _when_felt(
@@ -311,19 +313,20 @@ def _when_felt(
     if late is None:
         return _lagging(found, lag)
     shown = velocity_lag(log.samples[receiver])
-    lag = lag if shown is None else min(shown, late)
-    by = f"{late - lag:.2f} s late by the IMU" + (f", its velocities {lag:.2f} s more" if shown else "")
-    return replace(_lagging(found, lag), name=f"{found.name}, {by}", t=found.t + section.latency_s - (late - lag))
+    lag = lag if shown is None else min(shown, late.s)
+    late = Late(late.s - lag, late.sigma)
+    by = f"{late.text} late by the IMU" + (f", its velocities {lag:.2f} s more" if shown else "")
+    return replace(_lagging(found, lag), name=f"{found.name}, {by}", t=found.t + section.latency_s - late.s)
 
 
 def _later(name: str, section: Any, log: Log, sections: Mapping[str, SensorConfig]) -> str:
     """What there is to say of a receiver that is much later than it is told to be, or sooner; else nothing."""
     found = late_by_imu(log, name, log.samples[name], sections) if log.imus else None
     told = 0.0 if log.valid_times else section.latency_s + section.velocity_lag_s
-    if found is None or abs(found - told) < OTHER_CLOCK_S:
+    if found is None or abs(found.s - told) < OTHER_CLOCK_S:
         return ""
-    mends = "" if log.valid_times else f"latency_s = {max(found - section.velocity_lag_s, 0.0):.2g}, or "
-    return f"{name} is {found:.2f} s late by the IMU, and told to be {told:g}: {mends}an offset of its time mends it"
+    mends = "" if log.valid_times else f"latency_s = {max(found.s - section.velocity_lag_s, 0.0):.2g}, or "
+    return f"{name} is {found.text} late by the IMU, and told to be {told:g}: {mends}an offset of its time mends it"
 
 
 def _lagging(found: Reference, lag: float) -> Reference:

@@ -23,6 +23,7 @@ DOUBTED_M, LATE_S = 10.0, 0.5  # of a solution from its receiver: more than both
 STEPS = 3.0  # or so many of its own, where it is slower
 FAR_M, FAR = 10.0, 10.0  # that a fix may be off by and count, or so many times the usual
 BACK = 0.2  # of the way there, by which the way back may miss
+SIDE_BY_SIDE = 2  # that may be far off together
 KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
 
 
@@ -183,20 +184,31 @@ def silence(reference: Reference, first: float, last: float) -> str:
 def strays(fixes: Sequence[GnssSample]) -> npt.NDArray[np.bool_]:
     """Which fixes (N,) are far from the one before and from the one after, while those two agree.
 
-    That is by how far each step is from what velocities say of it, or from nothing where there are none.
+    That is by how far each step is from what velocities say of it, or from nothing where there are none. Where they
+    say it, two side by side are found too: without them a vehicle that hovers may have gone there and back.
     """
     found = np.zeros(len(fixes), bool)
     if len(fixes) < 3:
         return found
     t, lat, lon, h = np.array([(one.t, one.lat, one.lon, one.h) for one in fixes]).T
     v_n = np.array([one.v_n for one in fixes])
-    said = 0.5 * (v_n[1:] + v_n[:-1]) * np.diff(t)[:, None]
-    off = position_difference_n(lat[1:], lon[1:], h[1:], lat[:-1], lon[:-1], h[:-1])
-    off -= np.where(np.isfinite(said), said, 0.0)
-    far = np.linalg.norm(off, axis=1)
-    least = np.minimum(far[1:], far[:-1])
-    back = np.linalg.norm(off[1:] + off[:-1], axis=1)
-    found[1:-1] = (least > max(FAR_M, FAR * float(np.median(far)))) & (back < BACK * least)
+
+    def off(steps: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """How far each fix is from where the one so many before it, and both velocities, say [m]; if these are told."""
+        said = 0.5 * (v_n[steps:] + v_n[:-steps]) * (t[steps:] - t[:-steps])[:, None]
+        gone = position_difference_n(lat[steps:], lon[steps:], h[steps:], lat[:-steps], lon[:-steps], h[:-steps])
+        gone -= np.where(np.isfinite(said), said, 0.0)
+        return np.asarray(np.linalg.norm(gone, axis=1)), np.asarray(np.isfinite(said).all(axis=1))
+
+    far, told = off(1)
+    most = max(FAR_M, FAR * float(np.median(far)))
+    for count in range(1, min(SIDE_BY_SIDE, len(fixes) - 2) + 1):
+        least = np.minimum(far[:-count], far[count:])
+        astray = (least > most) & (off(count + 1)[0] < BACK * least)
+        if count > 1:
+            astray &= told[:-count] & told[count:]
+        for k in range(count):
+            found[1 + k : 1 + k + len(astray)] |= astray
     return found
 
 

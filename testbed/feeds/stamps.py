@@ -15,6 +15,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from nav.samples import Array, ImuSamples
 
@@ -225,8 +226,8 @@ def _parts(t: Array) -> list[int]:
     newest = np.maximum.accumulate(t)
     behind = t < np.concatenate([np.full(STRAY, -np.inf), newest[:-STRAY]])
     behind &= t < newest - GAP_S  # not a burst that came late
-    begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0)).tolist()
-    return [0, *(k for k in begins if not _is_shuffled(t, k, float(newest[k]))), len(t)]
+    begins = np.flatnonzero(behind & (np.diff(t, prepend=t[0]) < 0))
+    return [0, *begins[~_are_shuffled(t, begins, newest[begins])].tolist(), len(t)]
 
 
 def _kept(edges: list[int], leader: Course) -> int:
@@ -236,14 +237,17 @@ def _kept(edges: list[int], leader: Course) -> int:
     return max(range(len(edges) - 1), key=lambda k: edges[k + 1] - edges[k])
 
 
-def _is_shuffled(t: Array, row: int, newest: float) -> bool:
-    """Whether rows about one that is behind the ``newest`` time before it are in disorder, and one after it is newer.
+def _are_shuffled(t: Array, rows: Rows, newest: Array) -> Mask:
+    """Whether what is about ``rows`` (M,) behind the ``newest`` times (M,) before them is in disorder, and newer after.
 
     Of a clock that was set back there are twice as many rows in the time that it goes through again.
     """
-    about = t[max(row - 2 * STRAY, 0) : row + 2 * STRAY + 1]
-    again = np.count_nonzero((about >= t[row]) & (about <= newest))
-    return bool(about[min(row, 2 * STRAY) :].max() >= newest and again <= 1.5 * (newest - t[row]) / _usual(t) + 2)
+    near = 2 * STRAY
+    about = sliding_window_view(np.pad(t, near, constant_values=np.nan), 2 * near + 1)[rows]
+    again = np.count_nonzero((about >= t[rows, None]) & (about <= newest[:, None]), axis=1)
+    goes_on = (about[:, near:] >= newest[:, None]).any(axis=1)
+    shuffled: Mask = goes_on & (again <= 1.5 * (newest - t[rows]) / _usual(t) + 2)
+    return shuffled
 
 
 def _of_one_clock(t: Array, heard: tuple[float, float] | None) -> Mask:

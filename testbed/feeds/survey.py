@@ -13,7 +13,7 @@ import numpy as np
 from nav.earth import SEA_LEVEL_DENSITY, gravity, isa_density, position_difference_n
 from nav.samples import AirspeedSample, Array, GnssSample, ImuSamples, MagnetometerSample
 from testbed.errors import UserError
-from testbed.feeds.lateness import LEAST_FIXES, fixes, late_by_imu, velocity_lag
+from testbed.feeds.lateness import LEAST_FIXES, Late, fixes, late_by_imu, velocity_lag
 from testbed.feeds.log import Log
 from testbed.feeds.rest import REST_SPEED, WINDOW_S, is_still
 from testbed.feeds.stamps import GAP_PERIODS, GAP_S
@@ -106,7 +106,7 @@ class Survey:
     phases: Sequence[Phase]
     noise: Mapping[str, Noise]
     vibration: Mapping[str, Vibration]
-    latency_s: Mapping[str, float]  # of velocities
+    latency: Mapping[str, Late]  # of velocities
     velocity_lag_s: Mapping[str, float]  # by which these are older than the positions beside them
     spheres: Mapping[str, Sphere]
     airspeed_scale: Mapping[str, float]  # true airspeed over what the sensor says
@@ -132,8 +132,8 @@ def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Surv
     late, behind, spheres, scales = {}, {}, {}, {}
     for name, own in log.samples.items():
         if isinstance(own[0], GnssSample):
-            if (lag := late_by_imu(log, name, _as_told(log, own), sections or {})) is not None:
-                late[name] = lag
+            if (found_late := late_by_imu(log, name, _as_told(log, own), sections or {})) is not None:
+                late[name] = found_late
             if (lag := velocity_lag(own)) is not None:
                 behind[name] = lag
         elif isinstance(own[0], MagnetometerSample):

@@ -74,8 +74,8 @@ def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
         yield name, "vibration above 5 Hz, rms", f"{felt.rms:.3g} m/s²"
         for frequency, amplitude in felt.lines:
             yield name, "line of the spectrum", f"{frequency:.1f} Hz, {amplitude:.3g} m/s²"
-    for name, lag in found.latency_s.items():
-        yield name, "velocity is told of later than the motion by", f"{lag:.2f} s"
+    for name, late in found.latency.items():
+        yield name, "velocity is told of later than the motion by", late.text
     for name, lag in found.velocity_lag_s.items():
         yield name, "velocity is older than the position beside it by", f"{lag:.2f} s"
     for name, sphere in found.spheres.items():

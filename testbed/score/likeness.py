@@ -25,7 +25,7 @@ ROUNDING = 1e-9
 BANDS_HZ = (0.5, 2.0, 8.0, 32.0, 128.0)
 RECORD = "run.nc"
 LEAST_INNOVATIONS = 30
-LAG_SLACK_S = 0.015  # a step of the lags that are tried, and as much as rounds to it
+LAG_SLACK_S = 0.015  # and what is not known of both
 
 
 class Row(NamedTuple):
@@ -92,7 +92,10 @@ def _sensor(name: str, *both: Survey) -> Iterator[Row]:
     if name in both[0].log.imus:
         yield from _inertial(name, *both)
     for what, unit, tables, scale, slack in (
-        ("velocity is told of later by", "s", [one.latency_s for one in both], 1.0, LAG_SLACK_S),
+        (
+            "velocity is told of later by", "s", [{key: late.s for key, late in one.latency.items()} for one in both],
+            1.0, LAG_SLACK_S + sum(one.latency[name].sigma for one in both if name in one.latency),
+        ),
         ("true airspeed over the sensor's", "", [one.airspeed_scale for one in both], 1.0, 0.0),
         (
             "rms from the sphere that fits", "µT",

@@ -6,8 +6,9 @@ variances that there can't be is judged by its errors alone where it does, and t
 The normalised innovation squared of n samples with m components each is, summed, chi-square with n m degrees of freedom
 if the filter's model is right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation,
 2001, 5.4). No model of ours is exactly right, and in 10 000 samples one hundredth too much would show: what is told is
-beyond `FAR` too. Below 1 nothing is told: who expects more noise than there is, gusts above all, loses accuracy and
-misleads nobody.
+beyond `FAR` too. A single sample that is wildly wrong, which a gate refuses, says nothing of the filter: each counts as
+no more than one in a thousand should have. Those refused count, or who refuses most would seem sound. Below 1 nothing
+is told: who expects more noise than there is, gusts above all, loses accuracy and misleads nobody.
 """
 
 from __future__ import annotations
@@ -204,9 +205,12 @@ def _overconfident(dataset: xarray.DataTree, metrics: Mapping[str, float], names
             degrees = len(nis) * looks.components
             if not degrees:
                 continue
-            mean, bound = float(nis.sum()) / degrees, chi_square_threshold(1.0 - CONFIDENCE, degrees) / degrees
+            most = chi_square_threshold(1.0 - CONFIDENCE, looks.components)
+            mean = float(np.minimum(nis, most).sum()) / degrees
+            bound = chi_square_threshold(1.0 - CONFIDENCE, degrees) / degrees
             if mean > max(FAR, bound):
                 yield (
-                    f"{name} is too sure of {aid}: the mean NIS is {mean:.3g} per degree of freedom, where up to "
-                    f"{bound:.3g} would fit; its noise is larger, or the model worse, than the filter is told"
+                    f"{name} is too sure of {aid}: the mean NIS is {mean:.3g} per degree of freedom, none counted for "
+                    f"more than {most / looks.components:.3g}, where up to {bound:.3g} would fit; its noise is larger, "
+                    f"or the model worse, than the filter is told"
                 )

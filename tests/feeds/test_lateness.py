@@ -122,7 +122,7 @@ def test_a_draft_says_both_and_is_judged_by_where_the_receiver_was(tmp_path):
     flown = run(scenario)
     assert "its velocities 0.20 s more" in flown.dataset.attrs["reference"]
     # Was 2.2 m: the reference was where the receiver had been 0.2 s before.
-    assert flown.metrics["ins.position_horizontal_rms_m"] < 0.3
+    assert flown.metrics["ins.position_horizontal_rms_m"] < 0.4
     assert flown.metrics["ins.velocity_rms_mps"] < 0.3
 
 
@@ -154,7 +154,7 @@ def test_a_claim_that_is_missing_hides_no_others():
 def test_a_receiver_of_another_clock_is_found_and_told(late, tmp_path):
     """Nothing was found, and nothing said but that noise is larger than is told."""
     flown = run(table(tmp_path, lag=0.0, late=late).changed({"sensors.gnss.grade": "rtk"}))
-    (found,) = re.findall(r"gnss is ([\d.]+) s late by the IMU, and told to be 0.1:", " ".join(flown.remarks))
+    (found,) = re.findall(r"gnss is ([\d.]+) ± 0.01 s late by the IMU, and told to be 0.1:", " ".join(flown.remarks))
     assert float(found) == pytest.approx(late, abs=0.03)
     scenario = drafted(tmp_path, lag=0.0, late=late)
     assert scenario.sensors["gnss"].latency_s == pytest.approx(late, abs=0.03)

@@ -88,6 +88,24 @@ def test_a_fix_far_from_both_its_neighbours_is_no_reference(at: int, velocities:
     assert "but for 1 far" in found.name
 
 
+@pytest.mark.parametrize("at", [1, 30, 57])
+@pytest.mark.parametrize("second", [2000.0, -700.0, 2500.0])
+def test_two_side_by_side_are_no_reference(at: int, second: float) -> None:
+    """Both stayed, where either alone was left out."""
+    own = fixes(*circle(0.2), 0.2)
+    north, east = circle(0.2)
+    north[at], north[at + 1] = north[at] + 2000.0, north[at + 1] + second
+    own[at : at + 2] = fixes(north, east, 0.2)[at : at + 2]
+    assert np.flatnonzero(strays(own)).tolist() == [at, at + 1]
+
+
+def test_there_and_back_from_a_hover_is_flown() -> None:
+    """Without velocities nothing says that two fixes 15 m away, of a receiver of 1 Hz, are astray."""
+    north = np.random.default_rng(1).normal(0.0, 0.3, 60)
+    north[30:32] += 15.0
+    assert not strays(fixes(north, 0 * north, 1.0, velocities=False)).any()
+
+
 @pytest.mark.parametrize("velocities", [True, False])
 @pytest.mark.parametrize("step", [0.2, 1.0, 5.0, 7.5])
 def test_no_fix_of_a_sound_flight_is_left_out(step: float, velocities: bool) -> None:

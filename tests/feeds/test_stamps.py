@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -175,6 +177,15 @@ def test_rows_that_are_shuffled_are_put_in_order() -> None:
     assert np.array_equal(t, stamps)
     assert np.array_equal(order[rows], np.arange(len(order)))
     assert len(notes) == 1
+
+
+def test_many_rows_in_disorder_take_no_minutes() -> None:
+    """The usual step of all rows was found again for each: 35 s, and minutes of 200 000 rows."""
+    rows = np.arange(60_000)
+    stamps = 0.01 * rows[np.argsort(rows + np.random.default_rng(1).uniform(0, 60, len(rows)))]
+    begins = time.process_time()
+    ordered("imu", stamps, [])
+    assert time.process_time() - begins < 5.0
 
 
 @pytest.mark.parametrize(("rate_hz", "back_s"), [(1.0, 10.0), (1.0, 12.0), (0.5, 20.0), (10.0, 1.0)])

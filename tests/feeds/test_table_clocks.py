@@ -121,6 +121,17 @@ def test_a_counter_that_is_short_is_told_where_turns_are_not_known(tmp_path: Pat
     assert not any(isinstance(note, Loss) for note in log.notes)
 
 
+def test_who_is_heard_a_turn_before_the_unit_is_told(tmp_path: Path) -> None:
+    """Nothing was said, and the receiver was 65 s late: it and the unit end together, or begin together."""
+    t, gt = 70 + np.arange(1, 20_001) / 100, np.arange(271.0)
+    table = unit(t % 65.536) | fixes(gt % 65.536) | {"h": gt}
+    (told_of,) = [note for note in told(read(tmp_path, table, gnss=FIXES), "gnss") if isinstance(note, Loss)]
+    assert told_of.endswith("if it is early or late its time needs an offset of -65.536 s")
+    log = read(tmp_path, table, gnss={**FIXES, "time": {"column": "gt", "offset": -65.536}})
+    first = log.imus["imu"].t[0] - t[0]
+    assert [one.t - one.h for one in log.samples["gnss"]] == pytest.approx(np.full(271, first))
+
+
 def test_turns_of_one_time_column_are_counted_by_its_rows(tmp_path: Path) -> None:
     t = np.arange(1, 20_001) / 100
     table = unit(t % 65.536) | fixes(t)

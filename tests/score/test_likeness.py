@@ -14,6 +14,7 @@ from scipy import integrate
 import testbed.__main__ as cli
 from nav.samples import FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
+from testbed.feeds.lateness import Late
 from testbed.feeds.log import Log
 from testbed.feeds.survey import survey
 from testbed.report.log import beside
@@ -79,7 +80,7 @@ def test_of_what_a_unit_can_not_feel_nothing_is_said() -> None:
 
 def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None:
     flight = survey(toy(2.0))
-    late = replace(flight, latency_s={"gnss": 0.2})
+    late = replace(flight, latency={"gnss": Late(0.2, 0.0)})
     row = found(likeness.compare(late, flight), "velocity is told of later by")
     assert row.flight == 0.2
     assert math.isnan(row.simulation)
@@ -89,10 +90,12 @@ def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None
 
 @pytest.mark.parametrize(("lag", "alike"), [(0.01, True), (0.2, False)])
 def test_a_receiver_that_is_not_late_is_compared_like_any(lag: float, alike: bool) -> None:
-    flight = replace(survey(toy(2.0)), latency_s={"gnss": 0.0})
-    row = found(likeness.compare(flight, replace(flight, latency_s={"gnss": lag})), "velocity is told of later by")
+    flight = replace(survey(toy(2.0)), latency={"gnss": Late(0.0, 0.0)})
+    row = found(
+        likeness.compare(flight, replace(flight, latency={"gnss": Late(lag, 0.0)})), "velocity is told of later by"
+    )
     assert row.alike == alike
-    only = found(likeness.compare(flight, replace(flight, latency_s={})), row.what)
+    only = found(likeness.compare(flight, replace(flight, latency={})), row.what)
     assert not only.alike
     assert math.isnan(only.ratio)
 

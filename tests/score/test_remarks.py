@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from worlds import synthetic_run
 from worlds.synthetic_run import Errors, circle, scenario
 
-from nav.samples import Status
+from nav.samples import Outcome, Status
 from testbed import Scenario, run
 from testbed.record.recorder import Recorder
 from testbed.score import accuracy, metrics
@@ -115,11 +115,27 @@ def test_innovations_far_too_large_are_told_but_not_those_of_a_fault() -> None:
     nis *= 3.0
     (told,) = doubts(run, metrics.compute(run))
     settled = nis[(t >= 60.0) & ~((t >= 100.0) & (t < 130.0))]
-    bound = chi2.ppf(0.999, len(settled)) / len(settled)
+    bound, most = chi2.ppf(0.999, len(settled)) / len(settled), chi2.ppf(0.999, 1)
     assert told == (
-        f"ins is too sure of barometer: the mean NIS is {settled.mean():.3g} per degree of freedom, where up to "
-        f"{bound:.3g} would fit; its noise is larger, or the model worse, than the filter is told"
+        f"ins is too sure of barometer: the mean NIS is {np.minimum(settled, most).mean():.3g} per degree of freedom, "
+        f"none counted for more than {most:.3g}, where up to {bound:.3g} would fit; its noise is larger, or the "
+        f"model worse, than the filter is told"
     )
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize(("variance", "doubted"), [(1.0, False), (100.0, True)])
+def test_a_sample_that_is_wildly_wrong_tells_nothing_of_the_filter(variance: float, doubted: bool) -> None:
+    """One that the gate had refused made the mean 50 000, and the filter too sure; who is, by 10 sigma, is told."""
+    run = flown()
+    own = run["estimators/ins/innovations/barometer"]
+    own["nis"].values[:] = np.random.default_rng(1).chisquare(1, len(own["nis"])) * variance
+    own["nis"].values[-20] = 1e8
+    own["outcome"].values[own["nis"].values > chi2.ppf(0.9999, 1)] = Outcome.OUTSIDE_GATE
+    own["weight"].values[own["outcome"].values == Outcome.OUTSIDE_GATE] = 0.0
+    found = metrics.compute(run)
+    assert found["ins.nis_mean.barometer"] > 1e3
+    assert bool(doubts(run, found)) is doubted
 
 
 @pytest.mark.ci
