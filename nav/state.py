@@ -20,7 +20,7 @@ from nav.strapdown import step
 from nav.unscented import predict as predict_points
 from nav.unscented import remove
 
-FIXED = 70  # numbers in a `State` of any size
+FIXED = 73  # numbers in a `State` of any size
 SAME = 1e-9  # rates this close, relative, are those of one increment
 BRIDGED_RATE, BRIDGED_FORCE = 0.5, 3.0  # by which those before a gap are off in the end [rad/s, m/s^2]
 CHANGE_S = 0.2  # in which they are by half of that
@@ -48,7 +48,7 @@ class State:
     elapsed: Array  # (3,) seconds and samples since the last covariance step; seconds since a sound increment
     rates: Array  # (2, 3) angular rate and specific force of the last sound increment, as measured
     shaking: Array  # (3, 3) rate and force of the increment before; densities of their noise, and the last one's length
-    acceleration: Array  # (3,) of the IMU over ground, NED, averaged over `ACCELERATION_S` [m/s^2]
+    acceleration: Array  # (2, 3) of the IMU over ground, NED, averaged over `ACCELERATION_S`, and once more [m/s^2]
 
     def __init__(self, common: int, filters: int, n: int, whole: Array | None = None) -> None:
         self.shape = common, filters, n
@@ -61,6 +61,15 @@ class State:
     def take(self, other: State) -> None:
         """Become the same as ``other``, which has as many filters and states."""
         self.whole[:] = other.whole
+
+    def accelerated(self, before: float) -> Array:
+        """Acceleration (3,) over ground, NED [m/s^2], so many seconds ``before`` now.
+
+        The averages are as old as what they are taken over, once and twice `ACCELERATION_S`: by the line through both.
+        """
+        once, twice = self.acceleration
+        found: Array = once + (1.0 - before / ACCELERATION_S) * (once - twice)
+        return found
 
     def copy(self) -> State:
         """The same in arrays of its own."""
@@ -105,7 +114,7 @@ def parts(
         whole[:4], whole[4:7], whole[7:10], whole[FIXED:x], whole[x:P].reshape(filters, n),
         whole[P:].reshape(filters, n, n), whole[10:22].reshape(4, 3), whole[22:49].reshape(3, 3, 3),
         whole[49:52], whole[52:58].reshape(2, 3), whole[58:67].reshape(3, 3),
-        whole[67:FIXED],
+        whole[67:FIXED].reshape(2, 3),
     )  # fmt: skip
 
 
@@ -347,7 +356,8 @@ def propagate(
             step(q_nb, v_n, lla, angle, push, T)
             share = min(1.0, T / ACCELERATION_S)
             for i in range(3):
-                acceleration[i] += share * ((v_n[i] - old[i]) / T - acceleration[i])
+                acceleration[0, i] += share * ((v_n[i] - old[i]) / T - acceleration[0, i])
+                acceleration[1, i] += share * (acceleration[0, i] - acceleration[1, i])
             integrate(sums, before, q_nb, angle, push, T)
             elapsed[0] += T
             elapsed[1] += 1.0

@@ -60,10 +60,10 @@ class GnssAid:
     """A receiver by its own sigmas, of which a part may be a slowly varying error (first-order Markov, NED).
 
     A velocity older by ``velocity_lag`` than the position of the same sample, as of receivers that smooth it, is held
-    against the velocity at that time, to first order. That the acceleration which leads there is itself wrong by tilt
-    and by the accelerometers' biases is left out: 0.03 m/s for a degree and 0.2 s. It is that of some time
-    (`nav.state.ACCELERATION_S`): the noise of one increment would seem to tell a latency, and makes it smaller than it
-    is, as any noise of what is regressed upon does. Where it is known to
+    against the velocity at that time, v(t - L) = v(t) - L a(t - L / 2), which is right to second order. That the
+    acceleration which leads there is itself wrong by tilt and by the accelerometers' biases is left out: 0.03 m/s for a
+    degree and 0.2 s. It goes by averages (`nav.state.State.accelerated`): the noise of one increment would seem to tell
+    a latency, and makes it smaller than it is, as any noise of what is regressed upon does. Where it is known to
     ``latency_sigma`` only when a sample was valid, two states say by how much earlier the position was, and by how
     much more the velocity lags. The receiver's own filters make both change with each manoeuvre by as much: velocity
     times that is noise of the position beside its sigma, and acceleration times that of the velocity, where it outlasts
@@ -159,18 +159,17 @@ class GnssAid:
         unknown = NO_RATES if any(self.arm_b) and not state.rates[0].any() else None
         R = white(sample.sigma_velocity_n, self._correlated[1])
         if latency >= 0 or self.velocity_lag:
-            acceleration = state.acceleration
             lag = self.velocity_lag
             if latency >= 0:
                 lag += float(at.x[latency] + at.x[latency + 1])
-                H[:, latency] = H[:, latency + 1] = -acceleration
-                R = R + (self.latency_sigma * acceleration) ** 2
-            nu += lag * acceleration
+                H[:, latency] = H[:, latency + 1] = -state.accelerated(lag)
+                R = R + (self.latency_sigma * state.acceleration[0]) ** 2
+            nu += lag * state.accelerated(lag / 2)
         return Measurement(nu, H, R, unknown)
 
     def manoeuvre(self, state: State) -> Array:
         """The variance (3,) [m^2/s^2] that accelerating now adds to a velocity that is late by an uncertain time."""
-        return (self.latency_sigma * state.acceleration) ** 2
+        return (self.latency_sigma * state.acceleration[0]) ** 2
 
     def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
         """See `AidAtPoints`."""
