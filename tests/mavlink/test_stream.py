@@ -332,6 +332,23 @@ def test_a_place_that_a_log_does_not_know_is_not_told(tmp_path):
     assert len(heard["ATTITUDE"]) == 50
 
 
+def test_an_attitude_that_a_log_does_not_know_is_not_told(tmp_path):
+    """Of a flight without one the nose was told to point straight down, at every place."""
+
+    def unknown(t):
+        row = truth_row(t)
+        row.q_nb[0] = math.nan
+        return row
+
+    heard = log_of(tmp_path, range(25), truth=unknown)
+    for name in ("SIMSTATE", "SIM_STATE"):
+        message = heard[name][0]
+        assert np.isnan([message.roll, message.pitch, message.yaw]).all()
+        assert message.lat != 0
+    assert np.isnan(heard["HIL_STATE_QUATERNION"][0].attitude_quaternion).all()
+    assert heard["HIL_STATE_QUATERNION"][0].lat != 0
+
+
 def test_a_wind_may_have_no_sigma(tmp_path):
     wind = {"wind": (np.array([4.0, -3.0]), np.full(2, math.nan))}
     heard = log_of(tmp_path, range(6), estimate=lambda t: dataclasses.replace(estimate(t), extra=wind))
