@@ -11,15 +11,19 @@ import numpy.typing as npt
 
 from nav.columns import FusedReports
 from nav.samples import Outcome, UpdateReport
-
-REFUSED = 10  # samples of a receiver in a row, before it is held for spoofed
+from testbed.loop.events import REFUSALS
 
 
 class ShutOut(NamedTuple):
-    """The sensors that an estimator has isolated, and whose samples it has long refused."""
+    """The sensors that an estimator has isolated, and those whose samples it has refused `REFUSALS` times in a row."""
 
     isolated: frozenset[str]
     refused: frozenset[str]
+
+    @property
+    def sensors(self) -> frozenset[str]:
+        """All of them: who is not believed."""
+        return self.isolated | self.refused
 
 
 NOBODY = ShutOut(frozenset(), frozenset())
@@ -94,7 +98,7 @@ class Verdicts:
         """From this row on it is as it is now."""
         now = ShutOut(
             frozenset(sensor for sensor, _ in self._isolated),
-            frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
+            frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSALS),
         )
         if now != self._shut_out:
             shut_out += [self._shut_out] * (row - len(shut_out))

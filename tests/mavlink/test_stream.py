@@ -707,13 +707,36 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert last(heard, "GNSS_INTEGRITY", "jamming_state") == mav.GPS_JAMMING_STATE_NOT_JAMMED
     assert last(heard, "ESTIMATOR_STATUS", "flags") & mav.ESTIMATOR_GPS_GLITCH
     assert last(heard, "EKF_STATUS_REPORT", "flags") & mav.EKF_GPS_GLITCHING
-    healthy = bool(last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS)
-    assert healthy == (how is not Outcome.ISOLATED)
+    assert not last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
     assert [message.text for message in heard["STATUSTEXT"]] == ["gnss isolated"] * (how is Outcome.ISOLATED)
     heard = log_of(tmp_path, range(110), reports=reports)
     assert last(heard, "GNSS_INTEGRITY", "spoofing_state") == mav.GPS_SPOOFING_STATE_NOT_SPOOFED
     assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
     assert how is not Outcome.ISOLATED or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
+
+
+@pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE])
+@pytest.mark.parametrize(
+    ("sensor", "bit"),
+    [
+        ("airspeed", mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE),
+        ("barometer", mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE),
+        ("magnetometer", mav.MAV_SYS_STATUS_SENSOR_3D_MAG),
+    ],
+)
+def test_a_sensor_that_is_not_believed_shows_as_failed(tmp_path, sensor, bit, how):
+    """A pitot tube that stuck was refused for minutes, and healthy."""
+
+    def reports(t):
+        kind = {"weight": 0.0, "outcome": how} if 1.0 <= t < 3.0 else {"weight": 1.0, "outcome": Outcome.FUSED}
+        return [dataclasses.replace(report(t, **kind), sensor=sensor, aid=sensor)]
+
+    heard = log_of(tmp_path, range(110), reports=reports)
+    health = {round(one.onboard_control_sensors_health & bit) for one in heard["SYS_STATUS"]}
+    assert health == {0, bit}
+    heard = log_of(tmp_path, range(70), reports=reports)
+    assert not last(heard, "SYS_STATUS", "onboard_control_sensors_health") & bit
+    assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
 
 
 def test_receiver_without_fix_shows_as_jammed_not_spoofed(tmp_path):

@@ -7,7 +7,8 @@ import pytest
 
 from nav.columns import FusedReports
 from nav.samples import Outcome, UpdateReport
-from testbed.mavlink.verdicts import REFUSED, Verdicts
+from testbed.loop.events import REFUSALS
+from testbed.mavlink.verdicts import Verdicts
 
 KINDS = [
     ("gnss", "gnss_position", 3),
@@ -67,7 +68,7 @@ def one_after_the_other(found, rows):
                 refused[part] = refused.get(part, 0) + 1
             elif report.weight > 0:
                 refused[part] = 0
-        long = {sensor for (sensor, _), count in refused.items() if count >= REFUSED}
+        long = {sensor for (sensor, _), count in refused.items() if count >= REFUSALS}
         told.append((dict(ratios), {sensor for sensor, _ in isolated}, long))
     return told
 
