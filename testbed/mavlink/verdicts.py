@@ -88,7 +88,7 @@ class Verdicts:
             self._isolated.add(part)
         else:
             self._isolated.discard(part)
-        if report.outcome is Outcome.OUTSIDE_GATE:
+        if _is_refused(report):
             self._refused[part] = self._refused.get(part, 0) + 1
         elif report.weight > 0:
             self._refused.pop(part, None)
@@ -103,6 +103,15 @@ class Verdicts:
         if now != self._shut_out:
             shut_out += [self._shut_out] * (row - len(shut_out))
             self._shut_out = now
+
+
+def _is_refused(report: UpdateReport) -> bool:
+    """Whether a sample is not believed: outside the gate, or saying that it is out of range, and off by more than that.
+
+    So does a pitot tube that is blocked in flight; one that stands is out of range, and right.
+    """
+    out_of_range = report.outcome is Outcome.OUT_OF_RANGE
+    return report.outcome is Outcome.OUTSIDE_GATE or (out_of_range and report.nis > report.threshold)
 
 
 def _add(

@@ -715,7 +715,7 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert how is not Outcome.ISOLATED or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
 
 
-@pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE])
+@pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE, Outcome.OUT_OF_RANGE])
 @pytest.mark.parametrize(
     ("sensor", "bit"),
     [
@@ -737,6 +737,18 @@ def test_a_sensor_that_is_not_believed_shows_as_failed(tmp_path, sensor, bit, ho
     heard = log_of(tmp_path, range(70), reports=reports)
     assert not last(heard, "SYS_STATUS", "onboard_control_sensors_health") & bit
     assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
+
+
+def test_a_pitot_tube_at_rest_is_healthy(tmp_path):
+    """It is out of its range for as long as that takes, and as far off as any sound sensor."""
+
+    def reports(t):
+        slow = report(t, weight=0.0, outcome=Outcome.OUT_OF_RANGE)
+        return [dataclasses.replace(slow, sensor="airspeed", aid="airspeed", nis=1.0)]
+
+    heard = log_of(tmp_path, range(70), reports=reports)
+    bit = mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
+    assert all(message.onboard_control_sensors_health & bit for message in heard["SYS_STATUS"])
 
 
 def test_receiver_without_fix_shows_as_jammed_not_spoofed(tmp_path):
