@@ -207,9 +207,12 @@ def euler_from_quat(q: Array) -> Array:
     """[roll, pitch, heading] (3,) [rad] of a unit ``q_nb``: roll, heading in [-pi, pi], pitch in [-pi/2, pi/2].
 
     At pitch +-90 deg only the sum or difference of heading and roll is defined; near there both are ill-conditioned.
+    All are NaN where ``q_nb`` is.
     """
     w, x, y, z = q[0], q[1], q[2], q[3]
-    sin_pitch = min(1.0, max(-1.0, 2 * (w * y - x * z)))
+    sin_pitch = 2 * (w * y - x * z)
+    if abs(sin_pitch) > 1.0:  # by rounding
+        sin_pitch = math.copysign(1.0, sin_pitch)
     return np.array(
         [
             math.atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),

@@ -18,6 +18,7 @@ else `Adapter` stands in for them.
 from __future__ import annotations
 
 import dataclasses
+import math
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
@@ -154,13 +155,15 @@ def _options(section: CustomSection, made: Any) -> dict[str, Any]:
 class Adapter:
     """A class of three methods as an estimator of the house (`nav.horizon.Estimator`).
 
-    What it raises, or gives that can't be used, is its end: ``failure`` says why, and from there on it has no estimate.
-    It is handed copies, so that it can't change what others see. A tick lasts ``tick_s`` [s].
+    What it raises, or gives that can't be used, is its end: ``failure`` says why, and from there on it has no estimate:
+    ``ended`` [s] is the time of the first that it was asked for in vain, NaN until then. It is handed copies, so that
+    it can't change what others see. A tick lasts ``tick_s`` [s].
     """
 
     def __init__(self, inner: Any, tick_s: float) -> None:
         self.inner = inner
         self.failure = ""
+        self.ended = math.nan
         self._t = np.nan
         self._given = Given(tick_s)
 
@@ -190,11 +193,16 @@ class Adapter:
 
     def estimate(self) -> Estimate:
         """The state at its own time."""
-        return self._asked(self._estimate, None) or Estimate.of(self._t)
+        return self._asked(self._estimate, None) or self._none(self._t)
 
     def predict(self, imu: ImuSamples) -> Estimate:
         """The state after further increments: its own prediction, or its estimate carried on by the increments."""
-        return self._asked(self._predict, None, imu) or Estimate.of(float(imu.t[-1]))
+        return self._asked(self._predict, None, imu) or self._none(float(imu.t[-1]))
+
+    def _none(self, t: float) -> Estimate:
+        """In place of an estimate at ``t`` [s], of one that has ended."""
+        self.ended = float(np.fmin(self.ended, t))
+        return Estimate.of(t)
 
     def _asked(self, ask: Callable[..., T], otherwise: T, *arguments: Any) -> T:
         if self.failure:

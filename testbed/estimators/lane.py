@@ -126,6 +126,11 @@ class Lane:
         return str(getattr(self.horizon.estimator, "failure", ""))
 
     @property
+    def ended(self) -> float:
+        """From which time on it gives no estimate because of that [s], NaN while nobody has asked for one since."""
+        return float(getattr(self.horizon.estimator, "ended", math.nan))
+
+    @property
     def problem(self) -> str:
         """What its alignment waits for, of one that says so."""
         return str(getattr(self.horizon.estimator, "problem", ""))

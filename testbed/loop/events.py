@@ -16,7 +16,7 @@ from testbed.sensors.faults import FaultTruth
 from testbed.sensors.imu import ImuConfig
 from testbed.sensors.timing import patience
 
-REFUSALS = 10  # of an aid in a row, before it is worth an event
+REFUSALS = 10  # of an aid in a row, before it is worth an event, and its sensor is held for failed
 Emit: TypeAlias = Callable[[float, str, str], None]  # time [s], severity, text
 
 BAD_SAMPLE_QUIET_S = 10.0  # a sensor that keeps delivering nonsense is reported once per this time

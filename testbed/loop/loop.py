@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Unpack
 
 from nav.columns import Estimates
+from nav.increments import COINCIDENT
 from nav.samples import Status
 from testbed import interrupts
 from testbed.errors import UserError
@@ -310,9 +311,6 @@ class _Passage:
         self.recorder.reports(name, tracked.votes)
         self.recorder.reports(name, tracked.reports.pieces)
         self.backlog[name].add(tracked.votes, tracked.reports)
-        if lane.failure and name not in self.ended:
-            self.ended[name] = lane.failure
-            self.told.emit(float(turn.reference.t[-1]), "error", f"{name} has ended: {lane.failure}")
         return tracked
 
     def _record(self, turn: Turn) -> None:
@@ -358,6 +356,7 @@ class _Passage:
         """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
             self._emit(*event)
+        self._tell_ended(t, [name for name, lane in self.lanes.items() if lane.ended <= t + COINCIDENT])
         while self.arrived and self.arrived[0][0] <= t:
             when, _, samples, which = self.arrived.popleft()
             self.watch.sample(when, samples, which)
@@ -368,9 +367,17 @@ class _Passage:
             for report in self.backlog[name].until(t, lambda: self.watch.heeds_fused):
                 self.watch.report(name, report)
 
+    def _tell_ended(self, t: float, names: Sequence[str]) -> None:
+        """Tell of the estimators that have ended by an error of their own, of each once."""
+        for name in names:
+            if name not in self.ended:
+                self.ended[name] = self.lanes[name].failure
+                self._emit(t, "error", f"{name} has ended: {self.ended[name]}")
+
     def conclude(self) -> list[str]:
         """The end: last events, and what the caller should know."""
         end, remarks = self._end, []
+        self._tell_ended(end, [name for name, lane in self.lanes.items() if lane.failure])
         for event in self.feed.take_events():
             self.told.emit(*event)
         remark = self.feed.remark()

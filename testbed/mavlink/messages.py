@@ -73,7 +73,7 @@ _AIDS: Mapping[type[Sample], int] = {
 def health(s: Snapshot) -> int:
     """Which sensors work, in the bits of SYS_STATUS.
 
-    Failed are those that are silent, or isolated by the estimator, and a receiver without a fix.
+    Failed are those that are silent, or that the estimator does not believe, and a receiver without a fix.
     """
     bits = _ALWAYS
     if s.inertial:
@@ -222,7 +222,7 @@ def _satellites(sample: GnssSample) -> float:
 def gnss_integrity(s: Snapshot) -> Fields | None:
     """Jamming is reported while there is no fix, as nothing but interference takes it away in this testbed.
 
-    Spoofing is reported while the estimator isolates, or long refuses, a receiver that has one.
+    Spoofing is reported while the estimator does not believe a receiver that has one.
     """
     if not s.knows(GnssSample):
         return None

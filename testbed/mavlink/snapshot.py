@@ -84,7 +84,7 @@ class Snapshot:
         self._moments, self._row = moments, row
         self.t = float(moments.truth["t"][row])
         self.identity, self.legs, self.start_us = moments.identity, moments.legs, moments.start_us
-        self.isolated, self.refused = moments.shut_out[row]
+        self._disbelieved = moments.shut_out[row].sensors
 
     @property
     def aligned(self) -> bool:
@@ -163,15 +163,15 @@ class Snapshot:
         return math.hypot(self.v_n[0], self.v_n[1])
 
     def works(self, kind: type[S]) -> bool:
-        """Whether the first sensor of this kind says something, and is not isolated."""
+        """Whether the first sensor of this kind says something, and is believed."""
         sample = self.newest(kind)
-        return sample is not None and sample.sensor not in self.isolated
+        return sample is not None and sample.sensor not in self._disbelieved
 
     @cached_property
     def doubted(self) -> bool:
-        """Whether the estimator has isolated, or long refused, a receiver that has a fix."""
+        """Whether the estimator does not believe a receiver that has a fix."""
         fix = self.gnss_fix
-        return fix is not None and (fix.sensor in self.isolated or fix.sensor in self.refused)
+        return fix is not None and fix.sensor in self._disbelieved
 
     @cached_property
     def flying(self) -> bool | None:

@@ -11,15 +11,19 @@ import numpy.typing as npt
 
 from nav.columns import FusedReports
 from nav.samples import Outcome, UpdateReport
-
-REFUSED = 10  # samples of a receiver in a row, before it is held for spoofed
+from testbed.loop.events import REFUSALS
 
 
 class ShutOut(NamedTuple):
-    """The sensors that an estimator has isolated, and whose samples it has long refused."""
+    """The sensors that an estimator has isolated, and those whose samples it has refused `REFUSALS` times in a row."""
 
     isolated: frozenset[str]
     refused: frozenset[str]
+
+    @property
+    def sensors(self) -> frozenset[str]:
+        """All of them: who is not believed."""
+        return self.isolated | self.refused
 
 
 NOBODY = ShutOut(frozenset(), frozenset())
@@ -84,7 +88,7 @@ class Verdicts:
             self._isolated.add(part)
         else:
             self._isolated.discard(part)
-        if report.outcome is Outcome.OUTSIDE_GATE:
+        if _is_refused(report):
             self._refused[part] = self._refused.get(part, 0) + 1
         elif report.weight > 0:
             self._refused.pop(part, None)
@@ -94,11 +98,20 @@ class Verdicts:
         """From this row on it is as it is now."""
         now = ShutOut(
             frozenset(sensor for sensor, _ in self._isolated),
-            frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSED),
+            frozenset(sensor for (sensor, _), count in self._refused.items() if count >= REFUSALS),
         )
         if now != self._shut_out:
             shut_out += [self._shut_out] * (row - len(shut_out))
             self._shut_out = now
+
+
+def _is_refused(report: UpdateReport) -> bool:
+    """Whether a sample is not believed: outside the gate, or saying that it is out of range, and off by more than that.
+
+    So does a pitot tube that is blocked in flight; one that stands is out of range, and right.
+    """
+    out_of_range = report.outcome is Outcome.OUT_OF_RANGE
+    return report.outcome is Outcome.OUTSIDE_GATE or (out_of_range and report.nis > report.threshold)
 
 
 def _add(

@@ -15,6 +15,7 @@ from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
 from testbed.estimators.custom import CustomSection, build
+from testbed.loop.loop import EVENTS_S
 from testbed.many import campaign as campaigns
 from testbed.many import check
 
@@ -245,6 +246,19 @@ def test_what_it_does_to_its_samples_is_its_own_affair(folder: Path, healthy) ->
 def test_same_bits_live_and_batch(folder: Path, healthy) -> None:
     live = run(Scenario.load(folder / "own.toml", SHORT), realtime=1000.0)
     assert same(healthy.dataset, live.dataset)
+
+
+@pytest.mark.parametrize("flies", ["truth", "ins"])
+def test_its_end_is_told_at_the_same_time_live_and_batch(folder: Path, flies: str) -> None:
+    """Where events are looked for, once its first estimate is missing, however long a turn is."""
+    keys = SHORT | {"estimator[1].how": "raise", "estimator[1].after_s": 5.013, "autopilot.feedback": flies}
+    scenario = Scenario.load(folder / "own.toml", keys)
+    batch, live = run(scenario), run(scenario, realtime=1000.0)
+    events, own = batch.dataset["events"], batch.dataset["estimators/mine"]
+    (told,) = events["time"].values[["mine has ended" in text for text in events["text"].values.tolist()]]
+    missing = own["time"].values[np.isnan(own["lat"].values) & (own["time"].values > 5.0)][0]
+    assert missing <= told <= missing + EVENTS_S
+    assert same(batch.dataset, live.dataset)
 
 
 def test_nan_is_never_flown_on(folder: Path) -> None:

@@ -332,6 +332,23 @@ def test_a_place_that_a_log_does_not_know_is_not_told(tmp_path):
     assert len(heard["ATTITUDE"]) == 50
 
 
+def test_an_attitude_that_a_log_does_not_know_is_not_told(tmp_path):
+    """Of a flight without one the nose was told to point straight down, at every place."""
+
+    def unknown(t):
+        row = truth_row(t)
+        row.q_nb[0] = math.nan
+        return row
+
+    heard = log_of(tmp_path, range(25), truth=unknown)
+    for name in ("SIMSTATE", "SIM_STATE"):
+        message = heard[name][0]
+        assert np.isnan([message.roll, message.pitch, message.yaw]).all()
+        assert message.lat != 0
+    assert np.isnan(heard["HIL_STATE_QUATERNION"][0].attitude_quaternion).all()
+    assert heard["HIL_STATE_QUATERNION"][0].lat != 0
+
+
 def test_a_wind_may_have_no_sigma(tmp_path):
     wind = {"wind": (np.array([4.0, -3.0]), np.full(2, math.nan))}
     heard = log_of(tmp_path, range(6), estimate=lambda t: dataclasses.replace(estimate(t), extra=wind))
@@ -690,13 +707,48 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert last(heard, "GNSS_INTEGRITY", "jamming_state") == mav.GPS_JAMMING_STATE_NOT_JAMMED
     assert last(heard, "ESTIMATOR_STATUS", "flags") & mav.ESTIMATOR_GPS_GLITCH
     assert last(heard, "EKF_STATUS_REPORT", "flags") & mav.EKF_GPS_GLITCHING
-    healthy = bool(last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS)
-    assert healthy == (how is not Outcome.ISOLATED)
+    assert not last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
     assert [message.text for message in heard["STATUSTEXT"]] == ["gnss isolated"] * (how is Outcome.ISOLATED)
     heard = log_of(tmp_path, range(110), reports=reports)
     assert last(heard, "GNSS_INTEGRITY", "spoofing_state") == mav.GPS_SPOOFING_STATE_NOT_SPOOFED
     assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
     assert how is not Outcome.ISOLATED or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
+
+
+@pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE, Outcome.OUT_OF_RANGE])
+@pytest.mark.parametrize(
+    ("sensor", "bit"),
+    [
+        ("airspeed", mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE),
+        ("barometer", mav.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE),
+        ("magnetometer", mav.MAV_SYS_STATUS_SENSOR_3D_MAG),
+    ],
+)
+def test_a_sensor_that_is_not_believed_shows_as_failed(tmp_path, sensor, bit, how):
+    """A pitot tube that stuck was refused for minutes, and healthy."""
+
+    def reports(t):
+        kind = {"weight": 0.0, "outcome": how} if 1.0 <= t < 3.0 else {"weight": 1.0, "outcome": Outcome.FUSED}
+        return [dataclasses.replace(report(t, **kind), sensor=sensor, aid=sensor)]
+
+    heard = log_of(tmp_path, range(110), reports=reports)
+    health = {round(one.onboard_control_sensors_health & bit) for one in heard["SYS_STATUS"]}
+    assert health == {0, bit}
+    heard = log_of(tmp_path, range(70), reports=reports)
+    assert not last(heard, "SYS_STATUS", "onboard_control_sensors_health") & bit
+    assert last(heard, "SYS_STATUS", "onboard_control_sensors_health") & mav.MAV_SYS_STATUS_SENSOR_GPS
+
+
+def test_a_pitot_tube_at_rest_is_healthy(tmp_path):
+    """It is out of its range for as long as that takes, and as far off as any sound sensor."""
+
+    def reports(t):
+        slow = report(t, weight=0.0, outcome=Outcome.OUT_OF_RANGE)
+        return [dataclasses.replace(slow, sensor="airspeed", aid="airspeed", nis=1.0)]
+
+    heard = log_of(tmp_path, range(70), reports=reports)
+    bit = mav.MAV_SYS_STATUS_SENSOR_DIFFERENTIAL_PRESSURE
+    assert all(message.onboard_control_sensors_health & bit for message in heard["SYS_STATUS"])
 
 
 def test_receiver_without_fix_shows_as_jammed_not_spoofed(tmp_path):

@@ -7,7 +7,8 @@ import pytest
 
 from nav.columns import FusedReports
 from nav.samples import Outcome, UpdateReport
-from testbed.mavlink.verdicts import REFUSED, Verdicts
+from testbed.loop.events import REFUSALS
+from testbed.mavlink.verdicts import Verdicts
 
 KINDS = [
     ("gnss", "gnss_position", 3),
@@ -15,7 +16,7 @@ KINDS = [
     ("second", "gnss_position", 3),
     ("baro", "baro", 1),
 ]
-OUTCOMES = Outcome.OUTSIDE_GATE, Outcome.ISOLATED, Outcome.FUSED
+OUTCOMES = Outcome.OUTSIDE_GATE, Outcome.ISOLATED, Outcome.FUSED, Outcome.OUT_OF_RANGE
 
 
 def pieces(seed, rows):
@@ -37,7 +38,7 @@ def pieces(seed, rows):
                 )
             )
         else:
-            outcome = OUTCOMES[rng.choice(3, p=[0.7, 0.2, 0.1])]
+            outcome = OUTCOMES[rng.choice(4, p=[0.6, 0.2, 0.1, 0.1])]
             sensor, aid, _ = KINDS[rng.integers(len(KINDS))]
             weight = float(outcome is Outcome.FUSED)
             for row in due:
@@ -63,11 +64,12 @@ def one_after_the_other(found, rows):
                 isolated.add(part)
             else:
                 isolated.discard(part)
-            if report.outcome is Outcome.OUTSIDE_GATE:
+            wrong = report.outcome is Outcome.OUT_OF_RANGE and report.nis > report.threshold
+            if report.outcome is Outcome.OUTSIDE_GATE or wrong:
                 refused[part] = refused.get(part, 0) + 1
             elif report.weight > 0:
                 refused[part] = 0
-        long = {sensor for (sensor, _), count in refused.items() if count >= REFUSED}
+        long = {sensor for (sensor, _), count in refused.items() if count >= REFUSALS}
         told.append((dict(ratios), {sensor for sensor, _ in isolated}, long))
     return told
 

@@ -91,6 +91,13 @@ def test_straight_up_keeps_the_attitude():
     assert np.isfinite(back).all()
 
 
+@pytest.mark.parametrize("part", [slice(None), 0, 2])
+def test_an_unknown_attitude_has_no_euler_angles(part):
+    q = np.full(4, 0.5)
+    q[part] = math.nan
+    assert np.isnan(rotation.euler_from_quat(q)).all()
+
+
 @settings(deadline=None)
 @given(vectors, vectors)
 def test_cross_and_skew(u, v):
