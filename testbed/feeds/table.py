@@ -32,7 +32,7 @@ PARQUET = b"PAR1"
 # As ISO 8601 has it, with a time of day; RTKLIB has slashes for its dashes.
 DATE = re.compile(r"\s*\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d")
 DAY, CLOCK = re.compile(r"\d{4}[-/]\d\d[-/]\d\d"), re.compile(r"\d\d:\d\d:\d\d(\.\d+)?")  # in columns of their own
-LONGEST_SHOWN = 20  # of what is no number
+LONGEST_SHOWN = 30  # of what is no number
 FASTEST, HARDEST = 1e3, 1e4  # [rad/s], [m/s^2]: three times what gyros of missiles measure, and a thousand g
 WILD_SHARE = 0.01  # of the rows, that may be beyond these by damage
 
@@ -261,7 +261,8 @@ def _instead(array: Any) -> str:
         return "has no rows"
     for k, one in enumerate(array):
         if not _is_number(one):
-            return f"holds text, first {shown(str(one)[:LONGEST_SHOWN])} in row {k + 1}"
+            said = str(one)
+            return f"holds text, first {shown(said[:LONGEST_SHOWN])} in row {k + 1}{text.advice(said)}"
     return "holds numbers as text"
 
 
