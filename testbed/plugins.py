@@ -178,7 +178,7 @@ def raised(error: BaseException) -> str:
     last = (theirs or frames)[-1:]
     at = f" ({Path(last[0].filename).name}, line {last[0].lineno})" if last else ""
     try:
-        said = str(error)
+        said = " ".join(str(error).split())  # pydantic's texts have several lines
     except Exception:
         said = "it can't be shown"
     return f"{type(error).__name__}: {printable(said)}{at}"

@@ -65,7 +65,7 @@ def log(file: LogFile, scenario: Target = None, compare: Simulation = None, forc
         other, columns, _, told = _named(compare)
         simulated = formats.read(other, {}) if columns is None else formats.open_log(columns)
         other_found = survey(mounted(simulated, told), _in_body_axes(told))
-        console().print(pages.beside(likeness.compare(found, other_found)))
+        console().print(pages.beside(likeness.compare(found, other_found), likeness.called(other_found)))
     else:
         for table in pages.tables(found):
             console().print(table)

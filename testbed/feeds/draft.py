@@ -15,13 +15,12 @@ import numpy as np
 from nav.rotation import euler_from_quat
 from nav.samples import AirspeedSample, BarometerSample, GnssSample, MagnetometerSample
 from testbed.errors import UserError
-from testbed.feeds.axes import unlike
 from testbed.feeds.log import TABLE, Log
 from testbed.feeds.recorded import first_place, rate, references
 from testbed.feeds.reference import doubt, elsewhere_in_height, silence
 from testbed.feeds.scatter import otherwise
 from testbed.feeds.survey import Noise, Sphere, Survey
-from testbed.feeds.unsound import magnetometers
+from testbed.feeds.unsound import unfit_as_aids
 from testbed.motion.logged import LogTruth
 from testbed.motion.terrain import JACKSBORO
 from testbed.sensors import SensorConfig
@@ -156,9 +155,8 @@ def scenario(
     lasts = max(end - (0.0 if truth is None else truth.start_s), SHORTEST_S)
     date = log.date if date is None else date
     own = sections(found)
-    unsound = {**magnetometers(found), **unlike(log)}
-    aids = [name for name in own if len(log.samples.get(name, ())) > 1]
-    aids.sort(key=unsound.__contains__)  # those that are come last
+    unsound = unfit_as_aids(found)
+    aids = [name for name in own if len(log.samples.get(name, ())) > 1 and name not in unsound]
     first = {str(own[name]["kind"]): name for name in reversed(aids)}  # one of each kind
     if log.receiver is not None:
         first["gnss"] = log.receiver  # the first with a fix
@@ -186,7 +184,8 @@ def scenario(
         lines += [f"columns.{name} = {_inline(stream)}" for name, stream in _columns(truth, out).items()]
     for name, keys in own.items():
         keys |= _installed(told[name]) if told and name in told else {}
-        lines += ["", f"[sensors.{name}]", *(f"{key} = {_inline(value)}" for key, value in keys.items())]
+        why = [f"# Among no estimator's aids: {unsound[name]}"] if name in unsound else []
+        lines += ["", f"[sensors.{name}]", *why, *(f"{key} = {_inline(value)}" for key, value in keys.items())]
     for kind in USUAL_AIDS:
         if kind != "ins" or log.receiver is not None:
             used = [first[one] for one in USUAL_AIDS[kind] if one in first]
@@ -234,7 +233,7 @@ def _heading(log: Log) -> str:
     if not len(known):
         return "heading_deg = 0  # at the start: nothing in the log tells it: give it"
     heading = math.degrees(euler_from_quat(q_nb[known[0]])[2])
-    return f"heading_deg = {round(heading)}  # at the start, as its autopilot thought: there is no magnetometer"
+    return f"heading_deg = {round(heading)}  # at the start, as its autopilot thought: no magnetometer tells it"
 
 
 def _kept(truth: LogTruth, out: Path) -> dict[str, Any]:

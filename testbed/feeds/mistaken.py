@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from nav.earth import displacement_n
-from nav.samples import Array, GnssSample, ImuSamples
+from nav.earth import displacement_n, pressure_altitude
+from nav.samples import AirspeedSample, Array, BarometerSample, GnssSample, ImuSamples
 from testbed.feeds.axes import unlike
-from testbed.feeds.lateness import fixes
+from testbed.feeds.lateness import LEAST_FIXES, fixes
 from testbed.feeds.log import Log, feels_gravity, usual_force
-from testbed.feeds.survey import between, phases
+from testbed.feeds.survey import SCALES, Phase, about, airspeed_scale, between, in_the_air, phases
+from testbed.feeds.units import LENGTH, SPEED, mixed_up
 
 STRETCH_S = 5.0  # over which a way, and a turn, are added up: fixes may be told to a metre only
-LEAST_STRETCHES = 10
+LEAST_STRETCHES, LEAST_CLIMBS = 10, 6
 LEAST_WAY, LEAST_CLIMB = 15.0, 5.0  # in a stretch [m]
 LEAST_TURN = math.radians(360)  # of the course
 # What 56 logs have, of which one receiver was jammed and two IMUs were not right: positions are 1 to 4 % of their way
@@ -27,25 +28,64 @@ MOST_OFF, MOST_HEIGHT_OFF = 0.5, 1.0
 LEAST_FELT, FASTEST_TURN = 0.1, 4.0  # of the course; all the time that it flies [rad/s]
 MOST_STEP, STEP_SHARE = math.radians(5), 0.95  # from one sample to the next; no more in this share of them
 FASTEST = 100.0  # of one step [rad/s]
+HEIGHTS = 0.6, 1.6  # of a receiver over those of a barometer, by how far both go up and down
+LEAST_SPAN, MOST_OF_IT = 20.0, (0.05, 0.95)  # that both go up and down by [m], and of which share of the heights
+SAME_SHAPE = 0.9  # of these: correlation
+TINY = 1e-9  # [m]
 ON_ITS_BACK = math.radians(120)  # what stands on its tail is none
 
 
 def mistaken(log: Log) -> list[str]:
     """What contradicts what, a sentence each, sensor by sensor; nothing where all may be as it is taken for."""
-    told = []
+    told: list[str] = []
+    flight = phases(log) if any(len(imu) > 1 for imu in log.imus.values()) else []
     for name, own in log.samples.items():
-        if any(isinstance(one, GnssSample) and one.has_fix for one in own):
-            told += [f"{name}: {what}: are units, columns and axes right?" for what in _receiver(own)]
+        if own and isinstance(own[0], AirspeedSample):
+            told += [f"{name}: {what}" for what in _airspeed(log, own, flight)]
+        elif any(isinstance(one, GnssSample) and one.has_fix for one in own):
+            told += [f"{name}: {what}: are units, columns and axes right?" for what in gone_otherwise(*fixes(own))]
+            told += [f"{name}: {what}" for what in _heights(log, own)]
         elif any(isinstance(one, GnssSample) for one in own):
             told.append(f"{name}: it never has a fix")
     for name, imu in log.imus.items():
         if len(imu) > 1:
-            told += [f"{name}: {what}" for what in _inertial(log, imu)]
+            told += [f"{name}: {what}" for what in _inertial(log, imu, flight)]
     return [*told, *unlike(log).values()]
 
 
-def _receiver(own: Sequence[Any]) -> Iterator[str]:
-    return gone_otherwise(*fixes(own))
+def _airspeed(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> Iterator[str]:
+    """Where GNSS velocities, with the wind that fits best, say that an airspeed is in another unit."""
+    heard = in_the_air(log, own, flight)
+    if SCALES[0] <= about(*heard) <= SCALES[1]:
+        return
+    scale = airspeed_scale(*heard)
+    if scale and not SCALES[0] <= scale <= SCALES[1]:
+        pair = mixed_up(scale, SPEED)
+        as_made = f", as {pair} is" if pair else ""
+        yield f"by {log.receiver} true airspeed is {scale:.3g} times what it says{as_made}: is its unit right?"
+
+
+def _heights(log: Log, own: Sequence[Any]) -> Iterator[str]:
+    """Where a receiver's heights go as those of a barometer do, but by another measure."""
+    t, _, place = fixes(own)
+    for name, beside in log.samples.items():
+        pressures = [one for one in beside if isinstance(one, BarometerSample) and one.pressure > 0]
+        if not pressures:
+            continue
+        altitude = pressure_altitude(np.array([one.pressure for one in pressures]))
+        both = np.column_stack([place[:, 2], np.interp(t, [one.t for one in pressures], altitude, np.nan, np.nan)])
+        both = both[np.isfinite(both).all(axis=1)]
+        if len(both) < LEAST_FIXES:
+            continue
+        low, high = np.quantile(both, MOST_OF_IT, axis=0)
+        least, ratio = min(high - low), float(np.divide(*np.maximum(high - low, TINY)))
+        if least < LEAST_SPAN or HEIGHTS[0] <= ratio <= HEIGHTS[1]:
+            continue
+        if np.corrcoef(np.clip(both, low, high).T)[0, 1] >= SAME_SHAPE:
+            pair = mixed_up(1 / ratio, LENGTH)
+            as_made = f", as {pair} do" if pair else ""
+            far = f"{ratio:.3g} times as far up and down as those of {name}"
+            yield f"its heights go {far}{as_made}: are the units of both right?"
 
 
 def gone_otherwise(t: Array, v_n: Array, place: Array) -> Iterator[str]:
@@ -56,10 +96,11 @@ def gone_otherwise(t: Array, v_n: Array, place: Array) -> Iterator[str]:
     if not ways:
         return
     said, gone = (np.array(one) for one in zip(*ways, strict=True))
-    level, upright = ("go", [0, 1], LEAST_WAY, MOST_OFF), ("climb", [2], LEAST_CLIMB, MOST_HEIGHT_OFF)
-    for what, axes, least, most in (level, upright):
+    level = "go", [0, 1], LEAST_WAY, LEAST_STRETCHES, MOST_OFF
+    upright = "climb", [2], LEAST_CLIMB, LEAST_CLIMBS, MOST_HEIGHT_OFF
+    for what, axes, least, enough, most in (level, upright):
         far = np.maximum(*(np.linalg.norm(one[:, axes], axis=1) for one in (said, gone))) >= least
-        if far.sum() < LEAST_STRETCHES:
+        if far.sum() < enough:
             continue
         off = np.linalg.norm((said - gone)[far][:, axes], axis=1)
         way = np.linalg.norm(gone[far][:, axes], axis=1)
@@ -82,12 +123,12 @@ def _stretches(t: Array, v_n: Array, place: Array) -> Iterator[tuple[Array, Arra
             first = k
 
 
-def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
+def _inertial(log: Log, imu: ImuSamples, flight: Sequence[Phase]) -> Iterator[str]:
     """Where gravity, or the turns of a receiver's course, are not what it feels."""
     usual = usual_force(imu)
     if math.isfinite(usual) and not feels_gravity(imu):
         yield f"it feels {usual:.3g} m/s² mostly, where gravity is 9.8: is the unit of its accelerometers right?"
-    elif _lies_on_its_back(log, imu):
+    elif _lies_on_its_back(log, imu, flight):
         yield "at rest it lies on its back: are its axes forward, right and down?"
     turned = np.linalg.norm(np.nan_to_num(imu.dtheta), axis=1)
     often = float(np.quantile(turned, STEP_SHARE))
@@ -119,9 +160,9 @@ def _inertial(log: Log, imu: ImuSamples) -> Iterator[str]:
         yield f"its gyros feel {rates}, where the course of {log.receiver} turns by {turns}: is their unit right?"
 
 
-def _lies_on_its_back(log: Log, imu: ImuSamples) -> bool:
+def _lies_on_its_back(log: Log, imu: ImuSamples, flight: Sequence[Phase]) -> bool:
     """Whether gravity pulls it upwards for most of its rest."""
-    rests = [between(log, imu, one) for one in phases(log) if one.name == "rest"]
+    rests = [between(log, imu, one) for one in flight if one.name == "rest"]
     forces = [np.nansum(imu.dv[rows], axis=0) for rows in rests]
     total = np.sum(forces, axis=0) if forces else np.zeros(3)
     return bool(-total[2] < math.cos(ON_ITS_BACK) * np.linalg.norm(total))

@@ -30,6 +30,7 @@ LEAST_LINE = 6.0  # times the median of the spectrum about it
 ERRORS = 20  # of a magnetometer in a flight that are independent: each lasts
 LEAST_SPREAD = 0.05  # of a field about its mean, over its median size, in the direction of the least
 ACROSS = 0.1  # share of the flight across its main direction, to tell wind from scale
+SCALES = 0.6, 1.6  # of an airspeed in the right unit
 SCALE_SIGMA, WORST_CONDITION = 0.05, 1e6  # of an airspeed scale that is worth saying
 LEAST_AIR = 10.0  # an airspeed says something of its scale from here on [m/s]
 
@@ -140,7 +141,7 @@ def survey(log: Log, sections: Mapping[str, SensorConfig] | None = None) -> Surv
             field = np.array([one.field_b for one in own if isinstance(one, MagnetometerSample)])
             if (sphere := _sphere(field)) is not None:
                 spheres[name] = sphere
-        elif isinstance(own[0], AirspeedSample) and (scale := _airspeed_scale(log, own, found)) is not None:
+        elif isinstance(own[0], AirspeedSample) and (scale := airspeed_scale(*in_the_air(log, own, found))):
             scales[name] = scale
     rates = {name: _rate(t) for name, t in times.items()}
     return Survey(log, rates, found, noise, vibration, late, behind, spheres, scales)
@@ -311,20 +312,33 @@ def _sphere(field: Array) -> Sphere | None:
     return Sphere(scale * residual, scale * radius, scale * off, scale * doubt)
 
 
-def _airspeed_scale(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> float | None:
-    """True airspeed over the sensor's, of the wind and scale that fit GNSS velocity best while it flies."""
+def in_the_air(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> tuple[Array, Array]:
+    """GNSS velocities (N, 3) while it flies, and the true airspeeds (N,) that a sensor tells at these times."""
     receiver = log.receiver
     if receiver is None:
-        return None
+        return np.empty((0, 3)), np.empty(0)
     t, v_n, place = fixes(log.samples[receiver])
     told = np.interp(t, [one.t for one in own], [one.eas for one in own], left=np.nan, right=np.nan)
     told = told * np.sqrt(SEA_LEVEL_DENSITY / isa_density(place[:, 2]))
     flying = [(t >= log.t0 + one.start) & (t < log.t0 + one.end) for one in flight if one.name == "flying"]
     moves = np.hypot(v_n[:, 0], v_n[:, 1]) > REST_SPEED  # heights alone may drift, of one whose propeller turns
-    flown = np.any(flying, axis=0) & moves & (told > LEAST_AIR) & np.isfinite(v_n).all(axis=1)
-    if flown.sum() < LEAST_FIXES:
+    flown = np.any(flying, axis=0) & moves & (told > 0) & np.isfinite(v_n).all(axis=1)
+    return v_n[flown], told[flown]
+
+
+def about(v_n: Array, air: Array) -> float:
+    """Speed over ground of velocities (N, 3) over airspeed (N,), medians: what wind leaves of a scale; 1 of none."""
+    return float(np.median(np.linalg.norm(v_n, axis=1)) / np.median(air)) if len(air) else 1.0
+
+
+def airspeed_scale(v_n: Array, air: Array) -> float | None:
+    """True airspeed over the sensor's, of the wind and scale that fit what was heard `in_the_air` best."""
+    rough = about(v_n, air)
+    usual = 1.0 if SCALES[0] <= rough <= SCALES[1] else rough  # beyond these it is another unit
+    fast = usual * air > LEAST_AIR
+    v, air = v_n[fast], usual * air[fast]
+    if len(air) < LEAST_FIXES:
         return None
-    v, air = v_n[flown], told[flown]
     courses = v[:, :2] / np.hypot(v[:, 0], v[:, 1])[:, None]
     if np.linalg.eigvalsh(courses.T @ courses / len(courses))[0] < ACROSS:
         return None  # there and back alone: the wind across can't be told from the scale
@@ -337,6 +351,6 @@ def _airspeed_scale(log: Log, own: Sequence[Any], flight: Sequence[Phase]) -> fl
     found = least_squares(misfit, [0.0, 0.0, 1.0], loss="soft_l1")
     jacobian = np.asarray(found.jac)
     information = jacobian.T @ jacobian
-    variance = 2 * found.cost / flown.sum() * np.linalg.pinv(information)[2, 2]
+    variance = 2 * found.cost / len(air) * np.linalg.pinv(information)[2, 2]
     sure = found.success and variance < SCALE_SIGMA**2 and np.linalg.cond(information) < WORST_CONDITION
-    return float(found.x[2]) if sure else None
+    return usual * float(found.x[2]) if sure else None

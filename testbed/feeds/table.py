@@ -24,44 +24,18 @@ from testbed.feeds.log import TABLE, Log, Reference, Samples, beginning, require
 from testbed.feeds.reference import usual_sigma
 from testbed.feeds.samples import Fixes, airspeeds, barometers, eas_of, magnetometers, newly, quaternions
 from testbed.feeds.stamps import integrated, left_out, spaced, with_holes
+from testbed.feeds.units import ANGLE, UNITS
 from testbed.motion.logged import Column, Stream
-from testbed.sensors.units import DEG, DEG_PER_H, MG, MICROTESLA, G
+from testbed.sensors.units import DEG
 
 PARQUET = b"PAR1"
 # As ISO 8601 has it, with a time of day; RTKLIB has slashes for its dashes.
 DATE = re.compile(r"\s*\d{4}([-/])\d\d\1\d\d[T ]\d\d:\d\d")
 DAY, CLOCK = re.compile(r"\d{4}[-/]\d\d[-/]\d\d"), re.compile(r"\d\d:\d\d:\d\d(\.\d+)?")  # in columns of their own
-LONGEST_SHOWN = 20  # of what is no number
+LONGEST_SHOWN = 30  # of what is no number
 FASTEST, HARDEST = 1e3, 1e4  # [rad/s], [m/s^2]: three times what gyros of missiles measure, and a thousand g
 WILD_SHARE = 0.01  # of the rows, that may be beyond these by damage
 
-TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-ANGLE = {"rad": 1.0, "deg": DEG, "1e-7deg": 1e-7 * DEG}
-LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048}
-SPEED = {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1 / 3.6, "kn": 1852 / 3600, "ft/s": 0.3048}
-PRESSURE = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1000.0}
-ONE = {"1": 1.0}
-# The units that a quantity may be in, the SI unit first.
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "time": TIME,
-    "gyro": {"rad/s": 1.0, "deg/s": DEG, "deg/h": DEG_PER_H, "rad": 1.0, "deg": DEG},
-    "accel": {"m/s^2": 1.0, "g": G, "mg": MG, "m/s": 1.0},
-    "lat": ANGLE,
-    "lon": ANGLE,
-    "height": LENGTH,
-    "position": LENGTH,
-    "velocity": SPEED,
-    "sigma_position": LENGTH,
-    "sigma_velocity": SPEED,
-    "fix": ONE,
-    "satellites": ONE,
-    "hdop": ONE,
-    "vdop": ONE,
-    "pressure": PRESSURE,
-    "field": {"T": 1.0, "uT": MICROTESLA, "nT": 1e-9, "G": 1e-4, "mG": 1e-7},
-    "airspeed": SPEED,
-    "attitude": ANGLE,
-}
 STEEPEST = math.radians(91)  # a pitch; one that is in degrees and said to be in radians is soon more
 EDGE_RAD = 1e-3  # of a whole turn that is rounded
 LARGEST = {"lat": math.pi / 2, "lon": 4 * math.pi}  # that there may be of these, with a turn too many
@@ -287,7 +261,8 @@ def _instead(array: Any) -> str:
         return "has no rows"
     for k, one in enumerate(array):
         if not _is_number(one):
-            return f"holds text, first {shown(str(one)[:LONGEST_SHOWN])} in row {k + 1}"
+            said = str(one)
+            return f"holds text, first {shown(said[:LONGEST_SHOWN])} in row {k + 1}{text.advice(said)}"
     return "holds numbers as text"
 
 

@@ -21,6 +21,7 @@ UNITS = re.compile(
     r"[kmcuµn]?(s|sec|g|m|Pa|T|G|bar|[Gg]auss)|(rad|deg|°|k?m|cm|mm|ft|kn)(/(s|sec|hr?|min)|/s/s|/s\^?2|/s²)?"
     r"|[hm](Pa|bar)|dps|min|°C|%|-"
 )
+LIKE_MOMENT = re.compile(r"\d{1,4}([-./])\d{1,2}\1\d{1,4}(\D.*)?|\d{1,2}:\d\d(\D.*)?")  # as no column of numbers has it
 SAID = re.compile(r"sep=.", re.IGNORECASE)  # a first line that tells spreadsheets the mark, which rows show as well
 SHOWN = 100  # lines that show what numbers have for a point: in a few all may be whole
 MISSING = ("", "NA", "N/A", "null")  # in place of numbers
@@ -63,7 +64,7 @@ def layout(lines: Iterable[str]) -> Layout:
     (number, first), (second, row) = plain[0], plain[:2][-1]
     mark = next((one for one in MARKS if one in QUOTED.sub("", row)), SPACES if " " in row.strip() else ",")
     fields = _fields(row, mark)
-    shown = [one for _, line in plain[1:] or plain for one in _fields(line, mark)] if mark == ";" else []
+    shown = [one for _, line in plain[1:] or plain for one in _fields(line, mark)] if mark in ";\t" else []
     pointed = any(map(DECIMAL_POINT.fullmatch, shown))
     decimal = "," if not pointed and any(map(DECIMAL_COMMA.fullmatch, shown)) else "."
     width, top = len(fields), _fields(first, mark)
@@ -95,6 +96,18 @@ def is_table(head: bytes) -> bool:
     marked = found.mark != SPACES or (rows and _are_units(rows[0]))
     alike = marked and any(len(row) == len(first) > 1 and any(map(_is_number, row)) for row in rows)
     return bool(alike) or _are_numbers([first, *rows][:2][-1], found.decimal)
+
+
+def advice(field: str) -> str:
+    """What to do about a field that is no number, behind a colon; empty where that is not known."""
+    if LIKE_MOMENT.fullmatch(field.strip()):
+        return (
+            ": dates are read as ISO 8601 has them, 2015-03-07T12:04:10.5, and times of day beside a column of such"
+            " dates, 2015-03-07: write them so, or give seconds as numbers"
+        )
+    if DECIMAL_COMMA.fullmatch(field.strip()):
+        return ": decimal commas are read where semicolons or tabs part the fields, and none of these has a point"
+    return ""
 
 
 def columns(path: Path) -> Iterator[tuple[str, Any]]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from nav.earth import pressure_altitude
 from nav.samples import Array, BarometerSample, MagnetometerSample
+from testbed.feeds.axes import unlike
 from testbed.feeds.lateness import fixes
 from testbed.feeds.log import Log
 from testbed.feeds.reference import is_flown
@@ -24,6 +25,12 @@ MOST_INCLINATION_OFF = math.radians(15)
 MOST_SIZE_OFF = 0.25
 FIELDS_UT = 15.0, 85.0  # that a magnetometer may say, a third beyond those of the Earth
 MOST_HEIGHT_OFF_M = 1000.0  # of a pressure altitude: no weather makes so much
+
+
+def unfit_as_aids(found: Survey) -> dict[str, str]:
+    """What speaks against those sensors that are to be left out of the estimators' aids, a sentence each."""
+    told = {**magnetometers(found), **barometers(found), **unlike(found.log)}
+    return {name: said for name, said in told.items() if name in found.log.samples}
 
 
 def magnetometers(found: Survey) -> dict[str, str]:

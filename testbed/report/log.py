@@ -86,28 +86,28 @@ def _measured(found: Survey) -> Iterator[tuple[str, str, str]]:
         yield name, "true airspeed over the sensor's", f"{scale:.3f}"
 
 
-def beside(rows: Sequence[Row]) -> Table:
-    """A flight and its simulation, row by row, and where they are not alike."""
+def beside(rows: Sequence[Row], other: str) -> Table:
+    """A flight and what it is beside, called ``other``, row by row, and where they are not alike."""
     unlike = sum(not row.alike for row in rows)
     title = f"{len(rows)} figures, {len(rows) - unlike} of them alike, within a factor of {ALIKE:g}"
-    table = _table(title, "of", "what", "flight", "simulation", "")
+    table = _table(title, "of", "what", "flight", other, "")
     for row in rows:
         numbers = ("" if math.isnan(value) else f"{value:.3g} {row.unit}".strip() for value in row[3:5])
-        table.add_row(row.of, row.what, *numbers, _likeness(row))
+        table.add_row(row.of, row.what, *numbers, _likeness(row, other))
     return table
 
 
-def _likeness(row: Row) -> str:
+def _likeness(row: Row, other: str) -> str:
     if row.alike:
         return "alike"
     if math.isnan(row.ratio):
-        return "only the flight has it" if math.isnan(row.simulation) else "only the simulation has it"
+        return "only the flight has it" if math.isnan(row.other) else f"only the {other} has it"
     if row.opposite:
         return "[red]of the other sign[/]"
     if math.isinf(row.ratio):
-        return "[red]only the simulation has any[/]"
+        return f"[red]only the {other} has any[/]"
     if row.ratio > 1:
-        return f"[red]the simulation's is {row.ratio:.3g} times as large[/]"
+        return f"[red]the {other}'s is {row.ratio:.3g} times as large[/]"
     return (
         f"[red]the flight's is {1 / row.ratio:.3g} times as large[/]"
         if row.ratio

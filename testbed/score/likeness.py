@@ -1,4 +1,4 @@
-"""A recorded flight beside a simulation of it: do the sensors and the innovations look alike?"""
+"""A recorded flight beside a simulation of it, or another log: do the sensors and the innovations look alike?"""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LAG_SLACK_S = 0.015  # and what is not known of both
 
 
 class Row(NamedTuple):
-    """One figure of a sensor, or of an estimator's aid: of the flight and of its simulation, NaN where it has none.
+    """One figure of a sensor, or of an estimator's aid: of the flight and of the other one, NaN where it has none.
 
     ``slack`` is a difference that means nothing.
     """
@@ -38,13 +38,13 @@ class Row(NamedTuple):
     what: str
     unit: str
     flight: float
-    simulation: float
+    other: float
     slack: float = 0.0
 
     @property
     def ratio(self) -> float:
-        """The simulation's size over the flight's; NaN where one of them is not known."""
-        first, second = abs(self.flight), abs(self.simulation)
+        """The other's size over the flight's; NaN where one of them is not known."""
+        first, second = abs(self.flight), abs(self.other)
         if abs(first - second) <= self.slack:
             return 1.0
         if first:
@@ -54,7 +54,7 @@ class Row(NamedTuple):
     @property
     def opposite(self) -> bool:
         """Of different signs, beyond the slack."""
-        return self.flight * self.simulation < 0 and abs(self.flight - self.simulation) > self.slack
+        return self.flight * self.other < 0 and abs(self.flight - self.other) > self.slack
 
     @property
     def alike(self) -> bool:
@@ -63,22 +63,28 @@ class Row(NamedTuple):
         return within and not self.opposite
 
 
-def compare(flight: Survey, simulation: Survey) -> list[Row]:
+def called(other: Survey) -> str:
+    """What a flight is beside: its simulation, of a record of simulated motion, or another log."""
+    simulated = other.log.format == RECORD and "log" not in load(other.log.path).attrs
+    return "simulation" if simulated else "other log"
+
+
+def compare(flight: Survey, other: Survey) -> list[Row]:
     """Every figure that either has, of the sensors that both have by the same name.
 
     Two records of runs are compared by the innovations of the estimators too that both have.
     Raises UserError when there is no sensor in common.
     """
-    common = [name for name in flight.log.names if name in simulation.log.names]
+    common = [name for name in flight.log.names if name in other.log.names]
     if not common:
         raise UserError(
-            f"{simulation.log.path}: has no sensor of the flight's: {', '.join(simulation.log.names)};"
+            f"{other.log.path}: has no sensor of the flight's: {', '.join(other.log.names)};"
             f" the flight has {', '.join(flight.log.names)}"
         )
-    found = [row for name in common for row in _sensor(name, flight, simulation)]
-    if flight.log.format == simulation.log.format == RECORD:
-        found += _innovations(load(flight.log.path), load(simulation.log.path))
-    return [row for row in found if not (math.isnan(row.flight) and math.isnan(row.simulation))]
+    found = [row for name in common for row in _sensor(name, flight, other)]
+    if flight.log.format == other.log.format == RECORD:
+        found += _innovations(load(flight.log.path), load(other.log.path))
+    return [row for row in found if not (math.isnan(row.flight) and math.isnan(row.other))]
 
 
 def _sensor(name: str, *both: Survey) -> Iterator[Row]:
@@ -149,16 +155,16 @@ def _band(frequency: Array, density: Array, low: float, high: float) -> float:
     return math.sqrt(float(density[inside].sum()) * float(frequency[1])) if inside.any() else math.nan
 
 
-def _innovations(flight: xarray.DataTree, simulation: xarray.DataTree) -> Iterator[Row]:
+def _innovations(flight: xarray.DataTree, other: xarray.DataTree) -> Iterator[Row]:
     """Of each aid: mean NIS, share refused, and how much an innovation has of the one before."""
     for estimator in accuracy.names(flight):
-        if estimator not in accuracy.names(simulation):
+        if estimator not in accuracy.names(other):
             continue
         for aid in accuracy.aids(flight, estimator):
-            if aid not in accuracy.aids(simulation, estimator):
+            if aid not in accuracy.aids(other, estimator):
                 continue
             of = f"{estimator}: {aid}"
-            first, second = (_statistics(one, estimator, aid) for one in (flight, simulation))
+            first, second = (_statistics(one, estimator, aid) for one in (flight, other))
             yield Row(of, "NIS per degree of freedom", "", first.nis, second.nis)
             yield Row(of, "refused, percent", "", first.refused, second.refused, slack=1.0)
             yield Row(of, "correlation with the innovation before", "", first.memory, second.memory, slack=0.1)

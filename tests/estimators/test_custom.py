@@ -510,3 +510,18 @@ def test_an_external_program_that_hangs_does_not_outlive_the_run() -> None:
     own.tell("barometer", 0.0, 1e5)
     del own
     assert program.returncode is not None
+
+
+def test_options_of_a_type_that_is_not_there_yet_are_told_on_a_readable_line(tmp_path: Path) -> None:
+    """Inside its class a name of the class itself means nothing; pydantic says what to do, in lines of its own."""
+    (tmp_path / "own.py").write_text(
+        "from pydantic import BaseModel\n\n\nclass Mine:\n"
+        "    class Tuning(BaseModel):\n        gain: float = 1.0\n\n"
+        '    class Options(BaseModel):\n        tuning: "Mine.Tuning"\n'
+    )
+    text = (Path(__file__).parents[2] / "scenarios/u_turn.toml").read_text("utf-8").partition("[[estimator]]")[0]
+    (tmp_path / "a.toml").write_text(f'{text}[[estimator]]\nname = "mine"\nkind = "./own.py:Mine"\ntuning = {{}}\n')
+    with pytest.raises(UserError) as refused:
+        Scenario.load(tmp_path / "a.toml")
+    todo = "you should define `Mine`, then call `Options.model_rebuild()`. For further information visit https://"
+    assert todo in str(refused.value)

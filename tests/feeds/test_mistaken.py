@@ -11,7 +11,8 @@ import pymap3d
 import pytest
 from rich.console import Console
 
-from nav.samples import FixType, GnssSample, ImuSamples
+from nav.earth import SEA_LEVEL_DENSITY, isa_density, isa_pressure
+from nav.samples import AirspeedSample, BarometerSample, FixType, GnssSample, ImuSamples
 from testbed import Scenario
 from testbed.feeds import formats
 from testbed.feeds.log import Log
@@ -61,6 +62,79 @@ def with_velocities(change):
 
 def test_nothing_is_said_of_what_is_right():
     assert mistaken(log()) == []
+
+
+WIND = np.array([3.0, -4.0, 0.0])
+
+
+def beside(air=1.0, height=1.0, measured=1.0):
+    """The log with an airspeed told times ``air`` and a barometer's height times ``measured``, GNSS's ``height``."""
+    thin = math.sqrt(SEA_LEVEL_DENSITY / float(isa_density(600.0)))  # of the flight's middle, near enough
+    speeds = [AirspeedSample(one.t, one.t, air * float(np.linalg.norm(one.v_n - WIND)) / thin) for one in FIXES]
+    pressures = [BarometerSample(one.t, one.t, float(isa_pressure(measured * one.h))) for one in FIXES]
+    fixes = [replace(one, h=height * one.h, v_n=one.v_n * [1, 1, height]) for one in FIXES]
+    return replace(log(fixes=fixes), samples={"gnss": fixes, "barometer": pressures, "airspeed": speeds})
+
+
+@pytest.mark.parametrize(
+    ("told", "said"),
+    [
+        (1.0, ""),
+        (0.7, ""),
+        (1.5, ""),
+        (3.6, "km/h told as m/s"),
+        (1 / 3.6, "m/s told as km/h"),
+        (1.944, "kn told as m/s"),
+        (2.237, "mph told as m/s"),
+        (3.281, "ft/s told as m/s"),
+        (7.0, ""),
+    ],
+)
+def test_an_airspeed_in_another_unit_is_told_by_name(told, said):
+    """A filter was too sure of it at the end, and nobody knew why."""
+    found = mistaken(beside(air=told))
+    assert len(found) == (told in (3.6, 1 / 3.6, 1.944, 2.237, 3.281, 7.0))
+    as_made = f", as {said} is" if said else ""
+    for one in found:
+        times, _, rest = one.removeprefix("airspeed: by gnss true airspeed is ").partition(" ")
+        assert float(times) == pytest.approx(1 / told, rel=0.03)
+        assert rest == f"times what it says{as_made}: is its unit right?"
+    scale = survey(beside(air=told)).airspeed_scale["airspeed"]
+    assert scale == pytest.approx(1 / told, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("height", "measured", "said"),
+    [
+        (1.0, 1.0, ""),
+        (1.3, 1.0, ""),
+        (1 / 0.3048, 1.0, "3.28|ft told as m"),
+        (0.3048, 1.0, "0.305|m told as ft"),
+        (1.0, 0.3048, "3.28|ft told as m"),
+        (2.0, 1.0, "2|"),
+    ],
+)
+def test_heights_in_another_unit_than_the_barometers_are_told_by_name(height, measured, said):
+    times, _, pair = said.partition("|")
+    as_made = f", as {pair} do" if pair else ""
+    how = f"its heights go {times} times as far up and down as those of barometer{as_made}"
+    assert mistaken(beside(height=height, measured=measured)) == (
+        [f"gnss: {how}: are the units of both right?"] if said else []
+    )
+
+
+def test_a_barometer_of_another_flight_tells_no_unit():
+    """It goes up and down by tens of metres, and otherwise than the receiver does."""
+    other = [
+        BarometerSample(one.t, one.t, float(isa_pressure(400 + 40 * math.sin(one.t / 7)))) for one in FIXES
+    ]  # fmt: skip
+    assert mistaken(replace(log(), samples={"gnss": FIXES, "barometer": other})) == []
+
+
+def test_six_climbs_show_velocities_down_that_are_reversed():
+    first = int((STANDS + 4) * 5)
+    (said,) = mistaken(log(fixes=with_velocities(lambda v: v * [1, 1, -1])[: first + 8 * 25]))
+    assert said.startswith("gnss: its positions climb otherwise than its velocities say (10")
 
 
 def test_a_short_log_says_nothing():

@@ -30,7 +30,7 @@ def rows(table: Any, mark: str, decimal: str = ".") -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("mark", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), (" ", "."), ("   ", ".")]
+    ("mark", "decimal"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), (" ", "."), ("   ", ".")]
 )
 @pytest.mark.parametrize(
     ("above", "named"),
@@ -336,9 +336,22 @@ def test_a_comma_among_decimal_points_parts_no_numbers(tmp_path: Path) -> None:
     assert load(tmp_path / "a.csv").numbers["x"].tolist() == [1.5] * 3
 
 
-def test_a_time_of_day_without_a_date_is_text(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("Time,a\n00:00:01,1.5\n00:00:02,2.5\n")
-    assert load(tmp_path / "a.csv").others["Time"] == 'holds text, first "00:00:01" in row 1'
+@pytest.mark.parametrize(
+    "said", ["00:00:01", "00:04:10.001007", "07.03.2015 12:04:10.5", "3/7/2015 12:04", "2015-3-7T12:04:10"]
+)
+def test_a_time_that_is_not_read_is_shown_with_how_times_are(said: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"Time,a\n{said},1.5\n{said},2.5\n")
+    advice = (
+        "dates are read as ISO 8601 has them, 2015-03-07T12:04:10.5, and times of day beside a column of such dates,"
+        " 2015-03-07: write them so, or give seconds as numbers"
+    )
+    assert load(tmp_path / "a.csv").others["Time"] == f'holds text, first "{said}" in row 1: {advice}'
+
+
+def test_a_decimal_comma_that_is_not_read_is_shown_with_how_they_are(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text('t,a\n0,"2,75"\n1,"3,25"\n')
+    advice = "decimal commas are read where semicolons or tabs part the fields, and none of these has a point"
+    assert load(tmp_path / "a.csv").others["a"] == f'holds text, first "2,75" in row 1: {advice}'
 
 
 def test_each_quantity_may_have_its_file(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import io
 import math
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -100,8 +101,17 @@ def test_a_draft_takes_the_magnetometer_that_is_sound(factor: float, tmp_path: P
     text = draft.scenario(flown(tmp_path, factor=factor, second=True), tmp_path / "x", None)
     taken = "magnetometer" if factor == 1.0 else "magnetometer2"
     assert f'aids = ["gnss", "barometer", "{taken}"]' in text
-    alone = draft.scenario(flown(tmp_path, factor=factor), tmp_path / "x", None)
-    assert 'aids = ["gnss", "barometer", "magnetometer"]' in alone
+
+
+def test_a_draft_leaves_out_of_aids_what_its_note_says_to_leave_out(tmp_path: Path) -> None:
+    """An INS whose magnetometer was noted as unfit, and was among its aids, never aligned."""
+    found = flown(tmp_path, factor=1.5)
+    text = draft.scenario(found, tmp_path / "x", None)
+    assert [one["aids"] for one in tomllib.loads(text)["estimator"]] == [["gnss", "barometer"], ["barometer"]]
+    (said,) = magnetometers(found).values()
+    assert f"[sensors.magnetometer]\n# Among no estimator's aids: {said}\n" in text
+    thin = draft.scenario(flown(tmp_path, air=0.5), tmp_path / "x", None)
+    assert [one["aids"] for one in tomllib.loads(thin)["estimator"]] == [["gnss", "magnetometer"], ["magnetometer"]]
 
 
 @pytest.mark.parametrize(("air", "where"), [(1.0, ""), (0.95, ""), (0.5, "5394 m above"), (2.0, "6143 m below")])

@@ -333,3 +333,15 @@ def test_the_map_is_grey_where_a_reference_is_silent(tab: Page, tmp_path: Path) 
     known = known[np.isfinite(known).all(axis=1)]
     assert len(known) >= 0.9 * inside.sum()
     assert np.ptp(known, axis=0).max() > 1.0  # m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("off", "shown"), [(600.0, True), (4000.0, False)])
+def test_the_map_opens_at_estimates_that_went_astray(tab: Page, tmp_path: Path, off: float, shown: bool) -> None:
+    """One that was led away left it at the top; one that is lost does not make the flight a dot."""
+    led = synthetic_run.dataset(60.0, {"ins": Errors()})  # on a circle of 800 m
+    led["estimators/ins/lat"].values[300:] += off / 6.36e6
+    tab.open(write(led, tmp_path / "report.html"), WHOLE)
+    highest = tab.run("Math.max(...page.planes[0].tracks[0].n.filter(Number.isFinite))")
+    assert (tab.run("page.planes[0].figure.y_range.end") > highest) == shown
+    assert tab.run("page.planes[0].figure.y_range.end - page.planes[0].figure.y_range.start") < 5000

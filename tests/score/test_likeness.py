@@ -60,7 +60,7 @@ def test_bands_have_the_power_of_what_shakes_in_them() -> None:
     rows = likeness.compare(survey(toy(2.0)), survey(toy(0.5, gap=True)))
     row = found(rows, "specific force in motion, 8 to 32 Hz, rms")
     assert row.flight == pytest.approx(2.0 / math.sqrt(2), rel=0.02)
-    assert row.simulation == pytest.approx(0.5 / math.sqrt(2), rel=0.05)
+    assert row.other == pytest.approx(0.5 / math.sqrt(2), rel=0.05)
     assert not row.alike
     assert row.ratio == pytest.approx(0.25, rel=0.05)
     mean_square, _ = integrate.quad(lambda s: (3.0 * math.sin(2 * math.pi * s)) ** 2, 0.0, 1.0)
@@ -83,7 +83,7 @@ def test_what_only_one_has_is_not_alike_and_what_neither_has_is_no_row() -> None
     late = replace(flight, latency={"gnss": Late(0.2, 0.0)})
     row = found(likeness.compare(late, flight), "velocity is told of later by")
     assert row.flight == 0.2
-    assert math.isnan(row.simulation)
+    assert math.isnan(row.other)
     assert not row.alike
     assert not [one for one in likeness.compare(flight, flight) if one.what == row.what]
 
@@ -101,7 +101,7 @@ def test_a_receiver_that_is_not_late_is_compared_like_any(lag: float, alike: boo
 
 
 @pytest.mark.parametrize(
-    ("flight", "simulation", "said"),
+    ("flight", "other", "said"),
     [
         (0.9, -0.9, "of the other sign"),
         (5.0, 0.0, "only the flight has any"),
@@ -111,10 +111,13 @@ def test_a_receiver_that_is_not_late_is_compared_like_any(lag: float, alike: boo
         (0.05, -0.04, "alike"),  # within the slack
     ],
 )
-def test_what_is_said_of_figures_that_differ(flight: float, simulation: float, said: str) -> None:
-    row = Row("ins: airspeed", "correlation with the innovation before", "", flight, simulation, slack=0.1)
+def test_what_is_said_of_figures_that_differ(flight: float, other: float, said: str) -> None:
+    row = Row("ins: airspeed", "correlation with the innovation before", "", flight, other, slack=0.1)
     assert row.alike == (said == "alike")
-    assert beside([row]).columns[4]._cells[0].removeprefix("[red]").removesuffix("[/]") == said
+    assert beside([row], "simulation").columns[4]._cells[0].removeprefix("[red]").removesuffix("[/]") == said
+    assert beside([row], "other log").columns[3].header == "other log"
+    for_a_log = beside([row], "other log").columns[4]._cells[0].removeprefix("[red]").removesuffix("[/]")
+    assert for_a_log == said.replace("simulation", "other log")
 
 
 def test_a_flight_of_other_sensors_is_refused() -> None:
@@ -146,4 +149,9 @@ def test_a_run_and_its_rerun_are_compared_by_their_innovations(
     assert "No such file" in command("log", "flight/run.nc", "--compare", "nowhere.nc")
     shown = command("log", "recorded_flight.bin", "--compare", "recorded_flight.toml")  # shipped, a scenario of it
     assert "22 figures, 22 of them alike" in shown
+    assert " other log " in shown
+    assert " simulation " not in shown
+    command("run", "recorded_flight", "--out", "again", *short, "--set", "duration_s=110")
+    assert " other log " in command("log", "recorded_flight.bin", "--compare", "again/run.nc")
+    assert " simulation " in command("log", "recorded_flight.bin", "--compare", "simulation/run.nc")
     assert "is a scenario without a log" in command("log", "flight/run.nc", "--compare", "u_turn.toml")

@@ -1,6 +1,7 @@
 // The map, and beside it the errors at the cursor with the ellipses that are claimed of them.
 
 const CORNERS = 72;
+const [LEAST_SIDE, ASTRAY] = [10, 3]; // of what is shown [m]; estimates are, to so many times the side of the reference
 const markersAt = (source, points) =>
   (source.data = { x: points.map((p) => p.x), y: points.map((p) => p.y), colour: points.map((p) => p.colour) });
 
@@ -30,6 +31,18 @@ function bridged(t, values) {
     if (after == k || before == undefined || after == undefined) return value;
     return values[before] + ((values[after] - values[before]) * (t[k] - t[before])) / (t[after] - t[before]);
   });
+}
+
+/** The box about all known places of tracks, and its longer side; west is beyond east where none is known. */
+function extent(tracks) {
+  let [west, east, south, north] = [Infinity, -Infinity, Infinity, -Infinity];
+  for (const { n, e } of tracks)
+    for (let k = 0; k < n.length; k++) {
+      if (!(Number.isFinite(n[k]) && Number.isFinite(e[k]))) continue;
+      [west, east] = [Math.min(west, e[k]), Math.max(east, e[k])];
+      [south, north] = [Math.min(south, n[k]), Math.max(north, n[k])];
+    }
+  return { west, east, south, north, side: Math.max(east - west, north - south) };
 }
 
 /** A square view of places; ranges are set so that a metre is as long in both directions. */
@@ -208,20 +221,14 @@ class Chart extends Plane {
     this.fit(at.x, at.y, (factor * (x.end - x.start)) / 2, (factor * (y.end - y.start)) / 2);
   }
 
-  /** All of truth, or of the estimates where there is none. */
+  /** All of truth and of the estimates that stay near it; of all estimates where there is no truth. */
   whole() {
-    let [west, east, south, north] = [Infinity, -Infinity, Infinity, -Infinity];
-    const reach = ({ n, e }) => {
-      for (let k = 0; k < n.length; k++) {
-        if (!(Number.isFinite(n[k]) && Number.isFinite(e[k]))) continue;
-        [west, east] = [Math.min(west, e[k]), Math.max(east, e[k])];
-        [south, north] = [Math.min(south, n[k]), Math.max(north, n[k])];
-      }
-    };
-    this.truths.forEach(reach);
-    if (west > east) this.tracks.forEach(reach);
+    const far = ASTRAY * Math.max(extent(this.truths).side, LEAST_SIDE);
+    const near = this.tracks.filter((one) => extent([...this.truths, one]).side <= far);
+    const known = Number.isFinite(extent(this.truths).side);
+    const { west, east, south, north, side } = extent(known ? [...this.truths, ...near] : this.tracks);
     if (west > east) return;
-    const half = Math.max((east - west) / 2, (north - south) / 2, 5);
+    const half = Math.max(side, LEAST_SIDE) / 2;
     const narrow = (width) => Math.max(0.55 * width, 0.1 * half, 5);
     this.fit((west + east) / 2, (south + north) / 2, narrow(east - west), narrow(north - south));
     const { x_range: x, y_range: y } = this.figure;
