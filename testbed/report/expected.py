@@ -27,7 +27,8 @@ HEAD = """# What the shipped scenarios promise
 Each line is a bound of a scenario's `[expect]`, over seeds that nobody looked at before: the share of runs that keep
 it, the median, and what 95 % of the runs keep, each with the interval that holds it with 95 % confidence (order
 statistics, and Clopper and Pearson's for the share; an end that so few runs can't tell is infinite).
-[Many seeds](regression.md) says how to fly them again.
+Of an even number of runs the median of a section saved before 2026-11-30 is the lower of the two in the middle, later
+halfway between them. [Many seeds](regression.md) says how to fly them again.
 """
 
 
