@@ -312,6 +312,7 @@ class _Passage:
         self.backlog[name].add(tracked.votes, tracked.reports)
         if lane.failure and name not in self.ended:
             self.ended[name] = lane.failure
+            self.recorder.attributes["ended"] = json.dumps(self.ended)
             self.told.emit(float(turn.reference.t[-1]), "error", f"{name} has ended: {lane.failure}")
         return tracked
 

@@ -17,6 +17,7 @@ from testbed.errors import UserError
 from testbed.estimators.custom import CustomSection, build
 from testbed.many import campaign as campaigns
 from testbed.many import check
+from testbed.score import accuracy
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 TEMPLATE = Path(__file__).parents[2] / "testbed/template/first.toml"
@@ -208,6 +209,7 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
     events = result.dataset["events"]
     (told,) = [text for text in events["text"].values.tolist() if "has ended" in text]
     assert told == remark
+    assert f"mine has ended: {accuracy.ended(result.dataset)['mine']}" == remark
     assert np.isnan(result.dataset["estimators/mine/lat"].values[-1])
     before, after = ours(healthy), ours(result)
     assert before.keys() == after.keys()
@@ -217,19 +219,21 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
 @pytest.mark.ci
 def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None:
     """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure."""
-    overrides = ["duration_s=8", "estimator[1].after_s=5", 'expect={"ins.aligned_s"=60}']
+    expected = 'expect={"ins.aligned_s"=60, "mine.aligned_s"=60}'
+    overrides = ["duration_s=8", "estimator[1].after_s=5", expected]
     flown = partial(campaigns.fly, campaigns.Plan(folder / "own.toml", 1, tmp_path / "many", overrides=overrides))
     for result in (flown(), flown()):  # the second finds what the first has stored
         assert result.failures == []
         (told,) = result.ended()
         assert told.startswith("mine has ended in seed 1: RuntimeError: lost its way (filters.py, line")
+        assert [one.share.value for one in result.statistics.expected] == [1.0, 0.0]
     (kept,) = json.loads((tmp_path / "many/campaign.json").read_text("utf-8"))["ended"]
     assert (kept["seed"], kept["estimator"]) == (1, "mine")
     assert kept["message"].startswith("RuntimeError: lost its way")
     assert "mine has ended: RuntimeError: lost its way" in (tmp_path / "many/report.html").read_text("utf-8")
     scenario = Scenario.load(folder / "own.toml", overrides)
     outcome = check.fly(check.Task("own", scenario, tmp_path / "one", None))
-    assert [row.verdict for row in outcome.rows] == ["kept"]
+    assert [row.verdict for row in outcome.rows] == ["kept", "kept"]
     assert outcome.failed
     assert "FAILED" in str(outcome)
     assert "mine has ended: RuntimeError: lost its way (filters.py, line" in str(outcome)
