@@ -828,6 +828,8 @@ def test_how_many_runs_keep_what_is_expected(tmp_path: Path) -> None:
     assert math.isinf(largest.most[2])  # 95 % of all runs: thirty can't tell
     assert recovery.share[0] == 29 / 30
     assert nothing.share[0] == 0.0
+    assert [one.missing for one in result.statistics.expected] == [0, 0, 1, 30]
+    assert recovery.row[2].endswith(" %, missing in 1")
     assert largest.row[:2] == ("ins.position_horizontal_rms_m", "≤ 20")
     titles = [text.title for text in campaign_report.texts(result)]
     assert titles[-1] == "[expect] over the runs"
