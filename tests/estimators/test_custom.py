@@ -9,8 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from worlds.loop import same
 
+import testbed.__main__ as cli
 from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
@@ -217,8 +219,8 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
 
 
 @pytest.mark.ci
-def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None:
-    """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure."""
+def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure; by its record."""
     expected = 'expect={"ins.aligned_s"=60, "mine.aligned_s"=60}'
     overrides = ["duration_s=8", "estimator[1].after_s=5", expected]
     flown = partial(campaigns.fly, campaigns.Plan(folder / "own.toml", 1, tmp_path / "many", overrides=overrides))
@@ -237,6 +239,9 @@ def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None
     assert outcome.failed
     assert "FAILED" in str(outcome)
     assert "mine has ended: RuntimeError: lost its way (filters.py, line" in str(outcome)
+    monkeypatch.setattr(cli, "conclude", lambda *_: None)  # figures take long
+    again = CliRunner().invoke(cli.app, ["report", str(tmp_path / "one/run.nc")])
+    assert "mine has ended: RuntimeError: lost its way (filters.py, line" in again.output
 
 
 def test_what_it_does_to_its_samples_is_its_own_affair(folder: Path, healthy) -> None:
