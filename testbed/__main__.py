@@ -194,7 +194,7 @@ def check(
 def report(run_file: RunFile, force: Force = False) -> None:
     """Write figures and report.html again from a run file, beside it."""
     from testbed.record.reader import load
-    from testbed.score import metrics
+    from testbed.score import accuracy, metrics
     from testbed.score.remarks import remarks
 
     dataset = load(run_file)
@@ -202,6 +202,8 @@ def report(run_file: RunFile, force: Force = False) -> None:
         computed = metrics.compute(dataset)
     except UserError as error:
         raise error.within(str(run_file)) from None
+    for name, why in accuracy.ended(dataset).items():
+        remark(f"{name} has ended: {why}")
     for text in remarks(dataset, computed):
         remark(text)
     kept = run_file.parent / METRICS

@@ -72,7 +72,8 @@ def _case(path: Path, name: str) -> tuple[Case, Run]:
     loaded = [(int(dataset.attrs.get("seed", 0)), record, dataset) for record in records for dataset in [load(record)]]
     scored = [(seed, _metrics(record, dataset)) for seed, record, dataset in loaded]
     _, _, shown = min(loaded, key=lambda one: one[:2])
-    return Case(name, accuracy.names(shown), scored), Run(shown)
+    ended = {one: why for _, _, dataset in loaded for one, why in accuracy.ended(dataset).items()}
+    return Case(name, accuracy.names(shown), scored, ended), Run(shown)
 
 
 def _metrics(record: Path, dataset: xarray.DataTree) -> dict[str, float]:

@@ -259,6 +259,7 @@ class _Passage:
         self.showing = Showing(setup.links, publish, behind[setup.shown] if setup.shown else 0.0)
         self.row = 0  # of the turn, that is looked at for events
         self.ended: dict[str, str] = {}  # estimators that have ended by an error of their own, and why
+        self.ending: dict[str, float] = {}  # when those of this turn did [s]
 
     def _behind(self, lane: Lane) -> float:
         """Between a tick and what a filter has surely used by then [s]: an increment may not be complete yet."""
@@ -340,6 +341,7 @@ class _Passage:
         quiet = not self.watch.heeds_fused and all(one.plain for one in self.backlog.values())
         telling = {name: one for name, one in told.items() if one.news or not quiet}
         looked = slice(rows.start, None, rows.step)
+        self.ending = {name: lane.ended for name, lane in self.lanes.items() if lane.failure}
         for row, t, leg in zip(rows, block.t[looked].tolist(), block.leg[looked].tolist(), strict=True):
             self.row = row
             self._look(t, leg, telling, row)
@@ -356,7 +358,7 @@ class _Passage:
         """Look for events at ``t``, row ``k`` of a turn."""
         for event in self.feed.take_events(t):
             self._emit(*event)
-        self._tell_ended(t, [name for name, lane in self.lanes.items() if lane.ended <= t + COINCIDENT])
+        self._tell_ended(t, [name for name, ended in self.ending.items() if ended <= t + COINCIDENT])
         while self.arrived and self.arrived[0][0] <= t:
             when, _, samples, which = self.arrived.popleft()
             self.watch.sample(when, samples, which)
@@ -372,6 +374,7 @@ class _Passage:
         for name in names:
             if name not in self.ended:
                 self.ended[name] = self.lanes[name].failure
+                self.recorder.attributes["ended"] = json.dumps(self.ended)
                 self._emit(t, "error", f"{name} has ended: {self.ended[name]}")
 
     def conclude(self) -> list[str]:

@@ -54,8 +54,8 @@ SOUND = (*QUIET, "better", "updated")  # and all that are no failure
 class Row:
     """One metric beside what it should be, and the verdict: what follows from [expect], or from a golden value.
 
-    The former is kept or exceeded; the latter same, better, worse, or changed where no way is better; missing when the
-    run has none, new when there is no golden value, updated when the golden value has been written anew.
+    The former is kept or exceeded; the latter same, better, worse, or changed where no way is better, new when there is
+    no golden value, updated when the golden value has been written anew. Both are missing when the run has none.
     """
 
     metric: str
@@ -242,12 +242,12 @@ NONE = Bounds(max=0.0)
 
 
 def judge(expect: Mapping[str, Bounds], metrics: Mapping[str, float]) -> list[Row]:
-    """Each expected metric beside its bounds. One that is missing, or NaN, exceeds them, but for a count of none."""
+    """Each expected metric beside its bounds; one that is missing, but for a count of none, is no better."""
     rows = []
     for key, bounds in expect.items():
         now = metrics.get(key, 0.0 if key.endswith(LOST) else None)
-        kept = bounds.hold(math.nan if now is None else now)
-        rows.append(Row(key, str(bounds), now, "kept" if kept else "exceeded", False))
+        verdict = "missing" if now is None else "kept" if bounds.hold(now) else "exceeded"
+        rows.append(Row(key, str(bounds), now, verdict, False))
     return rows
 
 

@@ -27,6 +27,7 @@ IN_JSON: Mapping[str, type] = {
     "versions": dict,
     "estimated_point_b_m": dict,
     "estimator_imus": dict,
+    "ended": dict,
     "reference_sigma_n": list,
     "reference_point_b_m": list,
 }

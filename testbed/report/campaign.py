@@ -1,12 +1,12 @@
 """What the runs of a campaign say together: statistics, tables, figures.
 
-Median, 95th percentile and worst are over the runs of one combination of varied values: what half of them, or 95 %, do
-not exceed (`testbed.score.claims`). An interval of a quantile is from one order statistic to another, and holds the
-quantile of all draws with at least 95 %, whatever the distribution (Conover, Practical Nonparametric Statistics, 1999,
-3.2). Consistency is judged by the position NEES: over n independent runs of a filter whose covariance is right, the sum
-at one instant is chi-square with 3 n degrees of freedom, so that the mean per degree of freedom lies between the 2.5 %
-and 97.5 % points of chi2(3 n) / (3 n) at 95 % of all instants (Bar-Shalom, Li, Kirubarajan, Estimation with
-Applications to Tracking and Navigation, 2001, 5.4).
+Median, 95th percentile and worst are over the runs of one combination of varied values: the median as usual, the
+percentile what 95 % of them do not exceed (`testbed.score.claims`). An interval of a quantile is from one order
+statistic to another, and holds the quantile of all draws with at least 95 %, whatever the distribution (Conover,
+Practical Nonparametric Statistics, 1999, 3.2). Consistency is judged by the position NEES: over n independent runs of a
+filter whose covariance is right, the sum at one instant is chi-square with 3 n degrees of freedom, so that the mean per
+degree of freedom lies between the 2.5 % and 97.5 % points of chi2(3 n) / (3 n) at 95 % of all instants (Bar-Shalom, Li,
+Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4).
 """
 
 from __future__ import annotations

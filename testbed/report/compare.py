@@ -24,7 +24,9 @@ def console_table(block: Block) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(title=escape(f"{block.second} against {block.first}"), title_justify="left", caption=block.note)
+    table = Table(
+        title=escape(f"{block.second} against {block.first}"), title_justify="left", caption=escape(block.note)
+    )
     for k, name in enumerate(map(escape, block.head)):
         table.add_column(name, justify="left" if k in (0, 4) else "right", overflow="fold")
     for row in block.rows:

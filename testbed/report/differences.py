@@ -31,6 +31,7 @@ class Block:
     first: str
     second: str
     rows: Sequence[Difference]
+    lacking: Sequence[str] = ()  # why there is no verdict
 
     @property
     def head(self) -> tuple[str, ...]:
@@ -49,6 +50,8 @@ class Block:
     @property
     def note(self) -> str:
         """Which statistic it is, or why there is none."""
+        if self.lacking:
+            return f"No verdict, as not all of the run is scored: {'; '.join(self.lacking)}."
         pairs = max(row.runs for row in self.rows)
         if pairs < 2:
             return ALONE
@@ -58,7 +61,10 @@ class Block:
 
 def blocks(cases: Sequence[Case]) -> list[Block]:
     """The tables of differences, those without a row left out."""
-    found = [Block(str(one), str(two), differences(one, two, METRICS)) for one, two in sides(cases)]
+    found = [
+        Block(str(one), str(two), differences(one, two, METRICS), [side.lacking for side in (one, two) if side.lacking])
+        for one, two in sides(cases)
+    ]
     return [block for block in found if block.rows]
 
 

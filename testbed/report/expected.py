@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from nav.samples import Array
 from testbed.data import data_dir, docs_dir, write_file
 from testbed.errors import UserError
 from testbed.report import markdown
@@ -27,7 +26,8 @@ HEAD = """# What the shipped scenarios promise
 Each line is a bound of a scenario's `[expect]`, over seeds that nobody looked at before: the share of runs that keep
 it, the median, and what 95 % of the runs keep, each with the interval that holds it with 95 % confidence (order
 statistics, and Clopper and Pearson's for the share; an end that so few runs can't tell is infinite).
-[Many seeds](regression.md) says how to fly them again.
+Of an even number of runs the median of a section saved before 2026-11-30 is the lower of the two in the middle, later
+halfway between them. [Many seeds](regression.md) says how to fly them again.
 """
 
 
@@ -36,7 +36,7 @@ class Kept:
     """One bound of [expect] over the runs of one combination.
 
     ``share`` is that of the runs which keep it; ``most`` is what 95 % of them do not exceed, or, ``at_least``, do not
-    stay below. A run that lacks the metric keeps nothing.
+    stay below. A run that lacks the metric, or whose estimator has ended, keeps nothing; ``missing`` lack it.
     """
 
     combination: int
@@ -47,32 +47,36 @@ class Kept:
     median: Interval
     most: Interval
     runs: int
+    missing: int
 
     @property
     def row(self) -> tuple[str, ...]:
         """Under `COLUMNS`."""
         sign = "≥" if self.at_least else "≤"
         share = Interval(*(100 * one for one in self.share))
-        return self.metric, f"{sign} {self.bound:g}", f"{share} %", f"{self.median}", f"{sign} {self.most}"
+        kept_by = f"{share} %" + (f", missing in {self.missing}" if self.missing else "")
+        return self.metric, f"{sign} {self.bound:g}", kept_by, f"{self.median}", f"{sign} {self.most}"
 
 
 def kept(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Iterator[Kept]:
     """Every bound, one combination after the other."""
     for i, combination in enumerate(combinations):
-        own = [outcome.metrics for outcome in outcomes if outcome.combination == i]
+        own = [outcome for outcome in outcomes if outcome.combination == i]
         for metric, bounds in combination.scenario.expect.items() if own else ():
             for bound, at_least in ((bounds.min, True), (bounds.max, False)):
                 if bound is not None:
-                    missing = -math.inf if at_least else math.inf
-                    values = np.array([metrics.get(metric, missing) for metrics in own])
-                    yield _kept(i, metric, bound, at_least, np.where(np.isnan(values), missing, values))
+                    yield _kept(i, metric, bound, at_least, own)
 
 
-def _kept(combination: int, metric: str, bound: float, at_least: bool, values: Array) -> Kept:
+def _kept(combination: int, metric: str, bound: float, at_least: bool, outcomes: Sequence[Outcome]) -> Kept:
+    worst = -math.inf if at_least else math.inf
+    whose = metric.partition(".")[0]
+    values = np.array([worst if whose in one.ended else one.metrics.get(metric, worst) for one in outcomes])
     holds = values >= bound if at_least else values <= bound
-    most = (HARDLY_ANY if at_least else NEARLY_ALL).of(values)
     return Kept(
-        combination, metric, bound, at_least, SHARE.of(holds.astype(float)), MEDIAN.of(values), most, len(values)
+        combination, metric, bound, at_least, share=SHARE.of(holds.astype(float)), median=MEDIAN.of(values),
+        most=(HARDLY_ANY if at_least else NEARLY_ALL).of(values), runs=len(values),
+        missing=sum(metric not in one.metrics for one in outcomes),
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from testbed.report.figures import CHAPTERS
 from testbed.report.interactive.contents import events
 from testbed.report.run import Run
 from testbed.results import REPORT, held, write_result
+from testbed.score import accuracy
 from testbed.score.differences import Case
 from testbed.score.remarks import remarks
 
@@ -91,7 +92,8 @@ def content(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
     attributes = run.dataset.attrs
     contents = interactive.contents([interactive.Shown("", run)])
     summary = tables.summary(metrics)
-    beside = Case("", summary.names, [(0, metrics)])
+    ended = accuracy.ended(run.dataset)
+    beside = Case("", summary.names, [(0, metrics)], ended)
     return {
         "contents": contents,
         "script": script_of(contents),
@@ -99,7 +101,7 @@ def content(run: Run, metrics: Mapping[str, float]) -> dict[str, Any]:
         "duration_s": float(run.t[-1]),
         "seed": attributes.get("seed", ""),
         "complete": bool(attributes.get("complete", 1)),
-        "remarks": remarks(run.dataset, metrics),
+        "remarks": [*(f"{name} has ended: {why}" for name, why in ended.items()), *remarks(run.dataset, metrics)],
         "summary": summary,
         "against": differences.with_cells(differences.blocks([beside])),
         "faults": tables.faults(run.faults, metrics),

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from nav.terrain import Terrain
 from nav.terrain import ground as height_of_ground
-from testbed import measures
 from testbed.errors import UserError, unknown
 from testbed.estimators.ahrs import AhrsSection
 from testbed.estimators.outside import OutsideSection
@@ -18,7 +16,7 @@ from testbed.motion import aircraft, guidance, terrain
 from testbed.motion.logged import LogTruth
 from testbed.motion.sections import FlightTruth, KinematicTruth
 from testbed.motion.weather import strongest
-from testbed.scenario import keypath
+from testbed.scenario import expected, keypath
 from testbed.scenario.keypath import KeyPath
 from testbed.schema import IDENTIFIER, LONGEST_RUN_S
 from testbed.sensors import SensorConfig, faults
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
     from testbed.scenario.schema import Scenario
 
 LONGEST_NAME = 32  # as the record keeps them
-EXPECT_KEY = re.compile(r"(?P<whose>[A-Za-z_][A-Za-z0-9_]*)\.(?P<metric>[a-z0-9_]+(\.[A-Za-z0-9_]+)*)")
 ON_THE_GROUND_M = 1.0  # as near as the height of a start must be told
 RESERVED = frozenset({"run", "flight", "truth"})  # `run.wall_s` and the like would become ambiguous
 
@@ -55,8 +52,7 @@ def found(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
         taken |= set(estimator.recorded)
     yield from _address_mistakes(scenario)
     yield from _autopilot_mistakes(scenario)
-    for key in scenario.expect:
-        yield from _expect_mistakes(key, taken)
+    yield from expected.mistakes(scenario, taken)
 
 
 def _plan_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
@@ -275,24 +271,6 @@ def _autopilot_mistakes(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
     if known[feedback.position].attitude_only and "barometer" not in kinds:
         text = f"{feedback.position!r} estimates attitude alone, and height must come from a barometer"
         yield where, f"{text}: add [sensors.barometer], or take the position of another estimator"
-
-
-def _expect_mistakes(key: str, estimators: set[str]) -> Iterator[tuple[KeyPath, str]]:
-    """What is wrong with the name of an expected metric: no run of the scenario could have it."""
-    path: KeyPath = ("expect", key)
-    match = EXPECT_KEY.fullmatch(key)
-    if not match:
-        yield (
-            path,
-            'is no metric: write it quoted as "<estimator>.<quantity>_<statistic>_<unit>", such as'
-            ' "ins.position_horizontal_rms_m" = 5.0',
-        )
-        return
-    whose, metric = match["whose"], match["metric"]
-    if whose not in estimators | {"run", "flight"}:
-        yield path, unknown("estimator", whose, sorted(estimators | {"run", "flight"}))
-    elif measures.find(key) is None:
-        yield path, unknown("metric", metric, measures.names(whose))
 
 
 def _divides(path: KeyPath, rate_hz: float, tick_hz: float) -> Iterator[tuple[KeyPath, str]]:

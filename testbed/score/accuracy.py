@@ -102,6 +102,11 @@ def names(dataset: xarray.DataTree) -> list[str]:
     return sorted(found, key=lambda name: order.index(name) if name in order else len(order))
 
 
+def ended(dataset: xarray.DataTree) -> dict[str, str]:
+    """The estimators that ended by errors of their own before the run did, and why."""
+    return {str(name): str(why) for name, why in json.loads(str(dataset.attrs.get("ended", "{}"))).items()}
+
+
 def aids(dataset: xarray.DataTree, estimator: str) -> list[str]:
     """The aids whose innovations one estimator reported."""
     children = dataset.children["estimators"].children[estimator].children

@@ -63,7 +63,9 @@ class Statistic(NamedTuple):
 
 
 def quantile(p: float) -> Statistic:
-    """The ``p`` quantile: an order statistic, between two others (`scipy.stats.quantile_test`).
+    """The ``p`` quantile, an order statistic, between two others (`scipy.stats.quantile_test`).
+
+    A median is the usual one: of an even number of figures halfway between the two in the middle.
 
     Infinite figures, such as the delay of what was never found, count as the largest.
     """
@@ -73,7 +75,8 @@ def quantile(p: float) -> Statistic:
         ordered = np.sort(values)
         low = -math.inf if first is None else float(ordered[first])
         high = math.inf if last is None else float(ordered[last])
-        return Interval(float(np.quantile(values, p, method="inverted_cdf")), low, high)
+        value = np.median(values) if p == 0.5 else np.quantile(values, p, method="inverted_cdf")
+        return Interval(float(value), low, high)
 
     return Statistic("median" if p == 0.5 else f"{100 * p:g} %", of)
 

@@ -6,31 +6,37 @@ Statistics, 1999, 5.7 and 5.1). Both are two-sided and ask for no distribution; 
 clear as this one is by chance alone. It is not corrected for the number of rows: of twenty that differ by chance alone,
 one is below 0.05. One pair has no significance, and up to five pairs can have none below 0.05: p is 2 / 2^n at the
 least. Rows of a single run are no further samples, as errors are correlated over minutes.
+
+There is no verdict on an estimator that ended before the run, or gave estimates that are not finite: its metrics are of
+another, shorter part of the run than the other's.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from testbed import measures
+from testbed.score.remarks import LOST
 
 SIGNIFICANT = 0.05
+NO_VERDICT = "none"
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
     """Runs that are alike but for their seeds: for each, its seed and its metrics. ``estimators`` are those of all.
 
-    Without a ``name`` its estimators go by their own.
+    Without a ``name`` its estimators go by their own. ``ended`` are those that ended in any of the runs, and why.
     """
 
     name: str
     estimators: Sequence[str]
     runs: Sequence[tuple[int, Mapping[str, float]]]
+    ended: Mapping[str, str] = field(default_factory=dict)
 
     def values(self, metric: str) -> dict[int, list[float]]:
         """A metric by seed."""
@@ -51,12 +57,21 @@ class Side:
     def __str__(self) -> str:
         return f"{self.case.name}: {self.estimator}" if self.case.name else self.estimator
 
+    @property
+    def lacking(self) -> str:
+        """Why it is scored on less than its runs: it ended, or gave estimates that are not finite; else empty."""
+        if self.estimator in self.case.ended:
+            return f"{self} has ended: {self.case.ended[self.estimator]}"
+        lost = sum(metrics.get(f"{self.estimator}{LOST}", 0) for _, metrics in self.case.runs)
+        return f"{self} gave {lost:.0f} estimates that are not finite" if lost else ""
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
     """One metric of both sides: means over ``runs`` pairs, or over all if these are not ``paired``.
 
-    ``verdict``: same, better, worse or changed, by the tolerance of the metric. ``p`` is NaN where nothing can be said.
+    ``verdict``: same, better, worse or changed, by the tolerance of the metric; none where a side is `Side.lacking`.
+    ``p`` is NaN where nothing can be said.
     """
 
     metric: str
@@ -87,11 +102,13 @@ def sides(cases: Sequence[Case]) -> Iterator[tuple[Side, Side]]:
 
 def differences(first: Side, second: Side, metrics: Sequence[str]) -> list[Difference]:
     """Each of these metrics that both have; names are without the estimator's."""
+    lacking = first.lacking or second.lacking
     found = []
     for metric in metrics:
         one, two = (side.case.values(f"{side.estimator}.{metric}") for side in (first, second))
         if one and two:
-            found.append(_difference(metric, one, two))
+            row = _difference(metric, one, two)
+            found.append(replace(row, verdict=NO_VERDICT, p=math.nan) if lacking else row)
     return found
 
 

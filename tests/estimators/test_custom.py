@@ -9,8 +9,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from worlds.loop import same
 
+import testbed.__main__ as cli
 from nav.samples import Estimate
 from testbed import Scenario, plugins, run
 from testbed.errors import UserError
@@ -18,6 +20,7 @@ from testbed.estimators.custom import CustomSection, build
 from testbed.loop.loop import EVENTS_S
 from testbed.many import campaign as campaigns
 from testbed.many import check
+from testbed.score import accuracy
 
 EXAMPLES = Path(__file__).parents[2] / "docs/examples"
 TEMPLATE = Path(__file__).parents[2] / "testbed/template/first.toml"
@@ -209,6 +212,7 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
     events = result.dataset["events"]
     (told,) = [text for text in events["text"].values.tolist() if "has ended" in text]
     assert told == remark
+    assert f"mine has ended: {accuracy.ended(result.dataset)['mine']}" == remark
     assert np.isnan(result.dataset["estimators/mine/lat"].values[-1])
     before, after = ours(healthy), ours(result)
     assert before.keys() == after.keys()
@@ -216,24 +220,29 @@ def test_its_failure_ends_only_itself(folder: Path, healthy, how: str, says: str
 
 
 @pytest.mark.ci
-def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path) -> None:
-    """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure."""
-    overrides = ["duration_s=8", "estimator[1].after_s=5", 'expect={"ins.aligned_s"=60}']
+def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a campaign, of which the others' numbers are as good as ever; to a check it is a failure; by its record."""
+    expected = 'expect={"ins.aligned_s"=60, "mine.aligned_s"=60}'
+    overrides = ["duration_s=8", "estimator[1].after_s=5", expected]
     flown = partial(campaigns.fly, campaigns.Plan(folder / "own.toml", 1, tmp_path / "many", overrides=overrides))
     for result in (flown(), flown()):  # the second finds what the first has stored
         assert result.failures == []
         (told,) = result.ended()
         assert told.startswith("mine has ended in seed 1: RuntimeError: lost its way (filters.py, line")
+        assert [one.share.value for one in result.statistics.expected] == [1.0, 0.0]
     (kept,) = json.loads((tmp_path / "many/campaign.json").read_text("utf-8"))["ended"]
     assert (kept["seed"], kept["estimator"]) == (1, "mine")
     assert kept["message"].startswith("RuntimeError: lost its way")
     assert "mine has ended: RuntimeError: lost its way" in (tmp_path / "many/report.html").read_text("utf-8")
     scenario = Scenario.load(folder / "own.toml", overrides)
     outcome = check.fly(check.Task("own", scenario, tmp_path / "one", None))
-    assert [row.verdict for row in outcome.rows] == ["kept"]
+    assert [row.verdict for row in outcome.rows] == ["kept", "kept"]
     assert outcome.failed
     assert "FAILED" in str(outcome)
     assert "mine has ended: RuntimeError: lost its way (filters.py, line" in str(outcome)
+    monkeypatch.setattr(cli, "conclude", lambda *_: None)  # figures take long
+    again = CliRunner().invoke(cli.app, ["report", str(tmp_path / "one/run.nc")])
+    assert "mine has ended: RuntimeError: lost its way (filters.py, line" in again.output
 
 
 def test_what_it_does_to_its_samples_is_its_own_affair(folder: Path, healthy) -> None:

@@ -31,6 +31,7 @@ from worlds import browser, synthetic_run
 import testbed
 from testbed import Scenario, plugins, run
 from testbed.__main__ import app
+from testbed.data import docs_dir
 from testbed.errors import UserError
 from testbed.feeds import simulated
 from testbed.feeds.simulated import motion
@@ -782,7 +783,8 @@ def test_statistics(tmp_path: Path) -> None:
     assert second.inside == 0.0
     assert first.false_alarms_per_h == pytest.approx(0.5)
     rms = next(s for s in statistics.spreads if s.metric == "position_horizontal_rms_m")
-    assert (rms.median, rms.worst, rms.worst_seed, rms.runs) == (14.0, 29.0, 29, 30)  # half do not exceed 14
+    assert (rms.median, rms.worst, rms.worst_seed, rms.runs) == (14.5, 29.0, 29, 30)
+    assert rms.median == made_up_campaign(tmp_path, [""]).frame()[f"ins.{rms.metric}"].median()
     assert rms.p95 == 28.0  # the 29th of 30
     recovery = next(s for s in statistics.spreads if s.metric == "recovery_s")
     assert (recovery.worst, recovery.worst_seed, recovery.runs) == (10.0, 0, 29)
@@ -822,10 +824,12 @@ def test_how_many_runs_keep_what_is_expected(tmp_path: Path) -> None:
     clopper = binomtest(26, 30).proportion_ci(0.95)
     assert least.share == pytest.approx((26 / 30, clopper.low, clopper.high))
     assert (least.at_least, least.bound, least.most[0]) == (True, 4.0, 1.0)
-    assert (largest.share[0], largest.median[0], largest.most[0]) == (21 / 30, 14.0, 28.0)
+    assert (largest.share[0], largest.median[0], largest.most[0]) == (21 / 30, 14.5, 28.0)
     assert math.isinf(largest.most[2])  # 95 % of all runs: thirty can't tell
     assert recovery.share[0] == 29 / 30
     assert nothing.share[0] == 0.0
+    assert [one.missing for one in result.statistics.expected] == [0, 0, 1, 30]
+    assert recovery.row[2].endswith(" %, missing in 1")
     assert largest.row[:2] == ("ins.position_horizontal_rms_m", "≤ 20")
     titles = [text.title for text in campaign_report.texts(result)]
     assert titles[-1] == "[expect] over the runs"
@@ -863,6 +867,7 @@ def test_the_manual_has_a_section_for_each_scenario(tmp_path: Path, monkeypatch:
     assert "--runs 30" not in page
     assert page.count("| ins.recovery_s | ≤ 100 |") == 2
     assert page.startswith(expected.HEAD)
+    assert (docs_dir() / expected.PAGE).read_text("utf-8").startswith(expected.HEAD)
     with pytest.raises(UserError, match="1 runs failed"):
         expected.save(plan, made_up_campaign(tmp_path, ["0"]))
 

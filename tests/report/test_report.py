@@ -321,6 +321,20 @@ def test_a_page_tells_which_estimator_is_better_than_the_first() -> None:
     assert block.note == differences.ALONE
 
 
+def test_a_page_begins_with_who_has_ended_and_says_no_verdict() -> None:
+    run = synthetic_run.dataset(20.0, {"ins": Errors(), "dead_reckoning": Errors()})
+    run.attrs["ended"] = json.dumps({"dead_reckoning": "RuntimeError: lost [its] way"})
+    metric = "position_horizontal_rms_m"
+    found = report.content(Run(run), {f"ins.{metric}": 3.0, f"dead_reckoning.{metric}": 1.0})
+    assert found["remarks"][0] == "dead_reckoning has ended: RuntimeError: lost [its] way"
+    ((block, rows),) = found["against"]
+    assert [cells[4] for _, cells in rows] == ["none"]
+    assert block.note == (
+        "No verdict, as not all of the run is scored: dead_reckoning has ended: RuntimeError: lost [its] way."
+    )
+    assert "dead_reckoning against ins: no verdict</summary>" in report.render("run.html", figures=[], **found)
+
+
 def test_estimators_are_in_the_order_of_the_scenario_whoever_speaks_first() -> None:
     """So that a report has the colours that the run had."""
     run = synthetic_run.dataset(20.0, {"second": Errors(), "first": Errors()})

@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from testbed import sensors
 from testbed.data import data_dir
 from testbed.errors import UserError
+from testbed.estimators.datasheet import aid_of
 from testbed.loop.loop import run
-from testbed.scenario import Scenario
+from testbed.scenario import Scenario, expected
+from testbed.sensors import registry
 from testbed.sensors.faults import Faults
 
 TEXTS = {path.stem: path.read_text("utf-8") for path in sorted(data_dir("scenarios").glob("*.toml"))}
@@ -133,6 +135,17 @@ def line_of(text: str, start: str) -> int:
             'expect."ins.heading_rms": there is no metric "heading_rms": did you mean heading_rms_deg?',
         ),
         ("[expect]", '[expect]\n"ins.nis_mean" = 3', "did you mean nis_mean.<aid>?"),
+        (
+            "[expect]",
+            '[expect]\n"ins.nis_mean.gnss_pos" = 3',
+            'there is no aid of ins "gnss_pos": did you mean gnss_position?',
+        ),
+        (
+            "[expect]",
+            '[expect]\n"ins.nis_mean.range" = 3',
+            'there is no aid of ins "range": choose from gnss_position, gnss_v',
+        ),
+        ("[expect]", '[expect]\n"ins.missed.magy" = 3', 'there is no fault "magy": there is none to choose from'),
         ("[expect]", '[expect]\n"run.wall" = 3', 'there is no metric "wall": did you mean wall_s?'),
         ("[expect]", "[expect]\nins.roll_rms_deg = 3", "expect.ins: takes a maximum, or min and max; a metric's name"),
         ("[expect]", '[expect]\n"ins.x_m" = {}', 'expect."ins.x_m": give a maximum'),
@@ -395,6 +408,48 @@ def test_federated(override: str, said: str) -> None:
     )
     extra = ["estimator[0].aids=[]"] if 'kind="ins"' in override else []
     assert said in complaint(U_TURN, federated, "expect={}", override, *extra)
+
+
+BLOCKED = "fault=[{name='blocked',sensor='airspeed',channel='speed',kind='stuck',window=[60,90],value=5}]"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "key", "said"),
+    [
+        ([BLOCKED], "ins.detection_delay_s.block", 'there is no fault "block": did you mean blocked?'),
+        ([BLOCKED], "ins.detection_delay_s.blocked", ""),
+        (["estimator[0].smooth=true"], "ins_smoothed.nis_mean.barometer", "'ins_smoothed' looks back, and has nothing"),
+        ([], "ins.nis_mean.sideslip", ""),
+        (["sensors.airspeed.slips=true"], "ins.nis_mean.sideslip", 'there is no aid of ins "sideslip"'),
+        (["estimator[0].course={}"], "ins.nis_mean.gnss_course", ""),
+        ([], "ins.nis_mean.gnss_course", 'there is no aid of ins "gnss_course"'),
+        (["estimator[0].zero_velocity_mps=0.1"], "ins.nis_mean.zero_velocity", ""),
+        (["estimator[0].kind=ahrs"], "ins.nis_mean.barometer", 'no aid of ins "barometer": choose from level, magn'),
+        (["estimator[0].kind=ahrs", "estimator[0].aids=['magnetometer']"], "ins.rejected_fraction.level", ""),
+    ],
+)
+def test_what_is_expected_is_of_an_aid_or_a_fault_that_there_is(overrides: list[str], key: str, said: str) -> None:
+    """The whole flight was flown, and then the metric was missing."""
+    given = [*overrides, f"expect={{'{key}'=3}}"]
+    if said:
+        assert f'expect."{key}": ' in complaint(U_TURN, *given)
+        assert said in complaint(U_TURN, *given)
+    else:
+        assert list(Scenario.parse(U_TURN, given).expect) == [key]
+
+
+def test_aids_are_called_what_filters_call_them() -> None:
+    """Of every kind of sensor, with all that its aid may have beside."""
+    kinds = set(registry.BUILT_IN) - {"imu"}
+    assert set(expected.AIDS) == kinds
+    named = ",".join(f"{kind}={{}}" for kind in sorted(kinds - {"position_fix"}))
+    fix = "position_fix={transponder={lat_deg=47,lon_deg=8,range_m=1000}}"
+    rig = Scenario.parse(U_TURN, [f"sensors={{imu={{}},{named},{fix}}}", "expect={}"]).rig(1)
+    for kind, parts in expected.AIDS.items():
+        aid = aid_of(kind, rig, rig.imu_errors("imu"), rig.air(None, None), 0.1)
+        assert aid is not None
+        assert {part for part, _ in aid.parts} >= set(parts) - {"gnss_course", "terrain_fix"}
+        assert {part for part, _ in aid.parts} <= set(parts)
 
 
 def test_federated_without_sharing() -> None:

@@ -38,11 +38,11 @@ def claim(ours: Any, bound: float, **keys: Any) -> Claim:
 
 @pytest.mark.parametrize(("p", "name"), [(0.5, "median"), (0.95, "95 %"), (0.05, "5 %")])
 def test_a_quantile_lies_between_the_binomial_ranks(p: float, name: str) -> None:
-    """Of 1, 2, ... 100 the order statistic is its rank: rank r keeps P(B < r) and P(B >= r), B binomial(100, p)."""
+    """Of 1, 2, ... 100 an order statistic is its rank: rank r keeps P(B < r) and P(B >= r), B binomial(100, p)."""
     statistic = quantile(p)
     found = statistic.of(HUNDRED)
     assert statistic.name == name
-    assert found.value == math.ceil(100 * p)
+    assert found.value == (50.5 if p == 0.5 else math.ceil(100 * p))
     binomial = stats.binom(100, p)
     assert binomial.cdf(found.low - 1) <= 0.025 < binomial.cdf(found.low)
     assert binomial.sf(found.high - 1) <= 0.025 < binomial.sf(found.high - 2)
@@ -57,6 +57,7 @@ def test_too_few_draws_leave_a_quantile_without_an_end() -> None:
 def test_what_was_never_found_counts_as_the_largest() -> None:
     values = np.where(HUNDRED > 70, np.inf, HUNDRED)
     assert MEDIAN.of(values).high < math.inf
+    assert MEDIAN.of(np.array([1.0, 2.0, math.inf, math.inf])).value == math.inf
     assert NEARLY_ALL.of(values) == (math.inf, math.inf, math.inf)
 
 

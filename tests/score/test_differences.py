@@ -64,6 +64,19 @@ def test_one_pair_or_no_difference_says_nothing(before: dict[int, float], after:
     assert not found.significant
 
 
+def test_who_is_not_scored_on_the_whole_run_is_neither_better_nor_worse() -> None:
+    """Of a filter that died after 15 of 90 s the smaller error is of 15 s."""
+    whole, dead = case("a", dict.fromkeys(range(7), 2.0)), case("b", dict.fromkeys(range(7), 1.0))
+    lost = Case("b", ("ins",), [(seed, {**own, "ins.nonfinite_samples": 75.0}) for seed, own in dead.runs])
+    ended = Case("b", ("ins",), dead.runs, {"ins": "RuntimeError: lost"})
+    assert [one.verdict for one in differences(Side(whole, "ins"), Side(dead, "ins"), [METRIC])] == ["better"]
+    for case_, why in ((lost, "b: ins gave 525 estimates"), (ended, "b: ins has ended: RuntimeError: lost")):
+        for first, second in ((whole, case_), (case_, whole)):
+            (found,) = differences(Side(first, "ins"), Side(second, "ins"), [METRIC])
+            assert (found.verdict, found.significant) == ("none", False)
+        assert Side(case_, "ins").lacking.startswith(why)
+
+
 def test_a_filter_without_a_difference_is_found_different_in_a_twentieth_of_trials() -> None:
     rng = np.random.default_rng(1)
     found = []
