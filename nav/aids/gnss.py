@@ -169,7 +169,8 @@ class GnssAid:
 
     def manoeuvre(self, state: State) -> Array:
         """The variance (3,) [m^2/s^2] that accelerating now adds to a velocity that is late by an uncertain time."""
-        return (self.latency_sigma * state.acceleration[0]) ** 2
+        acceleration: Array = state.acceleration[0]
+        return (self.latency_sigma * acceleration) ** 2
 
     def at_points(self, part: str, sample: Sample, at: OperatingPoint, points: Points) -> Array | None:
         """See `AidAtPoints`."""
