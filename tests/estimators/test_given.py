@@ -370,7 +370,7 @@ def test_wherever_it_is_asked_working_folder_and_error_state_are_put_back(
 def test_what_it_raises_is_told_on_one_line() -> None:
     adapter = Adapter(Raising(ValueError("two\nlines, one \x1b[31mred")), TICK_S)
     adapter.predict(IMU)
-    assert adapter.failure.startswith(r"ValueError: two\nlines, one \x1b[31mred (test_given.py, line")
+    assert adapter.failure.startswith(r"ValueError: two lines, one \x1b[31mred (test_given.py, line")
 
 
 def test_a_method_that_cant_be_called_so_is_named() -> None:

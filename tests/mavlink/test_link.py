@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from testbed.errors import UserError
+from testbed.errors import UserError, printable
 from testbed.mavlink.link import connect, connect_all
 
 FRAME = b"\xfd" + bytes(range(60))
@@ -66,7 +66,7 @@ def test_bad_address_is_named(url, complaint):
     with pytest.raises(UserError) as caught:
         connect(url)
     assert complaint in str(caught.value)
-    assert str(caught.value).startswith(f"{url}:")
+    assert str(caught.value).startswith(f"{printable(url)}:")
 
 
 def test_log_cannot_replace_a_folder(tmp_path):
