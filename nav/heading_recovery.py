@@ -18,7 +18,7 @@ from nav.state import State
 from nav.velocity_matching import Matched
 
 DOUBT_S = 1.0  # what is refused for so long may be right
-BELIEVED_S = 10.0  # without such for longer, the filter is
+BELIEVED_S = 10.0  # without such for longer since it began, the filter is
 FALSE_ALARM = 1e-4  # probability that two attitudes as good as they claim contradict each other
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 LIMIT = chi_square_threshold(FALSE_ALARM, 3)
@@ -37,17 +37,20 @@ class HeadingRecovery:
     estimated beside (`nav.alignment.PULL`). One that is farther away than a wrong attitude could have led in the time
     is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what is refused
     is wrong. It is the receiver that the ``alignment`` was made for.
+
+    A filter that has just begun is doubted too, though it fuses everything: what it began on was one reading of a
+    compass, or a course, which bends biases and iron to itself until nothing contradicts it clearly any more.
     """
 
     def __init__(self, alignment: Alignment) -> None:
         self._beginning = alignment.by_accelerations()
-        self.begin()
+        self.begin(math.inf)
 
-    def begin(self) -> None:
-        """Nothing was refused so far."""
+    def begin(self, t: float) -> None:
+        """The filter begins at ``t`` [s], inf before it does: nothing was refused so far."""
         self._refusals: dict[str, Refusals] = {}
-        self._doubted_at = self._refused_at = -math.inf
-        self._alignment: Alignment | None = None
+        self._begun_at = self._doubted_at = self._refused_at = t
+        self._alignment = deepcopy(self._beginning) if math.isfinite(t) else None
 
     @property
     def under_way(self) -> bool:
@@ -92,8 +95,8 @@ class HeadingRecovery:
         if found is None:
             return None
         initial, matched = found
-        lost = sample.t - last_fused > DOUBT_S and _contradicts(matched, state, filters)
-        if lost and self._could_be(sample, state, filters):
+        doubted = sample.t - last_fused > DOUBT_S or sample.t - self._begun_at <= BELIEVED_S
+        if doubted and _contradicts(matched, state, filters) and self._could_be(sample, state, filters):
             return initial
         self._alignment.go_on(sample)
         return None

@@ -86,7 +86,7 @@ class Realignment:
         self._by_gravity: Alignment | None = None
         self._eas = 0.0
         self._fix_at = -math.inf  # when one was heard last
-        self._heading.begin()
+        self._heading.begin(t)
         self._receiver = ""
         self._lost_at = self._moved_at = self._widened = math.nan
 
