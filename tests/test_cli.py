@@ -273,6 +273,7 @@ def test_a_telemetry_log_of_somebody_else_is_kept(testbed: Testbed, tmp_path: Pa
     assert not (tmp_path / "a" / "run.tlog").exists(), "the log of another run is beside the record"
 
 
+@pytest.mark.ci
 def test_metrics_are_those_of_the_whole_record_that_a_killed_run_left(testbed: Testbed, tmp_path: Path) -> None:
     assert testbed("run", "static_bench", *QUICK, "--set", "duration_s=70", "--out", "a").code == 0
     whole = (tmp_path / "a" / "metrics.json").read_bytes()

@@ -248,6 +248,7 @@ def flown(folder: Path, name: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("name", "daemon", "code"), [("Mine", False, 0), ("Mine", True, 0), ("Lacking", False, 2), ("Pooled", False, 0)]
 )
@@ -283,6 +284,7 @@ class Mine:
 """
 
 
+@pytest.mark.ci
 def test_who_closes_the_output_takes_it_from_nobody(tmp_path: Path) -> None:
     """All was flown, and then there was a traceback in place of tables and report, or no metrics."""
     (tmp_path / "mine.py").write_text(CLOSING)

@@ -193,6 +193,7 @@ def test_it_runs_beside_ours_and_is_recorded(healthy) -> None:
     assert healthy.remarks[-1].startswith("mine: its errors are not scored")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("how", "says"),
     [
@@ -257,6 +258,7 @@ def test_same_bits_live_and_batch(folder: Path, healthy) -> None:
     assert same(healthy.dataset, live.dataset)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("flies", ["truth", "ins"])
 def test_its_end_is_told_at_the_same_time_live_and_batch(folder: Path, flies: str) -> None:
     """Where events are looked for, once its first estimate is missing, however long a turn is."""

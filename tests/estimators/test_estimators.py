@@ -411,6 +411,7 @@ def test_a_federation_without_receivers_aligns_with_the_first() -> None:
     assert running.sensors == ("barometer", "gnss", "magnetometer")
 
 
+@pytest.mark.ci
 def test_a_federation_in_a_run() -> None:
     result = run(Scenario.load("u_turn", [*FEDERATED, "duration_s=110"]))
     metrics = result.metrics

@@ -83,6 +83,7 @@ def test_seconds_are_those_of_the_log(solution: tuple[Reference, float], own: fl
     assert flown(written(tmp_path, solution[0])).metrics[RMS] == pytest.approx(own, abs=0.1)
 
 
+@pytest.mark.ci
 def test_a_reference_is_as_good_as_it_says(solution: tuple[Reference, float], tmp_path: Path) -> None:
     """Its variance is a part of what errors should be; nothing else changes."""
     sigma = 3.0

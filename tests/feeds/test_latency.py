@@ -125,6 +125,7 @@ def test_a_told_lever_arm_is_known_to_the_survey_and_the_reference(
     assert float(found[1]) == pytest.approx(0.2, abs=0.011)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("late", [0.0, 0.03])
 def test_a_flight_that_contradicts_the_told_latency_is_believed(late: float, tmp_path: Path) -> None:
     """It was asked only whether it speaks against the least of the grades, 0.1 s, which noise of 0.8 m/s hides."""
@@ -157,6 +158,7 @@ def test_a_receiver_of_the_testbeds_own_record_is_as_late_as_in_a_log_of_it() ->
     assert next(row for row in rows if row.what == "velocity is told of later by").alike
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("late", "vibration", "known"), [(0.2, 1.0, 0.003), (0.2, 8.0, 0.025), (0.02, 3.0, 0.01)])
 def test_how_well_a_latency_is_known_under_vibration(late: float, vibration: float, known: float) -> None:
     """White vibration of 8 m/s^2 made the least misfit of single steps scatter by 0.06 s, and two digits were told.

@@ -150,6 +150,7 @@ def test_a_claim_that_is_missing_hides_no_others():
     assert draft.sections(found)["gnss"]["grade"] == "rtk"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("late", [1.0, 2.4])
 def test_a_receiver_of_another_clock_is_found_and_told(late, tmp_path):
     """Nothing was found, and nothing said but that noise is larger than is told."""

@@ -287,6 +287,7 @@ def unfixed(messages: Messages, until: float) -> Messages:
     ]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("until", [10.0, 100.0])
 @pytest.mark.parametrize("fields", [True, False])
 def test_what_an_autopilot_thinks_before_a_fix_is_not_believed(until: float, fields: bool, tmp_path: Path) -> None:
@@ -356,6 +357,7 @@ def test_places_where_no_aircraft_is_are_not_believed_without_a_receiver_either(
     assert np.array_equal(known, log.solution.t >= 5.0)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("off_deg", "told"), [(0.0, False), (0.001, True)])
 def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, told: bool, tmp_path: Path) -> None:
     log = read(with_solution(circling(), off_deg), tmp_path)  # 12 m/s, for which 16 m are allowed
@@ -410,6 +412,7 @@ def test_a_fast_aircraft_is_no_reason_to_doubt_its_solution(late_s: float, told:
     assert bool(doubt(solution, {"gnss": fixes})) == told
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("later", [0.03, 0.31, 7.0])
 def test_an_inertial_unit_may_begin_later_than_the_log(later: float, tmp_path: Path) -> None:
     """Every sensor is heard from the beginning on, and estimators know that no increments were."""
@@ -421,6 +424,7 @@ def test_an_inertial_unit_may_begin_later_than_the_log(later: float, tmp_path: P
     assert later < aligned[0] < later + 4.0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("until", [0.0, 20.0, 35.0])
 def test_what_can_be_seen_where_nobody_knows_the_motion(until: float, tmp_path: Path) -> None:
     """Of a log without attitude nothing is said; where the autopilot falls silent the last that it said is taken."""

@@ -279,6 +279,7 @@ def test_gnss_denied_sample_says_so() -> None:
     assert all(np.isnan(s.lat) for s in inside)
 
 
+@pytest.mark.ci
 def test_faults_and_only_their_sensor() -> None:
     """A step of one receiver is told, recorded, detected by the gate, and isolated; then all is as before."""
     step = """
@@ -400,6 +401,7 @@ def test_slow_imu_gives_the_same_bits_live_and_batch(imu_hz: int) -> None:
     assert same(batch.dataset, run(scenario, links=[Watcher()], realtime=1000.0).dataset)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("duration_s", [2.0, 2.01, 2.03])
 def test_no_deadline_comes_at_once_after_another(duration_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The last, of the one row that is left over, was missed in every run."""

@@ -63,6 +63,7 @@ def test_what_it_has_compiled_is_there_for_the_run(tmp_path):
     assert run.stderr == ""
 
 
+@pytest.mark.ci
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
 @pytest.mark.parametrize("settings", [{}, {"realtime": 200.0}])
 def test_a_run_is_the_same_with_it_and_leaves_no_process(settings, monkeypatch):

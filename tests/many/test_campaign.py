@@ -458,6 +458,7 @@ def test_a_wrong_scheduler_is_told_before_anything_is_made(at_rest: Path, tmp_pa
         campaign(at_rest, 1_000_000_000, workers=f"tcp://127.0.0.1:{free_port()}", out=tmp_path / "out")
 
 
+@pytest.mark.ci
 def test_frame_and_dataset(at_rest: Path, tmp_path: Path, threads: str) -> None:
     vary = {"sensors.gnss.rate_hz": ["1", "5"]}
     result = campaign(at_rest, 2, vary=vary, workers=threads, overrides=["duration_s=76"], out=str(tmp_path / "out"))
@@ -585,6 +586,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixture
             del sys.modules[name]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("what", ["estimators", "sensors"])
 def test_a_class_that_was_edited_is_another(own: Path, what: str) -> None:
     if what == "sensors":
@@ -600,6 +602,7 @@ def test_a_class_that_was_edited_is_another(own: Path, what: str) -> None:
     campaign(own, 1, workers=1, out=out)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("kind", "edited"), [
     ("./classes.py:Mine", "own_helper.py"), ("own_package.classes:Mine", "own_package/helper.py"),
 ])  # fmt: skip

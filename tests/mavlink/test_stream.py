@@ -715,6 +715,7 @@ def test_receiver_that_is_not_believed_shows_as_spoofed(tmp_path, how):
     assert how is not Outcome.ISOLATED or last(heard, "STATUSTEXT", "text") == "gnss no longer isolated"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("how", [Outcome.ISOLATED, Outcome.OUTSIDE_GATE, Outcome.OUT_OF_RANGE])
 @pytest.mark.parametrize(
     ("sensor", "bit"),

@@ -163,6 +163,7 @@ def test_course_in_flight_without_magnetometer():
     assert (np.abs(wrong[6:8]) < 3.5 * sigma[6:8]).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", range(8))
 def test_a_vehicle_that_sets_off_is_not_aligned_by_a_course_that_may_be_anything(seed):
     """At 8 m/s wind may turn the heading by a radian, and what accelerates by 4 m/s^2 is tilted by 20 deg with it: one

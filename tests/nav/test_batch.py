@@ -222,6 +222,7 @@ def by_all(P, common, members):
     return better / better.sum()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     "make",
     [

@@ -388,6 +388,7 @@ def test_cross_check_finds_what_drags_its_own_filter_along():
     assert 150 < federated.events[-1].t < 155
 
 
+@pytest.mark.ci
 def test_cross_check_finds_nothing_in_healthy_flight():
     truth, increments, one, two, others = world(260)
     config = Config(CONSUMER, three(DETECTORS["glr"]), cross_check=True)

@@ -144,6 +144,7 @@ def aided(samples, seconds, config=CONFIG, seed=4, duration=120):
     return errors, [r for r in reports if r.aid == "gnss_position"], estimates
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("length_s", [0.1, 3.0])
 def test_a_glitch_of_a_hundred_metres_is_rejected(length_s):
     def glitch(fixes):

@@ -105,6 +105,7 @@ def test_of_whatever_grade_the_sensors_are(kind, gap_s, all_lost):
     right_in_three_seconds(truth, estimates, gap_s, most_m=2.0)
 
 
+@pytest.mark.ci
 def test_lost_increments_are_reckoned_with_one_by_one():
     """Of 100 increments a second a tenth is lost: NEES of the tilt was 15.
 
@@ -128,6 +129,7 @@ def test_lost_increments_are_reckoned_with_one_by_one():
     assert 0.5 < np.mean(squares) < 2.0
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", ["ins", "federated"])
 def test_however_it_is_cut_the_same_bits(kind):
     whole, parts = (flown(a_filter(kind), 3.0, seconds)[1] for seconds in (10.0, 0.5))
@@ -188,6 +190,7 @@ def test_what_is_measured_of_an_attitude_in_a_gap_does_not_last(gap_s):
     assert (estimator.estimate().covariance.diagonal()[6:] > 0.1**2).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("rate_hz", [1.0, 10.0])
 @pytest.mark.parametrize("until", [50.0, 60.3])
 @pytest.mark.parametrize("iron", [0.0, 30e-6])
@@ -233,6 +236,7 @@ def test_a_receiver_that_was_refused_does_not_start_it():
         assert np.hypot(*off[:2]) < 5 * np.hypot(*sigma[:2]), estimate.t
 
 
+@pytest.mark.ci
 def test_a_receiver_that_is_not_isolated_starts_it():
     """One is drawn away by 10 m/s from 25 s on, and isolated; after the gap only the other is used, for all."""
 

@@ -116,6 +116,7 @@ def turn_off(made, true, pull_sigma):
     return off_n, attitude.covariance - np.diag([0.0, 0.0, AT_BEST**2])
 
 
+@pytest.mark.ci
 def test_a_steady_pull_is_told_from_a_tilt():
     """Where more than gravity is felt: without noise to two degrees, and as well as it says with it."""
     exact = [turn_off(*pulled(400 + seed, 0.0), 2.0) for seed in range(12)]

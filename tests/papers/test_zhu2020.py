@@ -182,6 +182,7 @@ def test_claims_of_a_good_campaign() -> None:
     assert all("quation 1" in quantity for quantity in printed)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("run", "estimator", "worse", "quantity"),
     [

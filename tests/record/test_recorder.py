@@ -167,6 +167,7 @@ def test_root_says_how_the_run_was_made(run_file: Path) -> None:
     assert all(v != "not installed" for v in versions.values())
 
 
+@pytest.mark.ci
 def test_memory_file_and_plain_xarray_agree(run_file: Path) -> None:
     loaded = load(run_file)
     recorder = make(None)

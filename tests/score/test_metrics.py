@@ -164,6 +164,7 @@ def test_nees_is_the_quadratic_form_and_nan_where_singular() -> None:
     assert np.isnan(accuracy.nees(e[:1], indefinite[None])).all()
 
 
+@pytest.mark.ci
 def test_consistent_errors_give_one_and_overconfident_ones_their_square() -> None:
     for factor in (1.0, 2.0):
         found = metrics.compute(synthetic_run.dataset(400.0, {"ins": Errors(truth_over_claim=factor)}, DENIED))

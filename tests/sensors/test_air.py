@@ -93,6 +93,7 @@ def test_unsteady_errors_are_gauss_markov_and_filters_know():
     assert told["airspeed"].sigma == pytest.approx(np.hypot(10 / (1.225 * 25), 0.15 * 1.5), rel=0.01)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("usual_mps", [14.0, 18.0, 25.0, 35.0])
 def test_filters_are_told_the_errors_of_pressure_at_the_usual_airspeed(usual_mps):
     """What 200 sensors make of that airspeed, beside what a filter of such an aircraft reckons with, gusts left out."""

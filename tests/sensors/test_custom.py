@@ -431,6 +431,7 @@ MADE = {
 }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("unscented", [False, True])
 def test_what_an_aid_made_of_one_of_ours_measures_is_asked_however_the_run_is_cut(
     scenario: Path, unscented: bool
