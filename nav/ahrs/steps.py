@@ -395,9 +395,9 @@ def follow(
             return k, row, now, last_bad, written, drafted
         stop = row_after(t, steps[k, HORIZON], row)
         if stop > row:
-            last_bad, some, came = advance(
+            last_bad, some, came = advance(  # not with literals, for each of which it would be compiled anew
                 whole, n, told, rows, places, air, busy, t[row:stop], dtheta[row:stop], dv[row:stop],
-                dt[row:stop], last_bad, True, reports[written:],
+                dt[row:stop], last_bad, stop > row, reports[written:],
             )  # fmt: skip
             row, now, written = row + came, t[row + came - 1], written + some
             if lost(P) and now >= counts[PERIOD_END] - COINCIDENT:
@@ -417,7 +417,7 @@ def follow(
                 state[i] = whole[i]
             bad, some, came = advance(
                 state, n, told, rows, places, air, busy, t[row:stop], dtheta[row:stop], dv[row:stop], dt[row:stop],
-                last_bad, False, reports[written:],
+                last_bad, stop < row, reports[written:],
             )  # fmt: skip
             if further > COINCIDENT:
                 partly, part, then = True, further / dt[of_row], time
