@@ -369,7 +369,7 @@ class Ins:
         return self._gnss is not None and t - self._monitor.last_fused <= RECENT_S
 
     def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
-        """The estimates at ``times`` [s], ascending, by all samples used so far; of those since the alignment.
+        """The estimates at ``times`` [s], ascending, by all samples used so far; from the alignment to its own time.
 
         Raises ValueError where the filter was not told to keep what they need (`InsConfig.smooth`).
         """

@@ -126,17 +126,17 @@ class Smoother:
         self._nodes.append(_Node(t, state.copy(), np.eye(n), np.zeros(n), np.zeros((n, n))))
 
     def states(self, times: Sequence[float]) -> Iterator[Smoothed]:
-        """The smoothed states at ``times`` [s], ascending; none of those before the filter's start."""
+        """The smoothed states at ``times`` [s], ascending; none before the filter's start or after its own time."""
         self._catch_up()
         nodes = self._look_back()
         if not nodes:
             return
         imu = _joined(self._blocks)
         starts = np.array([t for t, _ in nodes])
-        own, at = -1, nodes[0]
+        own, at, end = -1, nodes[0], max(nodes[-1].t, *imu.t[-1:])
         for t in times:
             node = int(np.searchsorted(starts, t + NOTHING)) - 1
-            if node < 0:
+            if node < 0 or t > end + NOTHING:
                 continue
             if node != own:
                 own, at = node, nodes[node]

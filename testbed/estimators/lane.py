@@ -13,6 +13,7 @@ from nav._jit import njit
 from nav.alignment import InitialState
 from nav.columns import Estimates, Reports, Samples, one_by_one
 from nav.horizon import FusionHorizon
+from nav.increments import COINCIDENT
 from nav.ins import Ins
 from nav.samples import Array, Estimate, ImuSamples, Outcome, Sample, UpdateReport
 from nav.standing import Standing
@@ -104,9 +105,16 @@ class Lane:
         return Tracked(increments, votes, reports, estimates)
 
     def smoothed(self, times: Sequence[float]) -> Iterator[Estimate]:
-        """The estimates at ``times`` [s] by all that it was ever handed, of one that keeps what that takes."""
+        """The estimates at ``times`` [s] by all that it was ever handed, of one that keeps what that takes.
+
+        From its fusion horizon on nothing has told it more than it predicted by.
+        """
         estimator = self.horizon.estimator
-        return estimator.smoothed(times) if isinstance(estimator, Ins) and estimator.config.smooth else iter(())
+        if not (isinstance(estimator, Ins) and estimator.config.smooth and estimator.aligned):
+            return
+        told = [t for t in times if t <= estimator.t + COINCIDENT]
+        yield from estimator.smoothed(told)
+        yield from map(self.horizon.estimate_at, times[len(told) :])
 
     def _thinned(self, sensor: str, samples: Sequence[Sample]) -> Sequence[Sample]:
         """Those of one sensor that are far enough from the last one before them that was handed over."""

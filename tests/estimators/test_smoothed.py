@@ -102,3 +102,37 @@ def test_mistakes() -> None:
     taken = f'estimator=[{{ name="a_smoothed", {aids} }}, {{ name="a", {aids}, smooth=true }}]'
     with pytest.raises(UserError, match="'a_smoothed' is taken"):
         Scenario.load("loiter_gnss_outage", [taken, "expect={}"])
+
+
+def test_up_to_the_end_it_is_no_worse_than_the_filter() -> None:
+    """From the last fix that was used on, half a second before the end, it stood still: 30 m at 60 m/s."""
+    scenario = Scenario.parse(
+        """
+title = "Straight on, by fixes that are late"
+seed = 1
+duration_s = 80
+[truth]
+source = "kinematic"
+motion = "segments"
+start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 800, speed_mps = 60 }
+segments = [{ leg = "straight", duration_s = 80 }]
+[sensors.imu]
+[sensors.gnss]
+grade = "rtk"
+latency_s = 0.5
+[sensors.magnetometer]
+[[estimator]]
+name = "ins"
+kind = "ins"
+aids = ["gnss", "magnetometer"]
+smooth = true
+"""
+    )
+    data, off = run(scenario).dataset, {}
+    for name in ("ins", "ins_smoothed"):
+        t, lat, lon = (column(data, f"estimators/{name}/{key}")[-10:] for key in ("time", "lat", "lon"))
+        true = {key: np.interp(t, data["truth/time"], data[f"truth/{key}"]) for key in ("lat", "lon")}
+        off[name] = 6.4e6 * np.hypot(lat - true["lat"], np.cos(lat) * (lon - true["lon"]))
+    assert t[-1] == data["truth/time"][-1]
+    assert off["ins_smoothed"].max() < 0.3
+    assert off["ins_smoothed"][-1] == off["ins"][-1]  # when it has heard no more
