@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
@@ -54,6 +55,7 @@ TRIMS = ("AHRS_TRIM_X", "AHRS_TRIM_Y")  # roll and pitch of the inertial unit in
 RESOLUTION_DEG = 0.02  # of logged angles, and of what is added to them
 LAST_PAGE = 528  # of a log that is written by pages, which may be empty [bytes]
 LEAST_RUNNING = 0.5  # of the log
+OTHER_ZERO = 100.0  # of heights that are so far from a receiver's [m]
 PLACE = "place in the file"  # as a field of each message
 
 Rows: TypeAlias = dict[str, Array]  # the fields of one kind of message of one unit
@@ -75,7 +77,7 @@ def read(path: Path, columns: Mapping[str, Stream]) -> Log:
     require_imu(path, imus, found, NEEDED, notes)
     samples = _aiding(units, notes)
     solution = None
-    for solution in _solutions(messages, _first_fix(samples)):
+    for solution in _solutions(messages, _heard_fixes(samples)):
         if not (refused := refusal(solution, imus, samples)):
             break
         notes.append(refused)
@@ -276,20 +278,22 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
     return fixes.samples(name, notes)
 
 
-def _first_fix(samples: Mapping[str, Samples]) -> float:
-    """When the autopilot first knew where it is [s]; where it has no receiver, it may have been told."""
-    fixes = [one for own in samples.values() for one in own if isinstance(one, GnssSample)]
-    return min((one.t for one in fixes if one.has_fix), default=math.inf if fixes else -math.inf)
+def _heard_fixes(samples: Mapping[str, Samples]) -> list[GnssSample] | None:
+    """The fixes of all receivers, None where it has no receiver."""
+    told = [one for own in samples.values() for one in own if isinstance(one, GnssSample)]
+    return [one for one in told if one.has_fix] if told else None
 
 
-def _solutions(messages: Mapping[str, list[dict[str, Any]]], since: float) -> Iterator[Reference]:
+def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: Sequence[GnssSample] | None) -> Iterator[Reference]:
     """What the autopilot itself thought, the best first: attitude and velocity of an EKF's first core, and position.
 
-    Position and velocity from ``since`` [s] on: until it has heard of a receiver, what it logs of them means nothing.
+    Position and velocity from the first of ``fixes`` on: until it has heard of a receiver, what it logs of them means
+    nothing. Where it has none, it may have been told where it is.
     Logged angles are the vehicle's: those of the inertial unit less its trim (`TRIMS`). Where an EKF does not run, the
     unit's are zero; one that runs for less than `LEAST_RUNNING` of the log comes last.
     """
     trims = _trims(messages.get("PARM", []))
+    since = -math.inf if fixes is None else min((one.t for one in fixes), default=math.inf)
     late = []
     for source in SOLUTIONS:
         own = [one for one in messages.get(source, []) if one]
@@ -305,7 +309,9 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], since: float) -> It
             velocity = np.column_stack([rows[key][kept] for key in ("VN", "VE", "VD")])
             columns["q_nb"] = np.where(running[:, None], columns["q_nb"], np.nan)
             columns["v_n"] = np.where((running & (t >= since))[:, None], velocity, np.nan)
-        found = Reference(f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since)})
+        found = Reference(
+            f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since, fixes or [])}
+        )
         if running.any() and running.mean() >= LEAST_RUNNING:
             yield found
         elif running.any():
@@ -313,7 +319,9 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], since: float) -> It
     yield from late
 
 
-def _places(messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float) -> dict[str, Array]:
+def _places(
+    messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float, fixes: Sequence[GnssSample]
+) -> dict[str, Array]:
     """The positions that it had at the times ``t`` [s], by the first kind of message that has any from ``since`` on."""
     for name in PLACES:
         place = _rows([one for one in messages.get(name, []) if one])
@@ -321,12 +329,24 @@ def _places(messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float
             continue
         at, kept = _times(name, place, [])
         lat, lon, h = np.radians(place["Lat"][kept]), np.radians(place["Lng"][kept]), place["Alt"][kept]
-        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, h)
+        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, h) & _of_one_zero(at, h, fixes)
         if known.sum() > 1:
             columns = zip(("lat", "lon", "h"), (lat[known], np.unwrap(lon[known]), h[known]), strict=True)
             found = {key: np.interp(t, at[known], column, left=np.nan, right=np.nan) for key, column in columns}
             return {**found, "lon": np.mod(found["lon"] + math.pi, 2 * math.pi) - math.pi}
     return {}
+
+
+def _of_one_zero(at: Array, h: Array, fixes: Sequence[GnssSample]) -> npt.NDArray[np.bool_]:
+    """Which heights (N,) [m] at the times ``at`` [s] count from where a receiver's do, all where most don't.
+
+    Before an autopilot has found the height of its origin, they count from where it was switched on.
+    """
+    if not fixes:
+        return np.ones(len(h), bool)
+    told = np.interp(at, [one.t for one in fixes], [one.h for one in fixes])
+    same: npt.NDArray[np.bool_] = np.abs(h - told) <= OTHER_ZERO
+    return same if same.mean() >= 0.5 else np.ones(len(h), bool)
 
 
 def _trims(parameters: Sequence[Mapping[str, Any]]) -> Array:

@@ -372,6 +372,22 @@ def test_a_solution_that_is_not_where_its_receiver_was_is_told(off_deg: float, t
     assert not any("judges by the receiver" in one for one in run(scenario).remarks)
 
 
+def test_heights_from_before_an_autopilot_knew_its_origins_are_no_heights(tmp_path: Path) -> None:
+    """A real one counted from where it was switched on for 16 s, 590 m below; exports took their origin from that."""
+    early = [
+        (name, (*v[:3], v[3] - 500.0) if name == "POS" and v[0] < us(5.0) else v)
+        for name, v in with_solution(circling())
+    ]
+    found = read(early, tmp_path).solution
+    assert found is not None
+    before = found.t < 4.9
+    assert np.isnan(found.columns["h"][before]).all()
+    np.testing.assert_allclose(found.columns["h"][~before][2:], 500.0, atol=1e-3)
+    below = [(name, (*v[:3], v[3] - 500.0) if name == "POS" else v) for name, v in with_solution(circling())]
+    all_below = read(below, tmp_path).solution
+    assert all_below is None or np.isfinite(all_below.columns["h"]).any()  # told of otherwise
+
+
 @pytest.mark.parametrize(("below_m", "told"), [(0.0, False), (8.0, False), (20.0, True)])
 def test_a_solution_that_is_below_its_receiver_is_told(below_m: float, told: bool, tmp_path: Path) -> None:
     messages = with_solution(circling())
