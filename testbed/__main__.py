@@ -168,6 +168,8 @@ def check(
     if folder is not None and update:
         checks.make_folder(folder)
     todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
+    if junit is not None:
+        junit.unlink(missing_ok=True)  # whatever ends this, it is not that of a run before
     with (
         output_folder(RUNS / "check"),
         interrupts.leaving(lambda: "nothing was concluded"),
@@ -252,7 +254,7 @@ def campaign(
     for table in campaign_report.tables(result):
         console().print(table)
     print(printable(f"campaign: {folder}"))
-    for text in result.ended():
+    for text in result.spoilt():
         remark(text)
     for failure in result.failures:
         case = f"{result.combinations[failure.combination]} seed {failure.seed}".strip()

@@ -30,9 +30,11 @@ import numpy as np
 from nav.samples import Array
 from testbed.data import write_file
 from testbed.errors import UserError
+from testbed.feeds.closed import CLOSED, NEVER, NEVER_CLOSED
 from testbed.many import given, pool, progress, seeds
 from testbed.many.draws import DRAW, require_draw
 from testbed.many.folder import claim, code, own, require_code, require_own_code, versions
+from testbed.many.history import history_of
 from testbed.many.shared_flight import log_digests, require_control, share_truth
 from testbed.motion import aircraft
 from testbed.motion.logged import LogTruth
@@ -40,7 +42,7 @@ from testbed.motion.sections import FlightTruth
 from testbed.motion.table import Replay
 from testbed.results import REPORT, require_own
 from testbed.scenario import Scenario
-from testbed.score import accuracy, metrics
+from testbed.score.remarks import LOST
 
 if TYPE_CHECKING:
     import pandas
@@ -48,7 +50,7 @@ if TYPE_CHECKING:
 
     from testbed.report.campaign import Statistics
 
-HISTORY_HZ = 1.0  # rate at which a run's errors are kept
+NO_NUMBERS = "gave estimates that are no numbers"
 
 _Own: TypeAlias = Mapping[str, Mapping[str, str]]  # the user's classes in all combinations, as `own` tells them
 
@@ -66,7 +68,7 @@ class Combination:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What is kept of one run: its metrics, and its errors over time at `HISTORY_HZ`.
+    """What is kept of one run: its metrics, and its errors over time at `testbed.many.history.HISTORY_HZ`.
 
     ``history`` has ``time`` (N,) [s], ``outage`` (N,) 1 while some GNSS receiver has no fix, and for each estimator
     ``<name>.error`` horizontal position error [m], ``<name>.sigma`` its own 1-sigma sqrt(P_N + P_E) [m] and
@@ -80,6 +82,12 @@ class Outcome:
     metrics: Mapping[str, float]
     history: Mapping[str, Array]
     ended: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def spoilt(self) -> dict[str, tuple[str, str]]:
+        """Whose estimates are not to be judged by the others of its: what it did, and why."""
+        lost = [name.removesuffix(LOST) for name, count in self.metrics.items() if name.endswith(LOST) and count]
+        return dict.fromkeys(lost, (NO_NUMBERS, "")) | {name: ("has ended", why) for name, why in self.ended.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,16 +155,16 @@ class CampaignResult:
             ]
         )
 
-    def ended(self) -> list[str]:
-        """Which estimators ended by errors of their own, in how many runs, and why: a sentence each."""
-        seeds: dict[tuple[int, str, str], list[int]] = {}
+    def spoilt(self) -> list[str]:
+        """Which estimators ended by errors of their own or gave no numbers, in how many runs, why: a sentence each."""
+        seeds: dict[tuple[int, str, str, str], list[int]] = {}
         for one in self.outcomes:
-            for name, why in one.ended.items():
-                seeds.setdefault((one.combination, name, why), []).append(one.seed)
+            for name, (what, why) in one.spoilt.items():
+                seeds.setdefault((one.combination, name, what, why), []).append(one.seed)
         told = []
-        for (combination, name, why), runs in seeds.items():
+        for (combination, name, what, why), runs in seeds.items():
             which = f"seed {runs[0]}" if len(runs) == 1 else f"{len(runs)} runs, the first of seed {runs[0]}"
-            told.append(f"{self.combinations[combination]} {name} has ended in {which}: {why}".strip())
+            told.append(f"{self.combinations[combination]} {name} {what} in {which}{f': {why}' if why else ''}".strip())
         return told
 
     def dataset(self) -> xarray.Dataset:
@@ -287,7 +295,8 @@ def fly(
         say(remark)
     if len(stored) < total:
         teller = _Teller(tell, total, len(stored))
-        with pool.opened(total - len(stored), workers) as crew:
+        apart = any(one.scenario.has_own_code for one in combinations)
+        with pool.opened(total - len(stored), workers, apart) as crew:
             truth = share_truth(folder, [c.scenario for c in combinations])
             tasks = _tasks(plan, combinations, truth, mine, set(stored))
             for done in crew.work(_fly, tasks, teller.standing):
@@ -300,7 +309,7 @@ def fly(
                 teller.finished(flown)
     outcomes = [stored[run] for run in sorted(stored)]
     failures.sort(key=lambda f: (f.combination, f.seed))
-    statistics = campaign_report.statistics(combinations, outcomes)
+    statistics = campaign_report.statistics(combinations, outcomes, failures)
     result = CampaignResult(folder, combinations, outcomes, failures, statistics, plan.draw, remarks)
     campaign_report.save(result)
     return result
@@ -311,12 +320,21 @@ def _combinations(plan: Plan) -> list[Combination]:
     for key, listed in plan.vary.items():
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
+        if key.partition(".")[0] == "record":
+            raise UserError(f"--vary {key}: how a record is written changes no result: give it with --set")
         given.require_once(key, listed)
     made = []
     for values in itertools.product(*plan.vary.values()):
         chosen = dict(zip(plan.vary, values, strict=True))
         loaded = Scenario.load(plan.scenario, [*plan.overrides, *(f"{key}={value}" for key, value in chosen.items())])
         made.append(Combination(chosen, loaded))
+    names = [[one.name for one in combination.scenario.estimator] for combination in made]
+    for combination, own_names in zip(made, names, strict=True):
+        if own_names != names[0]:
+            raise UserError(
+                f"--vary {combination}: has estimators {own_names}, the first combination {names[0]}: they are compared"
+                " by their names, which must be the same, and in the same order"
+            )
     if not made[0].scenario.estimator:
         raise UserError(
             f"{plan.scenario}: has no estimator, so a campaign would have nothing to compare: add [[estimator]]"
@@ -396,10 +414,11 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
     stem = _stem(folder, combination, seed)
     try:
         record = json.loads(stem.with_suffix(".json").read_bytes())
-        values, ended = record["metrics"], record.get("ended", {})
+        values = {str(name): float(value) for name, value in record["metrics"].items()}
+        ended = {str(name): str(why) for name, why in record.get("ended", {}).items()}
         with np.load(io.BytesIO(stem.with_suffix(".npz").read_bytes())) as file:
             history = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
         return None
     return Outcome(combination, seed, values, history, ended)
 
@@ -429,36 +448,17 @@ def _fly(task: _Task, tell: Callable[[float], None]) -> Outcome | Failure:
         recorded = isinstance(task.scenario.truth, LogTruth)  # is read by the run itself
         source = Replay(shared) if shared else None if recorded else motion(task.scenario, task.seed)
         result = run(task.scenario, seed=task.seed, source=source, progress=lambda now: tell(now.t / now.duration))
-        require_control(result.failure)
+        ended = [f"{name} has ended: {why}" for name, why in result.ended.items()]
+        require_control("; ".join([result.failure, *ended]) if result.failure else "")
+        if result.dataset.attrs.get(CLOSED) == NEVER:
+            raise UserError(NEVER_CLOSED)
         # How long a run took says nothing about the filter and is never the same twice.
         kept = {key: value for key, value in result.metrics.items() if not key.startswith("run.")}
         finite = {key: value for key, value in kept.items() if math.isfinite(value)}
-        return Outcome(task.combination, task.seed, finite, _history(result.dataset), result.ended)
+        return Outcome(task.combination, task.seed, finite, history_of(result.dataset), result.ended)
     except Exception as error:
         message = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
         return Failure(task.combination, task.seed, message, traceback.format_exc())
-
-
-def _history(dataset: xarray.DataTree) -> dict[str, Array]:
-    """The errors of a run over time, as `Outcome` keeps them."""
-    t = accuracy.column(dataset, "truth/time")
-    kept = {"time": t, "outage": accuracy.inside(t, metrics.outages(dataset)).astype(float)}
-    for name in accuracy.names(dataset):
-        errors = accuracy.errors(dataset, name)
-        rows = np.searchsorted(t, errors.t - accuracy.SAME_TIME_S)
-        if errors.attitude_only:
-            error, sigma, nees = np.rad2deg(errors.tilt), np.rad2deg(errors.sigma_attitude), errors.attitude_nees
-        else:
-            error, sigma, nees = errors.horizontal, errors.sigma_position, errors.position_nees
-        for what, values in (
-            ("error", error),
-            ("sigma", np.hypot(sigma[:, 0], sigma[:, 1])),
-            ("nees", np.where(errors.valid, nees, np.nan)),
-        ):
-            kept[f"{name}.{what}"] = np.full(len(t), np.nan)
-            kept[f"{name}.{what}"][rows] = values
-    every = max(1, round(float(dataset.attrs["record_rate_hz"]) / HISTORY_HZ))
-    return {name: values[::every].copy() for name, values in kept.items()}
 
 
 # --- telling

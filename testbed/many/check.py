@@ -30,7 +30,7 @@ from testbed.feeds.closed import CLOSED, NEVER, NEVER_CLOSED
 from testbed.loop import loop
 from testbed.many import given, pool, progress
 from testbed.report import page as report
-from testbed.results import require_own, start_anew
+from testbed.results import RECORD, require_own, start_anew
 from testbed.scenario import Bounds, Scenario
 from testbed.score.accuracy import column
 from testbed.score.remarks import LOST
@@ -144,9 +144,10 @@ def check(
     """Fly scenarios, files or shipped ones by name, and hold their metrics against [expect] and against golden ones.
 
     ``golden`` is the folder of golden metrics, none without; ``workers`` is the number of processes, one for each core
-    without, and one scenario is flown in this one. Of a scenario that fails there are record and report in a folder of
-    its name in ``out``. In a test: ``result = testbed.check("mine.toml")``, ``assert result.passed, result``. Raises
-    UserError when a scenario or a golden file is wrong, or there is nothing to check.
+    without. One scenario is flown in this one, unless it has classes of the user's and ``workers`` is not 1. Of a
+    scenario that fails there are record and report in a folder of its name in ``out``. In a test:
+    ``result = testbed.check("mine.toml")``, ``assert result.passed, result``. Raises UserError when a scenario or a
+    golden file is wrong, or there is nothing to check.
     """
     from rich.console import Console
 
@@ -340,7 +341,7 @@ def fly_all(todo: Sequence[Task], tell: Tell | None = None, workers: int | None 
 
     with (
         tempfile.TemporaryDirectory(prefix=".flying_", dir=parent, ignore_cleanup_errors=True) as flying,
-        pool.opened(len(todo), workers) as crew,
+        pool.opened(len(todo), workers, apart=any(task.scenario.has_own_code for task in todo)) as crew,
     ):
         own = {task.name: task.folder for task in todo}
         for flown in crew.work(fly, (replace(task, folder=Path(flying, task.name)) for task in longest), say):
@@ -356,7 +357,7 @@ def fly_all(todo: Sequence[Task], tell: Tell | None = None, workers: int | None 
 def _keep(outcome: Outcome, flown: Path, folder: Path) -> Outcome:
     """Bring what is in the folder where it was flown into its own, unless files of somebody else are in the way."""
     outcome = replace(outcome, kept=False)
-    if not flown.exists():
+    if not (flown / RECORD).exists():  # its process has died before there was one
         return outcome
     found = list(flown.iterdir())
     try:

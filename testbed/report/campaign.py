@@ -35,7 +35,7 @@ from testbed.score.metrics import OUTAGE_MARKS_S
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from testbed.many.campaign import CampaignResult, Combination, Outcome
+    from testbed.many.campaign import CampaignResult, Combination, Failure, Outcome
 
 UNSCORED = f"Errors over the runs: none is scored, which begins {SETTLING_S:.0f} s after an alignment"
 INTERACTIVE = ("errors", "nees")  # figures that the page has as plots to look around in
@@ -160,7 +160,9 @@ class Statistics:
     expected: Sequence[Kept] = ()
 
 
-def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Statistics:
+def statistics(
+    combinations: Sequence[Combination], outcomes: Sequence[Outcome], failures: Sequence[Failure] = ()
+) -> Statistics:
     """Spread, mean errors, efficiency and consistency of every estimator, and [expect], by combination."""
     spreads: list[Spread] = []
     consistency: list[Consistency] = []
@@ -173,7 +175,7 @@ def statistics(combinations: Sequence[Combination], outcomes: Sequence[Outcome])
             consistency.append(_consistency(i, estimator, own))
             means += _means(i, estimator, own)
             efficiencies += _efficiencies(i, estimator, own)
-    return Statistics(spreads, consistency, means, efficiencies, list(kept(combinations, outcomes)))
+    return Statistics(spreads, consistency, means, efficiencies, list(kept(combinations, outcomes, failures)))
 
 
 def _spreads(combination: int, estimator: str, outcomes: Sequence[Outcome]) -> Iterator[Spread]:
@@ -270,9 +272,12 @@ def _page(result: CampaignResult, shown: Sequence[Shown]) -> str:
             for failure in result.failures
         ]
         + [
-            (f"{result.combinations[one.combination]} seed {one.seed}".strip(), f"{name} has ended: {why}")
+            (
+                f"{result.combinations[one.combination]} seed {one.seed}".strip(),
+                ": ".join([f"{name} {what}", *filter(None, [why])]),
+            )
             for one in result.outcomes
-            for name, why in one.ended.items()
+            for name, (what, why) in one.spoilt.items()
         ],
     )
 
@@ -308,10 +313,10 @@ def _json(result: CampaignResult) -> dict[str, Any]:
         "efficiencies": plain(result.statistics.efficiencies),
         "expected": plain(result.statistics.expected),
         "failures": plain(result.failures),
-        "ended": [
-            {"combination": one.combination, "seed": one.seed, "estimator": name, "message": why}
+        "spoilt": [
+            {"combination": one.combination, "seed": one.seed, "estimator": name, "message": why or what}
             for one in result.outcomes
-            for name, why in one.ended.items()
+            for name, (what, why) in one.spoilt.items()
         ],
     }
 

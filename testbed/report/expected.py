@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,13 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nav.samples import Array
 from testbed.data import data_dir, docs_dir, write_file
 from testbed.errors import UserError
 from testbed.report import markdown
 from testbed.score.claims import HARDLY_ANY, MEDIAN, NEARLY_ALL, SHARE, Interval
+from testbed.score.remarks import LOST
 
 if TYPE_CHECKING:
-    from testbed.many.campaign import CampaignResult, Combination, Outcome, Plan
+    from testbed.many.campaign import CampaignResult, Combination, Failure, Outcome, Plan
+    from testbed.scenario.schema import Bounds
 
 PAGE = "expected.md"
 COLUMNS = ("metric", "bound", "kept by", "median", "95 % of runs")
@@ -36,7 +39,8 @@ class Kept:
     """One bound of [expect] over the runs of one combination.
 
     ``share`` is that of the runs which keep it; ``most`` is what 95 % of them do not exceed, or, ``at_least``, do not
-    stay below. A run that lacks the metric, or whose estimator has ended, keeps nothing; ``missing`` lack it.
+    stay below. A run that failed or lacks the metric keeps nothing, nor does one whose estimator has ended, or gave no
+    numbers where that is not expected; ``missing`` lack it, and ``failed`` have none.
     """
 
     combination: int
@@ -48,35 +52,50 @@ class Kept:
     most: Interval
     runs: int
     missing: int
+    failed: int
 
     @property
     def row(self) -> tuple[str, ...]:
         """Under `COLUMNS`."""
         sign = "≥" if self.at_least else "≤"
         share = Interval(*(100 * one for one in self.share))
-        kept_by = f"{share} %" + (f", missing in {self.missing}" if self.missing else "")
+        told = [f", {what} {count}" for what, count in (("missing in", self.missing), ("failed", self.failed)) if count]
+        kept_by = f"{share} %{''.join(told)}"
         return self.metric, f"{sign} {self.bound:g}", kept_by, f"{self.median}", f"{sign} {self.most}"
 
 
-def kept(combinations: Sequence[Combination], outcomes: Sequence[Outcome]) -> Iterator[Kept]:
-    """Every bound, one combination after the other."""
+def kept(
+    combinations: Sequence[Combination], outcomes: Sequence[Outcome], failures: Sequence[Failure] = ()
+) -> Iterator[Kept]:
+    """Every bound, one combination after the other, but on how long runs took, which says nothing of a filter."""
     for i, combination in enumerate(combinations):
         own = [outcome for outcome in outcomes if outcome.combination == i]
-        for metric, bounds in combination.scenario.expect.items() if own else ():
+        failed = sum(failure.combination == i for failure in failures)
+        expect = combination.scenario.expect
+        for metric, bounds in expect.items() if own else ():
             for bound, at_least in ((bounds.min, True), (bounds.max, False)):
-                if bound is not None:
-                    yield _kept(i, metric, bound, at_least, own)
+                if bound is not None and not metric.startswith("run."):
+                    worst = -math.inf if at_least else math.inf
+                    values = np.array([_judged(metric, one, expect, worst) for one in own] + [worst] * failed)
+                    yield _kept(i, metric, bound, at_least, values, own, failed)
 
 
-def _kept(combination: int, metric: str, bound: float, at_least: bool, outcomes: Sequence[Outcome]) -> Kept:
-    worst = -math.inf if at_least else math.inf
+def _judged(metric: str, one: Outcome, expect: Mapping[str, Bounds], worst: float) -> float:
+    """What a run is judged by: the worst where its estimator is `Outcome.spoilt`, but by a count that is expected."""
     whose = metric.partition(".")[0]
-    values = np.array([worst if whose in one.ended else one.metrics.get(metric, worst) for one in outcomes])
+    if whose in one.ended or (whose in one.spoilt and f"{whose}{LOST}" not in expect):
+        return worst
+    return one.metrics.get(metric, 0.0 if metric.endswith(LOST) else worst)
+
+
+def _kept(
+    combination: int, metric: str, bound: float, at_least: bool, values: Array, outcomes: Sequence[Outcome], failed: int
+) -> Kept:
     holds = values >= bound if at_least else values <= bound
+    lacking = [one for one in outcomes if metric not in one.metrics and not metric.endswith(LOST)]
     return Kept(
         combination, metric, bound, at_least, share=SHARE.of(holds.astype(float)), median=MEDIAN.of(values),
-        most=(HARDLY_ANY if at_least else NEARLY_ALL).of(values), runs=len(values),
-        missing=sum(metric not in one.metrics for one in outcomes),
+        most=(HARDLY_ANY if at_least else NEARLY_ALL).of(values), runs=len(values), missing=len(lacking), failed=failed,
     )  # fmt: skip
 
 

@@ -289,11 +289,20 @@ class Scenario(Section):
                 return tuple(segment.leg for segment in self.truth.segments)
         return ()
 
+    @property
+    def _own_kinds(self) -> tuple[list[str], list[str]]:
+        estimators = [one.kind for one in self.estimator if isinstance(one, custom.CustomSection)]
+        return estimators, [one.kind for one in self.sensors.values() if one.kind not in sensor_registry.BUILT_IN]
+
+    @property
+    def has_own_code(self) -> bool:
+        """Whether there is any class of the user's in it, which may end the process."""
+        return any(self._own_kinds)
+
     def own(self) -> dict[str, dict[str, str]]:
         """Digests of the code of the user's classes, by kind. Raises UserError where one can't be had as it is now."""
         folder = self._path.parent if self._path else Path()
-        estimators = [one.kind for one in self.estimator if isinstance(one, custom.CustomSection)]
-        sensors: list[str] = [one.kind for one in self.sensors.values() if one.kind not in sensor_registry.BUILT_IN]
+        estimators, sensors = self._own_kinds
         return {
             "estimators": {kind: plugins.digest(kind, folder, custom.GROUP) for kind in estimators},
             "sensors": {kind: plugins.digest(kind, folder, sensor_registry.GROUP) for kind in sensors},

@@ -330,7 +330,7 @@ def test_export(flown: Any, tmp_path: Path) -> None:
 @pytest.mark.ci
 def test_a_campaign_counts_degrees(flown: Any, tmp_path: Path) -> None:
     result = flown[0]
-    history = campaign._history(result.dataset)
+    history = campaign.history_of(result.dataset)
     errors = accuracy.errors(result.dataset, "ahrs")
     np.testing.assert_allclose(np.nanmax(history["ahrs.error"][60:]), np.rad2deg(errors.tilt[600:].max()), rtol=0.2)
     assert np.nanmean(history["ahrs.nees"]) > 0.0

@@ -228,10 +228,10 @@ def test_its_end_is_told_by_who_flies_many(folder: Path, tmp_path: Path, monkeyp
     flown = partial(campaigns.fly, campaigns.Plan(folder / "own.toml", 1, tmp_path / "many", overrides=overrides))
     for result in (flown(), flown()):  # the second finds what the first has stored
         assert result.failures == []
-        (told,) = result.ended()
+        (told,) = result.spoilt()
         assert told.startswith("mine has ended in seed 1: RuntimeError: lost its way (filters.py, line")
         assert [one.share.value for one in result.statistics.expected] == [1.0, 0.0]
-    (kept,) = json.loads((tmp_path / "many/campaign.json").read_text("utf-8"))["ended"]
+    (kept,) = json.loads((tmp_path / "many/campaign.json").read_text("utf-8"))["spoilt"]
     assert (kept["seed"], kept["estimator"]) == (1, "mine")
     assert kept["message"].startswith("RuntimeError: lost its way")
     assert "mine has ended: RuntimeError: lost its way" in (tmp_path / "many/report.html").read_text("utf-8")

@@ -114,7 +114,7 @@ def flown_here(path: Path, seed: int, overrides: tuple[str, ...] = ()) -> Outcom
     """What a campaign should have of one run, flown in this process by the plain loop, truth and all."""
     result = run(Scenario.load(path, overrides), seed=seed)
     metrics = {k: v for k, v in result.metrics.items() if not k.startswith("run.")}
-    return Outcome(0, seed, metrics, campaigns._history(result.dataset))
+    return Outcome(0, seed, metrics, campaigns.history_of(result.dataset))
 
 
 class Counter:
@@ -886,19 +886,37 @@ def test_the_manual_is_of_shipped_scenarios(plan: Plan) -> None:
 
 def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[weakref.ref[Any]] = []
-    plain = campaigns._history
+    plain = campaigns.history_of
 
     def history(dataset: Any) -> Any:
         left.append(weakref.ref(dataset["truth/h"].values))
         return plain(dataset)
 
-    monkeypatch.setattr(campaigns, "_history", history)
+    monkeypatch.setattr(campaigns, "history_of", history)
     scenario = Scenario.load(at_rest, ["duration_s=5", "sensors.gnss.denied=[]"])
     for seed in (1, 2):
         task = campaigns._Task(0, seed, scenario, None, folder.code(), folder.own([scenario]))
         flown = campaigns._fly(task, lambda share: None)
         assert isinstance(flown, Outcome)
         assert sum(one() is not None for one in left) == 1  # the last
+
+
+@pytest.mark.parametrize("text", ["[]", '{"metrics": []}', '{"metrics": {"ins.aligned_s": "soon"}}', "{}", "1"])
+def test_a_stored_run_of_another_shape_is_none(text: str, tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs/c000_s000001.json").write_text(text)
+    np.savez(tmp_path / "runs/c000_s000001.npz", time=np.zeros(1))
+    assert campaigns._load(tmp_path, 0, 1) is None
+
+
+@pytest.mark.ci
+def test_a_loop_that_never_closed_is_a_failure() -> None:
+    """The flight on truth to its end was a success, of an estimator that never said anything."""
+    scenario = Scenario.load("closed_loop_gnss_outage", ["duration_s=1", "sensors.gnss.denied=[]", "expect={}"])
+    task = campaigns._Task(0, 1, scenario, None, folder.code(), folder.own([scenario]))
+    flown = campaigns._fly(task, lambda share: None)
+    assert isinstance(flown, Failure)
+    assert "the autopilot flew on truth to the end" in flown.message
 
 
 def test_few_runs_have_no_interval(tmp_path: Path) -> None:
@@ -922,7 +940,7 @@ def test_runs_too_short_to_be_scored_say_so(at_rest: Path, tmp_path: Path, threa
 
 def test_history_is_the_error_once_a_second() -> None:
     dataset = synthetic_run.dataset(100.0, denied=((40.0, 50.0),))
-    history = campaigns._history(dataset)
+    history = campaigns.history_of(dataset)
     np.testing.assert_allclose(history["time"], np.arange(101.0))
     np.testing.assert_array_equal(np.flatnonzero(history["outage"]), np.arange(40, 51))  # the fix comes at 50.1 s
     assert np.flatnonzero(np.isfinite(history["ins.error"]))[0] == 5

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 import pytest
 import xarray
+from typer.testing import CliRunner
 
 import testbed
 import testbed.__main__ as cli
@@ -502,3 +503,41 @@ def test_junit(tmp_path: Path) -> None:
     assert messages[1] == "ins.heading_rms_deg is 2, not 1: worse"
     error = next(root.iter("error"))
     assert error.get("message") == "ValueError: <&> ??[31m"
+
+
+DYING = """
+import os
+
+from nav.samples import Estimate
+
+
+class Dying:
+    def __init__(self, rig):
+        self.t = 0.0
+
+    def propagate(self, imu):
+        self.t = float(imu.t[-1])
+        if self.t > 2.0:
+            os._exit(0)
+
+    def update(self, sample):
+        return []
+
+    def estimate(self):
+        return Estimate.of(self.t)
+"""
+
+
+@pytest.mark.ci
+def test_one_scenario_whose_process_dies_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It ended the command, with exit code 0, no verdict, and the JUnit report of the run before."""
+    (tmp_path / "dying.py").write_text(DYING)
+    flight = (data_dir("scenarios") / "u_turn.toml").read_text().replace("duration_s = 200", "duration_s = 20")
+    mine = '\n[[estimator]]\nname = "mine"\nkind = "./dying.py:Dying"\n'
+    (tmp_path / "mine.toml").write_text(flight + mine)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "junit.xml").write_bytes(check.junit([]))
+    result = CliRunner().invoke(cli.app, ["check", "mine.toml", "--junit", "junit.xml"])
+    assert result.exit_code == 1, result.output
+    assert "its process ended with exit code 0" in (tmp_path / "junit.xml").read_text()
+    assert "kept in" not in result.output  # there is no record
