@@ -44,20 +44,20 @@ class Flight:
         self._ended = False
         self._frame = max(1, round(truth.rate_hz / GUIDANCE_HZ))
         self._aircraft = Aircraft(truth.aircraft, truth.rate_hz)
-        self._weather = Weather(truth.wind, truth.start, seed, self._frame / truth.rate_hz)
-        start, envelope, wind = truth.start, self._aircraft.envelope, self._weather.start()
-        self._launcher: Launcher | None = None
         self._legs, self._ground, self._hit = list(plan), terrain.of(truth.terrain), HIT_M
+        self._weather = Weather(truth.wind, truth.start, self._ground, seed, self._frame / truth.rate_hz)
+        start, envelope = truth.start, self._aircraft.envelope
+        self._launcher: Launcher | None = None
         self._summit = float(self._ground.heights.max())
         if start.on_ground:
             assert envelope.launch is not None  # the scenario was checked
             self._launcher = Launcher(envelope.launch, truth, self._frame)
-            self._aircraft.stand(start, envelope.launch, wind)
+            self._aircraft.stand(start, envelope.launch, self._weather.start(start.alt_m + envelope.launch.height_m))
             self._legs.insert(0, climb_out(start, envelope))
             # It rests on the ground, whose height its start tells to a metre.
             self._hit += start.alt_m - self._height_of_ground(math.radians(start.lat_deg), math.radians(start.lon_deg))
         else:
-            self._aircraft.start(start, wind)
+            self._aircraft.start(start, self._weather.start(start.alt_m))
         wind_seed = truth.wind.turbulence_seed
         self._aircraft.turbulence(truth.wind.turbulence, seed if wind_seed is None else wind_seed)
         self._row = self._aircraft.read()

@@ -1,5 +1,8 @@
 """How strong gusts are: MIL-F-8785C, 3.7.3.4 and 3.7.3.5, as JSBSim's turbulence follows it.
 
+The specification goes by height over ground. JSBSim (1.3.3, FGWinds) takes the altitude, whatever the height of the
+terrain that it is told; so altitudes are above the ellipsoid here, as they are flown.
+
 MIL-F-8785C, *Flying Qualities of Piloted Airplanes*, 1980, figure 7 for the high-altitude table.
 """
 
@@ -32,7 +35,7 @@ EXCEEDANCE = {
 
 
 def gust_sigma(level: str, alt_m: float) -> float:
-    """Rms of the horizontal gusts along one axis [m/s] at an altitude over ground, by a word of `TURBULENCE`.
+    """Rms of the horizontal gusts along one axis [m/s] at an altitude, by a word of `TURBULENCE`.
 
     Up to 1000 ft sigma_u = 0.1 W20 / (0.177 + 0.000823 h)^0.4, above 2000 ft figure 7, linear between the two.
     """
@@ -46,7 +49,7 @@ def gust_sigma(level: str, alt_m: float) -> float:
 
 
 def gust_statistics(level: str, alt_m: Array) -> tuple[Array, Array]:
-    """Rms [m/s] and length [m] of JSBSim's gusts along, across and down (N, 3) at altitudes over ground (N,).
+    """Rms [m/s] and length [m] of JSBSim's gusts along, across and down (N, 3) at altitudes (N,).
 
     They are first-order Gauss-Markov processes of these lengths over the airspeed (MIL-STD-1797A as Yeager 1998 has it,
     equations 30 to 32): across and down half of Dryden's L_u and L_w, which up to 1000 ft are h / (0.177 + 0.000823

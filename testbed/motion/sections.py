@@ -101,19 +101,21 @@ class Updrafts(Section):
     """Thermals with sink between them (`testbed.motion.updrafts`), placed by the run's seed."""
 
     w_star_mps: float = Field(ge=0, le=10, description="convective velocity scale: 1 in winter, 2.7 in a desert's July")
-    depth_m: float = Field(ge=100, le=6000, description="of the mixing layer, to which they rise")
+    depth_m: float = Field(ge=100, le=6000, description="of the mixing layer over ground, to whose top they rise")
 
 
 class Wind(Section):
     """Wind over ground: one vector, a profile of rows [alt_m, from_deg, speed_mps], or a file; what changes it; gusts.
 
+    Boundary layer and updrafts lie on the ground of ``terrain``; profile, file and gusts go by altitude.
     The gusts follow the run's seed, or ``turbulence_seed`` where runs of different seeds shall meet the same ones.
     """
 
     from_deg: Heading = Field(default=0.0, description="true direction that the wind comes from")
     speed_mps: WindSpeed = Field(default=0.0, description="of the mean wind over ground")
     turbulence: Literal["none", "light", "moderate", "severe"] = Field(
-        default="none", description="Dryden gusts by MIL-F-8785C, as JSBSim makes them"
+        default="none",
+        description="Dryden gusts by MIL-F-8785C, as JSBSim makes them: by altitude, whatever the ground",
     )
     turbulence_seed: int | None = Field(default=None, ge=0, lt=2**63, description="of the gusts; none: the run's seed")
     profile: tuple[tuple[Altitude, Heading, WindSpeed], ...] = Field(

@@ -9,6 +9,8 @@ import numpy as np
 
 from nav.earth import radii, wrap_longitude
 from nav.samples import Array
+from nav.terrain import Terrain
+from nav.terrain import ground as height_of_ground
 from testbed.motion.sections import FlightTruth, Front, Start, Wind
 from testbed.motion.updrafts import UpdraftField
 from testbed.motion.wind_table import read
@@ -26,12 +28,12 @@ class Weather:
 
     Velocity = base wind, or that it becomes by a front, times the boundary layer's factor; plus random walk and
     Gauss-Markov part; plus gradient times distance; plus updrafts. What is drawn depends on seed and step alone.
-    ``changes`` says whether it may ever be another than at the start. Raises UserError where the file of a table can't
-    be read.
+    Boundary layer and updrafts lie on ``ground``, profiles and tables go by altitude. ``changes`` says whether it may
+    ever be another than at the start. Raises UserError where the file of a table can't be read.
     """
 
-    def __init__(self, wind: Wind, start: Start, seed: int, period_s: float) -> None:
-        self._wind, self._start, self._period = wind, start, period_s
+    def __init__(self, wind: Wind, start: Start, ground: Terrain, seed: int, period_s: float) -> None:
+        self._wind, self._start, self._ground, self._period = wind, start, ground, period_s
         self._base = blowing(wind.from_deg, wind.speed_mps)
         self._asked: tuple[float, float] | None = None
         self._profile = [(alt, *blowing(from_deg, speed)) for alt, from_deg, speed in wind.profile]
@@ -43,9 +45,10 @@ class Weather:
         self._steps = 0
         self.changes = not wind.one or bool(self._drawn) or updrafts is not None or bool(self._gradient.any())
 
-    def start(self) -> tuple[float, float]:
-        """Horizontal velocity [m/s] at the start, which is no step yet."""
-        return self._horizontal(0.0, self._start.alt_m, 0.0, 0.0)
+    def start(self, h: float) -> tuple[float, float]:
+        """Horizontal velocity [m/s] over the place of the start at a height ``h`` [m], which is no step yet."""
+        lat, lon = math.radians(self._start.lat_deg), math.radians(self._start.lon_deg)
+        return self._horizontal(0.0, h, self._over_ground(lat, lon, h), 0.0, 0.0)
 
     def step(self, lat: float, lon: float, h: float) -> Velocity:
         """Velocity at the next step, the first being at time zero, and a place: ``lat``, ``lon`` [rad], ``h`` [m]."""
@@ -54,9 +57,9 @@ class Weather:
             share = -math.expm1(-self._period / WIND_CHANGE_S)
             north, east = self._base
             self._base = north + share * (self._asked[0] - north), east + share * (self._asked[1] - east)
-        away = self._away(lat, lon, h)
-        v_north, v_east = self._horizontal(t, h, *away)
-        up = self._updrafts.up(*away, h) if self._updrafts else 0.0
+        away, over_ground = self._away(lat, lon, h), self._over_ground(lat, lon, h)
+        v_north, v_east = self._horizontal(t, h, over_ground, *away)
+        up = self._updrafts.up(*away, over_ground) if self._updrafts else 0.0
         self._steps += 1
         if self._drawn:
             self._drift = sum(part.take(1)[0] for part in self._drawn)
@@ -66,8 +69,8 @@ class Weather:
         """Let the base wind, where there is one, become this with a time constant of `WIND_CHANGE_S`."""
         self._asked, self.changes = blowing(from_deg, speed_mps), True
 
-    def _horizontal(self, t: float, h: float, north: float, east: float) -> tuple[float, float]:
-        """Velocity north, east at a time [s], a height [m], and metres north and east of the start."""
+    def _horizontal(self, t: float, h: float, over_ground: float, north: float, east: float) -> tuple[float, float]:
+        """Velocity north, east at a time [s], heights [m], and metres north and east of the start."""
         if self._table is not None:
             v = self._table.at(t, h)
         elif self._profile:
@@ -78,10 +81,16 @@ class Weather:
         if self._wind.front is not None:
             v = _changed(v, self._wind.front, t)
         if self._wind.boundary_layer is not None:
-            factor = self._wind.boundary_layer.factor(h)
+            factor = self._wind.boundary_layer.factor(over_ground)
             v = factor * v[0], factor * v[1]
         more = self._drift + self._gradient @ (north, east)
         return v[0] + float(more[0]), v[1] + float(more[1])
+
+    def _over_ground(self, lat: float, lon: float, h: float) -> float:
+        """The height over ground [m]; ``h`` where nothing asks for it."""
+        if self._wind.boundary_layer is None and self._updrafts is None:
+            return h
+        return h - height_of_ground(lat, lon, self._ground.heights, self._ground.grid)[0]
 
     def _away(self, lat: float, lon: float, h: float) -> tuple[float, float]:
         """Metres north and east of the start."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
@@ -9,6 +11,7 @@ from pydantic import TypeAdapter
 from testbed.motion.flight import Flight
 from testbed.motion.gusts import UNKNOWN_AIR, expected_gust, gust_sigma
 from testbed.motion.legs import Leg
+from testbed.motion.model import Aircraft
 from testbed.motion.sections import FlightTruth
 
 FOOT, KNOT = 0.3048, 1852 / 3600
@@ -50,6 +53,22 @@ def test_jsbsim_makes_gusts_of_this_strength(level: str, alt: float) -> None:
     plan = PLAN.validate_python([{"leg": "loiter", "radius_m": 600, "duration_s": 600}])
     wind_n = Flight(truth(level, alt), plan, 1).advance(600 * 200).wind_n
     assert np.sqrt((wind_n[:, :2] ** 2).mean()) == pytest.approx(gust_sigma(level, alt), rel=0.2)
+
+
+@pytest.mark.ci
+def test_jsbsim_takes_the_altitude_for_the_height_over_ground() -> None:
+    """Told of terrain 500 m high it makes the same gusts 300 m over it as 800 m over none; what filters are told."""
+    flown = []
+    for ground in (0.0, 500.0):
+        aircraft = Aircraft("loiter", 200.0)
+        aircraft.fdm["position/terrain-elevation-asl-ft"] = ground / FOOT
+        aircraft.start(truth("light", 800.0).start)
+        aircraft.turbulence("light", 1)
+        rows = array("d")
+        aircraft.run(2000, rows)
+        assert FOOT * aircraft.fdm["position/h-agl-ft"] == pytest.approx(800.0 - ground, abs=10.0)
+        flown.append(rows)
+    assert flown[0] == flown[1]
 
 
 def test_a_filter_expects_the_strongest_that_the_plan_meets() -> None:

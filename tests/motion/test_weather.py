@@ -13,11 +13,13 @@ from pydantic import TypeAdapter
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import chi2
 
+from nav.terrain import Terrain
 from testbed.errors import UserError
 from testbed.estimators.rig import Air
 from testbed.motion.flight import Flight
 from testbed.motion.legs import Leg
 from testbed.motion.sections import FlightTruth, KinematicTruth, Start, Wind
+from testbed.motion.sections import Terrain as Ground
 from testbed.motion.updrafts import UpdraftField, outer_radius
 from testbed.motion.weather import UNKNOWN_WALK, Weather, blowing, expected_walk, strongest
 from testbed.motion.wind_table import read
@@ -25,14 +27,17 @@ from testbed.scenario import Scenario
 
 PERIOD = 0.1
 START = Start(lat_deg=34.0, lon_deg=108.0, alt_m=280.0, heading_deg=30.0, airspeed_mps=25.0)
+LEVEL = Terrain.flat(0.0)
 HERE = (math.radians(34.0), math.radians(108.0), 280.0)
 RUNS = 400
 METRE = math.degrees(1 / 6.37e6)
 ALWAYS = {"from_deg": 250.0, "speed_mps": 6.0}
+LAYER = {**ALWAYS, "boundary_layer": {"roughness_m": 0.1, "reference_m": 10.0, "top_m": 300.0}}
+THERMALS = {"updrafts": {"w_star_mps": 2.5, "depth_m": 1500.0}}
 
 
-def air(wind: dict[str, Any], seed: int = 1) -> Weather:
-    return Weather(Wind.model_validate(wind), START, seed, PERIOD)
+def air(wind: dict[str, Any], seed: int = 1, ground: Terrain = LEVEL) -> Weather:
+    return Weather(Wind.model_validate(wind), START, ground, seed, PERIOD)
 
 
 def blown(wind: dict[str, Any], seconds: float, seed: int = 1) -> np.ndarray:
@@ -79,16 +84,15 @@ def test_a_gauss_markov_part_is_stationary_and_forgets() -> None:
 @pytest.mark.ci
 def test_each_is_drawn_from_its_own_stream() -> None:
     walk, back = {"walk_mps_per_sqrt_s": 0.05}, {"gauss_markov": {"sigma_mps": 1.5, "correlation_s": 20.0}}
-    updrafts = {"updrafts": {"w_star_mps": 2.5, "depth_m": 1500}}
-    alone = blown(walk, 30.0) + blown(back, 30.0) + blown(updrafts, 30.0)
-    np.testing.assert_allclose(blown({**walk, **back, **updrafts}, 30.0), alone, atol=1e-12)
+    alone = blown(walk, 30.0) + blown(back, 30.0) + blown(THERMALS, 30.0)
+    np.testing.assert_allclose(blown({**walk, **back, **THERMALS}, 30.0), alone, atol=1e-12)
     assert (blown(walk, 30.0, seed=2) != blown(walk, 30.0)).any()
 
 
 def test_the_start_is_in_the_wind_of_the_first_step() -> None:
     wind = {**ALWAYS, "gauss_markov": {"sigma_mps": 1.5, "correlation_s": 20.0}}
     weather = air(wind)
-    assert weather.start() == weather.step(*HERE)[:2]
+    assert weather.start(280.0) == weather.step(*HERE)[:2]
 
 
 # --- formulas
@@ -96,7 +100,7 @@ def test_the_start_is_in_the_wind_of_the_first_step() -> None:
 
 def test_one_wind_never_changes() -> None:
     assert not air(ALWAYS).changes
-    assert air(ALWAYS).start() == blowing(250.0, 6.0)
+    assert air(ALWAYS).start(280.0) == blowing(250.0, 6.0)
     assert blowing(90.0, 6.0) == pytest.approx((0.0, -6.0))  # an easterly
 
 
@@ -114,14 +118,40 @@ def test_a_front_is_a_smooth_step() -> None:
 
 def test_a_boundary_layer_is_logarithmic() -> None:
     """v(h) = u* / 0.4 ln(h / z0), u* that of the wind at the reference; nothing at z0, the same from the top on."""
-    wind = {**ALWAYS, "boundary_layer": {"roughness_m": 0.1, "reference_m": 10.0, "top_m": 300.0}}
-    weather = air(wind)
+    weather = air(LAYER)
     friction = 0.4 * 6.0 / math.log(10.0 / 0.1)
     for h in (0.1, 2.0, 10.0, 50.0, 300.0):
         assert math.hypot(*weather.step(*HERE[:2], h)) == pytest.approx(friction / 0.4 * math.log(h / 0.1), abs=1e-12)
     assert weather.step(*HERE[:2], 900.0) == weather.step(*HERE[:2], 300.0)
     assert math.hypot(*weather.step(*HERE[:2], -3.0)) == 0.0
-    assert strongest(Wind.model_validate(wind)) == pytest.approx(6.0 * math.log(3000) / math.log(100))
+    assert strongest(Wind.model_validate(LAYER)) == pytest.approx(6.0 * math.log(3000) / math.log(100))
+
+
+@pytest.mark.parametrize("ground", [0.0, 500.0, 2000.0])
+def test_height_over_ground_is_over_the_ground(ground: float) -> None:
+    """It was over the ellipsoid: over 2000 m a boundary layer was at its top, and no thermals were left.
+
+    The same but for metres north of the start, which are longer higher up: 0.6 m of 2000.
+    """
+    level, raised = air({**LAYER, **THERMALS}), air({**LAYER, **THERMALS}, ground=Terrain.flat(ground))
+    for north in np.arange(0.0, 2000.0, 50.0):
+        lat, h = HERE[0] + math.radians(north * METRE), 100.0 + north / 10
+        assert raised.start(ground + h) == pytest.approx(level.start(h))
+        np.testing.assert_allclose(raised.step(lat, HERE[1], ground + h), level.step(lat, HERE[1], h), atol=0.02)
+
+
+def test_height_over_ground_follows_a_relief() -> None:
+    """A slope of one in ten to the north, flown level: the height over ground is what is left."""
+    slope = Terrain(np.array([[0.0, 0.0], [1000.0, 1000.0]]), np.radians([34.0, 10_000 * METRE, 107.0, 2.0]))
+    weather, level = air(LAYER, ground=slope), air(LAYER)
+    for north in (0.0, 1000.0, 2000.0, 2700.0):
+        lat = HERE[0] + math.radians(north * METRE)
+        assert weather.step(lat, *HERE[1:]) == pytest.approx(level.step(lat, HERE[1], 280.0 - north / 10))
+
+
+def test_profiles_go_by_altitude() -> None:
+    profile = {"profile": [[0.0, 250.0, 2.0], [1000.0, 250.0, 12.0]]}
+    assert air(profile, ground=Terrain.flat(500.0)).step(*HERE) == air(profile).step(*HERE)
 
 
 def test_a_gradient_grows_with_the_distance_from_the_start() -> None:
@@ -134,7 +164,7 @@ def test_a_gradient_grows_with_the_distance_from_the_start() -> None:
 
 def test_a_gradient_knows_the_date_line() -> None:
     start = START.model_copy(update={"lon_deg": 179.9999})
-    weather = Weather(Wind(gradient_mps_per_km=((1.0, 1.0), (1.0, 1.0))), start, 1, PERIOD)
+    weather = Weather(Wind(gradient_mps_per_km=((1.0, 1.0), (1.0, 1.0))), start, LEVEL, 1, PERIOD)
     assert np.abs(weather.step(HERE[0], math.radians(-179.9999), 280.0)).max() < 0.03
 
 
@@ -347,8 +377,9 @@ ALL = {
 }
 
 
-def flight(wind: dict[str, Any], seed: int = 1) -> Flight:
-    truth = FlightTruth(source="flight", start=START, wind=Wind.model_validate(wind))
+def flight(wind: dict[str, Any], seed: int = 1, ground: float = 0.0) -> Flight:
+    start = START.model_copy(update={"alt_m": START.alt_m + ground})
+    truth = FlightTruth(source="flight", start=start, wind=Wind.model_validate(wind), terrain=Ground(height_m=ground))
     return Flight(truth, ROUND, seed)
 
 
@@ -383,6 +414,30 @@ def test_weather_is_the_same_however_a_run_is_cut() -> None:
     for name in ("wind_n", "v_n", "lat", "q_nb"):
         np.testing.assert_array_equal(np.concatenate([getattr(b, name) for b in blocks]), getattr(whole, name))
     assert (flight(ALL, seed=2).advance(4001).wind_n != whole.wind_n).any()
+
+
+@pytest.mark.ci
+def test_over_high_ground_there_are_the_same_wind_and_thermals() -> None:
+    """Higher up it flies another way, in thinner air: the same at first, and thermals all along."""
+    wind = {**LAYER, **THERMALS}
+    low, high = flight(wind).advance(30 * 200).wind_n, flight(wind, ground=2000.0).advance(30 * 200).wind_n
+    np.testing.assert_allclose(high[:200], low[:200], atol=0.01)
+    assert (high[1:, 2] != 0.0).all()
+    assert np.linalg.norm(high[:, :2], axis=1) == pytest.approx(np.linalg.norm(low[:, :2], axis=1), abs=0.01)
+
+
+@pytest.mark.ci
+@pytest.mark.parametrize("ground", [0.0, 500.0])
+def test_on_its_launcher_it_is_in_the_wind_there(ground: float) -> None:
+    """Which is that of its height over ground from the first row on."""
+    start = Start(lat_deg=34.0, lon_deg=108.0, alt_m=ground, heading_deg=250.0, on_ground=True)
+    truth = FlightTruth(source="flight", start=start, wind=Wind.model_validate(LAYER), terrain=Ground(height_m=ground))
+    source = Flight(truth, ROUND, 1)
+    block = source.advance(200)
+    over_ground = block.h[0] - ground
+    assert 1.0 < over_ground < 5.0
+    wind = 6.0 * math.log(over_ground / 0.1) / math.log(10.0 / 0.1)
+    assert np.linalg.norm(block.wind_n, axis=1) == pytest.approx(wind, abs=1e-3)
 
 
 @pytest.mark.ci
