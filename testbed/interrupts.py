@@ -49,9 +49,14 @@ INTERRUPTS = (Interrupted, KeyboardInterrupt)  # which are nobody's own to take
 
 
 def end_at_once() -> None:
-    """From now on each of `SIGNALS` ends this process there and then, with a line: before anything is begun."""
+    """From now on each of `SIGNALS` ends this process there and then, with a line: before anything is begun.
+
+    Who is forked off, as by a pool of the user's own, does not inherit that, nor what comes later.
+    """
     global _program
     _program = True
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=left_to_others)
     for one in SIGNALS:
         if signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, _end)

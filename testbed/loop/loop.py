@@ -164,12 +164,13 @@ def _leaves_to_compile(scenario: Scenario, setup: Setup) -> bool:
     return ours and open_loop and Ahead.possible() and not registry.is_kept(scenario.estimator)
 
 
-def _own_code(scenario: Scenario) -> dict[str, str]:
-    """What a record says of the code of the user's classes; nothing where there are none, or they have been edited."""
-    with suppress(UserError):
+def _own_code(scenario: Scenario) -> tuple[dict[str, str], list[str]]:
+    """What a record says of the code of the user's classes, and what there is to say where they have been edited."""
+    try:
         digests = {kind: code for own in scenario.own().values() for kind, code in own.items()}
-        return {"own_code": json.dumps(digests)} if digests else {}
-    return {}
+    except UserError as error:
+        return {}, [str(error)]
+    return {"own_code": json.dumps(digests)} if digests else {}, []
 
 
 def _rehearse(scenario: Scenario, estimators: Sequence[EstimatorSection], seed: int) -> None:
@@ -247,7 +248,8 @@ class _Passage:
         self.recorder = Recorder(setup.out / RECORD if setup.out else None, scenario, setup.seed)
         ending.callback(self.recorder.close)
         self.told = Listeners(setup.links, setup.progress, scenario.duration_s, self.recorder.event)
-        self.recorder.attributes |= self.feed.origin | _own_code(scenario)
+        own_code, self.edited = _own_code(scenario)
+        self.recorder.attributes |= self.feed.origin | own_code
         self.watch = EventWatch.of(self._emit, self.feed.faults.truth, scenario)
         self.leg_names = scenario.leg_names
         plant = Parts(self.feed.faults, self.feed.receptions, self.lanes, self.feed.source)
@@ -379,7 +381,7 @@ class _Passage:
 
     def conclude(self) -> list[str]:
         """The end: last events, and what the caller should know."""
-        end, remarks = self._end, []
+        end, remarks = self._end, [*self.edited]
         self._tell_ended(end, [name for name, lane in self.lanes.items() if lane.failure])
         for event in self.feed.take_events():
             self.told.emit(*event)

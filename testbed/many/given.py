@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from pathlib import Path
@@ -57,16 +58,17 @@ def varied(given: Any) -> dict[str, Sequence[str]]:
 
 
 def require_once(key: str, listed: Sequence[str]) -> None:
-    """Raises UserError where there is no value to vary a key by, or one twice: 1 is 1.0."""
-    if not listed or len(set(map(_number, listed))) < len(listed):
+    """Raises UserError where there is no value to vary a key by, or one twice: 1 is 1.0, and 'a' is "a"."""
+    if not listed or len(set(map(_meant, listed))) < len(listed):
         raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
 
 
-def _number(value: str) -> float | str:
+def _meant(value: str) -> str:
     try:
-        return float(value)
-    except ValueError:
-        return value
+        found = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        found = value
+    return repr(float(found) if type(found) is int else found)
 
 
 def _listed(key: str, given: Any) -> Sequence[str]:

@@ -37,7 +37,7 @@ from testbed.feeds import simulated
 from testbed.feeds.simulated import motion
 from testbed.loop import loop
 from testbed.many import campaign as campaigns
-from testbed.many import folder, pool, shared_flight
+from testbed.many import folder, given, pool, shared_flight
 from testbed.many.campaign import Combination, Failure, Outcome, Plan, Progress, campaign
 from testbed.motion.kinematic import Kinematic
 from testbed.motion.table import COLUMNS, Replay, TruthBlock, save_motion
@@ -899,6 +899,13 @@ def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: 
         flown = campaigns._fly(task, lambda share: None)
         assert isinstance(flown, Outcome)
         assert sum(one() is not None for one in left) == 1  # the last
+
+
+@pytest.mark.parametrize("listed", [["'a'", '"a"'], ["1", "1.0"], ["1e0", "1"], ["[1, 2]", "[1,2]"], []])
+def test_a_value_given_twice_is_refused_however_it_is_written(listed: list[str]) -> None:
+    given.require_once("estimator[0].grade", ["true", "1", "'a'", "a.b", "[1]"])
+    with pytest.raises(UserError, match="give each value once"):
+        given.require_once("estimator[0].grade", listed)
 
 
 @pytest.mark.parametrize("text", ["[]", '{"metrics": []}', '{"metrics": {"ins.aligned_s": "soon"}}', "{}", "1"])
