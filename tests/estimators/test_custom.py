@@ -542,7 +542,7 @@ def test_a_run_of_what_was_edited_since_it_was_imported_says_so(tmp_path: Path) 
     """It flew the old code without a word, and its record could not tell that it was another's."""
     (tmp_path / "own.py").write_text(
         "class Idle:\n"
-        "    def __init__(self): self.t = 0.0\n"
+        "    def __init__(self, rig): self.t = 0.0\n"
         "    def propagate(self, imu): self.t = float(imu.t[-1])\n"
         "    def update(self, sample): return []\n"
         "    def estimate(self):\n"
