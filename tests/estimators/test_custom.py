@@ -538,9 +538,11 @@ def test_options_of_a_type_that_is_not_there_yet_are_told_on_a_readable_line(tmp
     assert todo in str(refused.value)
 
 
-def test_a_run_of_what_was_edited_since_it_was_imported_says_so(tmp_path: Path) -> None:
+def test_a_run_of_what_was_edited_since_it_was_imported_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It flew the old code without a word, and its record could not tell that it was another's."""
-    (tmp_path / "own.py").write_text(
+    (tmp_path / "idling.py").write_text(
         "class Idle:\n"
         "    def __init__(self, rig): self.t = 0.0\n"
         "    def propagate(self, imu): self.t = float(imu.t[-1])\n"
@@ -552,12 +554,13 @@ def test_a_run_of_what_was_edited_since_it_was_imported_says_so(tmp_path: Path) 
     (tmp_path / "own.toml").write_text(
         'title = "Idle"\nseed = 1\nduration_s = 1\n[truth]\nsource = "kinematic"\nmotion = "static"\n'
         "start = { lat_deg = 47.0, lon_deg = 8.0, alt_m = 300 }\n[sensors.imu]\n"
-        '[[estimator]]\nname = "idle"\nkind = "./own.py:Idle"\n'
+        '[[estimator]]\nname = "idle"\nkind = "idling:Idle"\n'
     )
+    monkeypatch.syspath_prepend(tmp_path)
     scenario = Scenario.load(tmp_path / "own.toml")
     first = run(scenario)
     assert "own_code" in first.dataset.attrs
     assert not any("edited" in one for one in first.remarks)
-    with (tmp_path / "own.py").open("a") as file:
+    with (tmp_path / "idling.py").open("a") as file:
         file.write("# more\n")
-    assert any("own.py: has been edited since it was imported" in one for one in run(scenario).remarks)
+    assert any("idling.py: has been edited since it was imported" in one for one in run(scenario).remarks)
