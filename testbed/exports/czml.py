@@ -34,7 +34,7 @@ def content(tree: xarray.DataTree) -> bytes:
         colour = TRUE if track.name == TRUTH else ESTIMATED[(k - 1) % len(ESTIMATED)]
         packets.append(_moving(view, track, colour))
         if track.name == TRUTH:
-            packets += [_denied(track, start, end) for start, end in view.denied]
+            packets += [packet for start, end in view.denied for packet in _denied(track, start, end)]
     return json.dumps(packets, indent=1).encode()
 
 
@@ -61,12 +61,15 @@ def _moving(view: View, track: Track, colour: tuple[int, int, int]) -> dict[str,
     return packet
 
 
-def _denied(track: Track, start: float, end: float) -> dict[str, Any]:
+def _denied(track: Track, start: float, end: float) -> list[dict[str, Any]]:
+    """The stretch of a track, nothing where no two places of it are known: they make a line."""
     inside = (track.t >= start) & (track.t <= end)
+    if inside.sum() < 2:
+        return []
     lon, lat, h = (values[inside] for values in _degrees(track))
     paint = {"solidColor": {"color": {"rgba": [*DENIED, 255]}}}
     line = {"positions": {"cartographicDegrees": _flat(lon, lat, h)}, "width": 5, "material": paint}
-    return {"id": f"denied {start:g}", "name": f"no GNSS, {start:g} to {end:g} s", "polyline": line}
+    return [{"id": f"denied {start:g}", "name": f"no GNSS, {start:g} to {end:g} s", "polyline": line}]
 
 
 def _degrees(track: Track) -> tuple[Array, Array, Array]:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 HEAD = b"\xa3\x95"
 FIRST_NUMBER = 128  # of messages; FMT has it
+TEXT_BYTES = 64  # of the letter Z
 GAUSS, FREEZING = 1e-4, 273.15  # [T], [K]
 NONE, FIX_3D = 1, 3  # fixes, as ArduPilot counts them
 
@@ -36,7 +37,7 @@ NONE, FIX_3D = 1, 3  # fixes, as ArduPilot counts them
 LETTERS: Mapping[str, tuple[str, float]] = {
     "Q": ("<u8", 1), "d": ("<f8", 1), "f": ("<f4", 1), "B": ("u1", 1), "b": ("i1", 1), "H": ("<u2", 1), "I": ("<u4", 1),
     "c": ("<i2", 100), "C": ("<u2", 100), "e": ("<i4", 100), "L": ("<i4", 1e7), "h": ("<i2", 1),
-    "n": ("S4", 1), "N": ("S16", 1), "Z": ("S64", 1),
+    "n": ("S4", 1), "N": ("S16", 1), "Z": (f"S{TEXT_BYTES}", 1),
 }  # fmt: skip
 
 
@@ -113,9 +114,20 @@ def content(tree: xarray.DataTree) -> bytes:
     """The log of a record."""
     view = View(tree)
     told = [("navigation-testbed: " + view.title, 0.0), *((text, t) for t, _, text in view.events)]
-    words = _rows("MSG", stamps(np.array([t for _, t in told])), Message=np.array([text.encode() for text, _ in told]))
+    pieces = [(piece, t) for text, t in told for piece in _pieces(text)]
+    words = _rows("MSG", stamps(np.array([t for _, t in pieces])), Message=np.array([piece for piece, _ in pieces]))
     parts = [("MSG", words), *_sensors(view), *_solutions(view)]
     return _head() + in_order([(own["TimeUS"], _framed(name, own)) for name, own in parts])
+
+
+def _pieces(text: str) -> list[bytes]:
+    """A text in as many pieces as messages have room for, none of which ends within a character."""
+    found, rest = [], text.encode()
+    while len(rest) > TEXT_BYTES:
+        end = next(k for k in range(TEXT_BYTES, 0, -1) if rest[k] & 0xC0 != 0x80)  # no byte that goes on with another
+        found.append(rest[:end])
+        rest = rest[end:]
+    return [*found, rest]
 
 
 @cache

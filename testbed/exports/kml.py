@@ -76,7 +76,10 @@ def _line(view: View, folder: ElementTree.Element, track: Track, colour: str) ->
 
 
 def _denied(folder: ElementTree.Element, track: Track, start: float, end: float) -> None:
+    """The stretch of a track, nothing where no two places of it are known: they make a line."""
     inside = (track.t >= start) & (track.t <= end)
+    if inside.sum() < 2:
+        return
     line = _with(_placemark(folder, f"no GNSS, {start:g} to {end:g} s", DENIED, "5"), "LineString")
     ElementTree.SubElement(line, _name("altitudeMode")).text = "absolute"
     places = " ".join(_places(track.lat[inside], track.lon[inside], track.h[inside], ","))

@@ -24,7 +24,7 @@ STEPS = 3.0  # or so many of its own, where it is slower
 FAR_M, FAR = 10.0, 10.0  # that a fix may be off by and count, or so many times the usual
 BACK = 0.2  # of the way there, by which the way back may miss
 SIDE_BY_SIDE = 2  # that may be far off together
-KNOWN = {"dtheta": 0.0, "dv": 0.0, "leg": -1.0}  # columns that a log has none of; all others are NaN
+KNOWN = {"leg": -1.0}  # columns of which something is known without a log that tells it; all others are NaN
 
 
 class ReferenceMotion:

@@ -36,10 +36,12 @@ class Hearing:
         news: Sequence[tuple[int, Sample]],
         t: Array,
         silent_s: Mapping[str, float],
+        first: Mapping[type[Sample], str],
     ) -> None:
         """The newest samples ``before``, by sensor, and those since, each with the instant by which it was there.
 
-        ``silent_s`` says after how long a sensor that says nothing counts as failed.
+        ``silent_s`` says after how long a sensor that says nothing counts as failed, ``first`` which is the first
+        sensor of a kind; of a kind that is not in it, the first to speak is.
         """
         self._t, self._times, self._silent_s = t, t.tolist(), silent_s
         # From which instants on which samples are the newest, by sensor, who spoke first before the others.
@@ -53,9 +55,12 @@ class Hearing:
             else:
                 rows.append(row)
                 samples.append(sample)
-        self._first: dict[type[Sample], str] = {}  # the first sensor of each kind
-        for name, (_, samples) in self._own.items():
-            self._first.setdefault(_kind(samples[0]), name)
+        self._first = dict(first)
+        self._since: dict[type[Sample], int] = {}  # the instant by which any of a kind has spoken
+        for name, (rows, samples) in self._own.items():
+            kind = _kind(samples[0])
+            self._first.setdefault(kind, name)
+            self._since[kind] = min(rows[0], self._since.get(kind, rows[0]))
 
     def last(self) -> dict[str, Sample]:
         """The newest sample of each sensor at the end."""
@@ -63,11 +68,12 @@ class Hearing:
 
     def knows(self, kind: type[Sample], row: int) -> bool:
         """Whether a sensor of this kind has said anything by an instant."""
-        return kind in self._first and self._own[self._first[kind]][0][0] <= row
+        return kind in self._since and self._since[kind] <= row
 
     def newest(self, kind: type[Sample], row: int) -> Sample | None:
-        """The newest sample of the first sensor of a kind, None when there is none or it has fallen silent."""
-        return self._newest_of(self._first[kind], row) if kind in self._first else None
+        """The newest sample of the first sensor of a kind, None when there is none or it is silent."""
+        name = self._first.get(kind)
+        return None if name is None or name not in self._own else self._newest_of(name, row)
 
     def fixed(self, row: int) -> bool:
         """Whether any sensor tells where the vehicle is; the estimator takes its last word for fresh a while longer."""
@@ -110,7 +116,7 @@ class Hearing:
     def _column(self, kind: type[S], of: Callable[[S], object], shape: tuple[int, ...] = ()) -> Array:
         """A number of the samples of the first sensor of a kind."""
         name = self._first.get(kind)
-        if name is None:
+        if name is None or name not in self._own:
             return np.full((len(self._t), *shape), math.nan)
         which, speaks = self._newest(name)
         values = np.array([of(cast("S", sample)) for sample in self._own[name][1]], float)[which]

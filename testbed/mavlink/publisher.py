@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from nav.columns import Estimates
 from nav.samples import Array, Sample, Status
+from testbed.feeds.log import SAMPLES
 from testbed.loop.links import Stretch
 from testbed.loop.requests import Request
 from testbed.loop.settings import settings
@@ -91,6 +92,7 @@ class MavlinkPublisher:
             for name, config in scenario.sensors.items()
             if not isinstance(config, ImuConfig)
         }
+        self._first = _first_of(scenario)
         self._streams = BESIDE_VEHICLES if vehicles else STREAMS
         self._schedule = Schedule(self._streams)
         self._history = History()
@@ -151,7 +153,7 @@ class MavlinkPublisher:
     def _moments(self, rows: Stretch) -> Moments:
         """The rows as the shown vehicle has them."""
         t = rows.truth["t"]
-        hearing = Hearing(self._heard, rows.samples, t, self._silent_s)
+        hearing = Hearing(self._heard, rows.samples, t, self._silent_s, self._first)
         self._heard = hearing.last()
         ratios, shut_out = self._verdicts.read(rows.reports, len(rows))
         return Moments(
@@ -362,6 +364,15 @@ class MavlinkPublisher:
             changed |= column != [self._health_of.get(name, 0), *column[:-1]]
             self._health_of[name] = int(column[-1])
         return [int(row) for row in np.flatnonzero(changed)]
+
+
+def _first_of(scenario: Scenario) -> dict[type[Sample], str]:
+    """The first sensor of each kind in the order of the scenario; of what own sensors measure none is known yet."""
+    found: dict[type[Sample], str] = {}
+    for name, config in scenario.sensors.items():
+        if config.kind in SAMPLES:
+            found.setdefault(SAMPLES[config.kind], name)
+    return found
 
 
 def _as_estimates(truth: Mapping[str, Array]) -> Estimates:

@@ -180,7 +180,7 @@ class Snapshot:
         return max(speeds) > FLYING_MPS if speeds else None
 
     def newest(self, kind: type[S]) -> S | None:
-        """The newest sample of the first sensor of this kind, None when there is none or it has fallen silent."""
+        """The newest sample of the first sensor of this kind, None when there is none or it is silent."""
         return cast("S | None", self._moments.hearing.newest(kind, self._row))
 
     def knows(self, kind: type[Sample]) -> bool:

@@ -127,17 +127,18 @@ def _way(dataset: xarray.DataTree, name: str, running: Lane) -> _Way | None:
     if t[-1] - start < 2 * SHORTEST_S:
         return None
     edges = np.linspace(start, t[-1], min(SEGMENTS, int((t[-1] - start) / SHORTEST_S)) + 1)
-    motion = {key: column(dataset, f"truth/{key}") for key in ("lat", "lon", "h", "q_nb", "v_n", "dv", "dtheta")}
+    motion = {key: column(dataset, f"truth/{key}") for key in ("lat", "lon", "h", "q_nb", "v_n")}
     known = np.flatnonzero(np.isfinite(np.column_stack([*motion.values()])).all(axis=1) & (t > t[0]))
     if not len(known):
         return None
     after = np.clip(np.searchsorted(t[known], (edges[:-1] + edges[1:]) / 2), 0, len(known) - 1)
     row = known[after]
     lla = np.column_stack([motion[key][row] for key in ("lat", "lon", "h")])
-    q_nb, v_n, dv, dtheta = (motion[key][row] for key in ("q_nb", "v_n", "dv", "dtheta"))
+    q_nb, v_n = motion["q_nb"][row], motion["v_n"][row]
+    dv, dtheta = (column(dataset, f"truth/{key}")[row] for key in ("dv", "dtheta"))
     airspeed = column(dataset, "truth/airspeed")[row]
     airspeed = np.where(np.isfinite(airspeed), airspeed, np.linalg.norm(v_n, axis=1))
-    if not motion["dv"][known].any():
+    if not np.nan_to_num(dv).any():  # unknown, in older records 0
         unit, C_sb = next(iter(running.imus.items()))
         felt = _felt(dataset, unit, t[row - 1], t[row])
         if felt is None:

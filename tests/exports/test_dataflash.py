@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from pymavlink import DFReader
@@ -29,7 +31,11 @@ def record(flown: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def messages(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
-    path = export(flown, "bin", tmp_path_factory.mktemp("bin") / "run.bin")
+    return read(export(flown, "bin", tmp_path_factory.mktemp("bin") / "run.bin"))
+
+
+def read(path: Path) -> dict[str, list[Any]]:
+    """Messages by name."""
     reader = DFReader.DFReader_binary(str(path))
     found: dict[str, list[Any]] = {}
     with contextlib.closing(reader.filehandle), contextlib.closing(reader.data_map):
@@ -101,6 +107,21 @@ def test_truth_and_estimates_are_the_records(messages: dict[str, list[Any]], rec
         np.testing.assert_allclose(column(messages, "XKF1", "Pitch", core, "C"), angles[:, 1], rtol=0, atol=0.0051)
     assert np.isnan(column(messages, "XKF1", "PN", 1, "C")).all()  # attitude is all that it estimates
     assert [m.Message for m in messages["MSG"]][1:] == list(record["events/text"].values)
+
+
+def test_a_long_text_goes_on_in_further_messages(flown: Path, tmp_path: Path) -> None:
+    """They have room for 64 bytes: of 200 Pa the 20 were told."""
+    said = ["fault barometer_pressure_step begins: barometer pressure step 200 Pa", 63 * "a" + "µ" + 40 * "€"]
+    shutil.copy(flown, tmp_path / "run.nc")
+    with h5py.File(tmp_path / "run.nc", "r+") as file:
+        file["events/text"][:2] = np.array([text.encode() for text in said], "S320").view("S1").reshape(2, 320)
+    messages = read(export(tmp_path / "run.nc", "bin"))
+    record = load(tmp_path / "run.nc")["events"]
+    texts = [one.Message for one in messages["MSG"][1:]]
+    assert "".join(texts) == "".join(record["text"].values)
+    assert max(len(text.encode()) for text in texts) <= 64
+    assert texts[:2] == [said[0][:64], said[0][64:]]
+    assert messages["MSG"][1].TimeUS == messages["MSG"][2].TimeUS == us(record["time"].values[0])
 
 
 def test_units_and_labels_fit_the_letters(messages: dict[str, list[Any]]) -> None:

@@ -75,6 +75,22 @@ def test_czml_says_the_same_over_time(exported: Any, record: Any) -> None:
     assert any(name.startswith("denied") for name in packets)
 
 
+@pytest.mark.parametrize(("known", "shown"), [(28.0, 1), (0.0, 0)])
+def test_a_denied_stretch_without_a_place_is_left_out(known: float, shown: int, flown: Path, tmp_path: Path) -> None:
+    """Where the truth of a recorded flight was unknown it was a line without a point."""
+    shutil.copy(flown, tmp_path / "run.nc")
+    with h5py.File(tmp_path / "run.nc", "r+") as file:
+        t = file["truth/time"][:]
+        file["truth/lat"][(t > known) & (t < 33.0)] = np.nan
+    root = ElementTree.parse(export(tmp_path / "run.nc", "kml")).getroot()
+    lines = root.findall(".//k:LineString/k:coordinates", KML)
+    packets = json.loads(export(tmp_path / "run.nc", "czml").read_text("utf-8"))
+    stretches = [one["polyline"]["positions"]["cartographicDegrees"] for one in packets if "polyline" in one]
+    assert len(lines) == len(stretches) == shown
+    assert all(line.text for line in lines)
+    assert all(stretches)
+
+
 def test_ellipses_enclose_what_they_claim() -> None:
     covariance = np.zeros((2, 3, 3))
     covariance[:, :2, :2] = [[9.0, 3.0], [3.0, 4.0]]

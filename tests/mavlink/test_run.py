@@ -10,6 +10,7 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mav
 from scipy.spatial.transform import Rotation
+from worlds.mavlink import read_log
 
 from testbed import Scenario, run
 from testbed.feeds import build
@@ -203,3 +204,17 @@ def test_only_what_may_ask_keeps_the_run_from_flying_ahead(listening, monkeypatc
     for group in ("truth", "estimators"):
         for mine, own in zip(watched[group].subtree, unwatched[group].subtree, strict=True):
             assert mine.dataset.equals(own.dataset)
+
+
+def test_a_specific_force_that_nobody_knows_is_not_told(tmp_path):
+    """Of a recorded flight it was told to be 0, of a vehicle in the air."""
+    scenario = Scenario.load("recorded_flight", {"duration_s": 3, "sensors.gnss.denied": [], "expect": {}})
+    publisher = MavlinkPublisher([f"tlog:{tmp_path / 'run.tlog'}"], scenario)
+    result = run(scenario, links=[publisher])
+    assert np.isnan(result.dataset["truth/dv"].values).all()
+    assert np.isnan(result.dataset["truth/dtheta"].values).all()
+    told = [message for _, message in read_log(tmp_path / "run.tlog")]
+    said = [message for message in told if message.get_type() in ("SIMSTATE", "SIM_STATE")]
+    assert {message.get_type() for message in said} == {"SIMSTATE", "SIM_STATE"}
+    assert np.isnan([[message.xacc, message.yacc, message.zacc] for message in said]).all()
+    assert np.isfinite([message.yaw for message in said]).all()

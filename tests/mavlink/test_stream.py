@@ -380,6 +380,48 @@ def test_gnss_denied_or_silent_shows_as_no_fix(tmp_path, samples, satellites):
     assert heard["GNSS_INTEGRITY"].jamming_state == mav.GPS_JAMMING_STATE_DETECTED
 
 
+TWO_OF_EACH = {
+    f"sensors.{name}2": {"kind": name, "rate_hz": 5} for name in ("gnss", "barometer", "magnetometer", "airspeed")
+}
+
+
+def both(t, first):
+    """What second sensors say, and then, if anything, the first."""
+    others = {f"{name}2": dataclasses.replace(one, sensor=f"{name}2") for name, one in samples_at(t).items()}
+    return others | first
+
+
+def differing(t):
+    """Samples that differ from those of the second sensors, and no fix."""
+    return samples_at(t, fix=False) | {
+        "barometer": BarometerSample(t, t, 80000.0),
+        "magnetometer": dataclasses.replace(samples_at(t)["magnetometer"], field_b=np.array([-2e-5, 1e-5, 5e-5])),
+        "airspeed": AirspeedSample(t, t, 10.0),
+    }
+
+
+def test_the_first_sensor_is_the_scenarios_not_who_spoke_first(tmp_path):
+    """A receiver heard 0.1 s before the first one was shown in its place, and the outage of that was not."""
+    heard = collections.defaultdict(list)
+    publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], SCENARIO.changed(TWO_OF_EACH))
+    publish(publisher, range(60), samples=lambda t: both(t, differing(t) if t > 0.1 else {}))
+    publisher.close()
+    for _, message in read_log(tmp_path / "run.tlog"):
+        heard[message.get_type()].append(message)
+    bit = mav.MAV_SYS_STATUS_SENSOR_GPS
+    assert {message.fix_type for message in heard["GPS_RAW_INT"]} == {mav.GPS_FIX_TYPE_NO_FIX}
+    assert not any(message.onboard_control_sensors_health & bit for message in heard["SYS_STATUS"])
+    assert all(message.onboard_control_sensors_present & bit for message in heard["SYS_STATUS"])
+    assert last(heard, "GNSS_INTEGRITY", "jamming_state") == mav.GPS_JAMMING_STATE_DETECTED
+    early, late = heard["HIGHRES_IMU"][0], heard["HIGHRES_IMU"][-1]
+    assert early.time_usec < 100_000
+    assert np.isnan([early.abs_pressure, early.diff_pressure, early.xmag]).all()
+    assert (late.abs_pressure, late.diff_pressure) == pytest.approx((800.0, 0.6125), rel=1e-4)
+    assert (late.xmag, late.zmag) == pytest.approx((-0.2, 0.5))
+    assert last(heard, "VFR_HUD", "airspeed") == 10.0
+    assert last(heard, "SCALED_PRESSURE", "press_abs") == 800.0
+
+
 def test_health_is_told_as_soon_as_it_changes(tmp_path):
     publisher = MavlinkPublisher([str(tmp_path / "run.tlog")], SCENARIO)
     publish(publisher, range(153))
