@@ -161,6 +161,7 @@ print("heavy:", sorted(heavy & sys.modules.keys()))
     assert shown.splitlines()[-1] == "heavy: []"
 
 
+@pytest.mark.ci
 def test_a_run_imports_nothing_slow_that_it_does_not_use() -> None:
     code = """
 import sys, testbed.loop.loop

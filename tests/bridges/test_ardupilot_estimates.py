@@ -87,6 +87,7 @@ def test_whom_nothing_is_denied_has_no_outage(heard: tuple[RunResult, autopilots
     assert not [name for name in found if name.startswith("theirs.outage") or name.startswith("theirs.recovery")]
 
 
+@pytest.mark.ci
 def test_one_that_flies_is_armed_by_whom_it_likes() -> None:
     voice = autopilots.Answering(0.5, 1.5, 100.0)
     peer = autopilots.ArduPilot(voice=voice)

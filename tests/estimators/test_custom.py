@@ -422,6 +422,7 @@ def test_an_installed_package_offers_a_kind_by_name(monkeypatch: pytest.MonkeyPa
     assert flown(folder, kind="theirs").dataset["estimators/mine"]["time"].size
 
 
+@pytest.mark.ci
 def test_one_that_holds_a_port_keeps_to_the_clock_too(folder: Path) -> None:
     """It is made once before, so that all is loaded, and that one held the port until the end of the run."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:

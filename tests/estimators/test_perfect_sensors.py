@@ -18,6 +18,7 @@ FEDERATED = {
 }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("estimator", [INS, FEDERATED], ids=["ins", "federated"])
 def test_the_truth_is_found_and_nothing_refused(estimator: dict[str, object]) -> None:
     """Told of no noise, an INS trusted itself more than its integration: 9 cm off, and half of all samples refused."""

@@ -16,6 +16,7 @@ def flown(scenario: str, *overrides: str) -> RunResult:
     return run(Scenario.load(f"scenarios/{scenario}.toml", ["expect={}", *overrides]))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("imu", [(), (HOBBY,)], ids=["industrial", "hobby"])
 def test_standing_without_gnss_it_stays_where_it_is(imu: tuple[str, ...]) -> None:
     denied = "duration_s=200", "sensors.gnss.denied=[[40, 200]]", *imu

@@ -112,6 +112,7 @@ def test_a_log_without_the_time_of_day_asks_for_its_own_seconds(
         flown(written(tmp_path, *solution), log=tmp_path / "run.nc")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("columns", "told"),
     [

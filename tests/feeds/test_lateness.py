@@ -113,6 +113,7 @@ def drafted(folder, **how):
     return Scenario.load(folder / "draft.toml")
 
 
+@pytest.mark.ci
 def test_a_draft_says_both_and_is_judged_by_where_the_receiver_was(tmp_path):
     scenario = drafted(tmp_path, lag=0.2, late=0.1)
     receiver = scenario.sensors["gnss"]

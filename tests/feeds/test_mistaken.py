@@ -76,6 +76,7 @@ def beside(air=1.0, height=1.0, measured=1.0):
     return replace(log(fixes=fixes), samples={"gnss": fixes, "barometer": pressures, "airspeed": speeds})
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("told", "said"),
     [

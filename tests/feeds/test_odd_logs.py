@@ -169,6 +169,7 @@ def test_a_long_silence_is_a_phase_and_nothing_is_measured_of_it(tmp_path: Path)
     assert not found.vibration
 
 
+@pytest.mark.ci
 def test_of_a_log_that_does_not_say_where_it_was_a_place_is_assumed(tmp_path: Path) -> None:
     lost = [one for one in circling() if one[0] != "GPS"]
     text = draft.scenario(survey(read(lost, tmp_path)), tmp_path / "x", None)

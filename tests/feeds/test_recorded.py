@@ -61,6 +61,7 @@ def again(flown: RunResult, text: str, changes: Mapping[str, Any], folder: Path)
     return fly(log_of(text, flown.path / "run.nc", 'aircraft = "loiter"'), {**FLIGHT, **changes}, folder)
 
 
+@pytest.mark.ci
 def test_attitudes_are_judged_between_the_fixes_of_a_slow_receiver(tmp_path: Path) -> None:
     """By the log's solution at its own rate: between two fixes an aircraft in a turn does not turn evenly."""
     text = Scenario.load("u_turn").text

@@ -44,6 +44,7 @@ imu = true
 """
 
 
+@pytest.mark.ci
 def test_errors_against_a_receiver_are_of_its_antenna(tmp_path: Path) -> None:
     """Against the truth they are of centimetres, and so they are against a receiver of centimetres, a metre away."""
     flown = run(Scenario.parse(FLIGHT), out=tmp_path / "flown")

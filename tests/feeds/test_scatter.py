@@ -80,6 +80,7 @@ def test_without_claims_the_noise_is_told() -> None:
     assert otherwise(circling(1.0, math.nan, white=0.2 * WHITE), GRADES["standalone"]) == {}
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("grade", ["standalone", "sbas", "rtk", "u-blox-m8"])
 def test_the_receivers_of_the_simulator_are_as_they_are_told(grade: str) -> None:
     e = GnssConfig(grade=grade).errors()  # type: ignore[arg-type]

@@ -49,6 +49,7 @@ def test_a_pitot_that_is_blown_on_the_ground_says_nothing_of_its_scale(shakes: b
     assert survey(flown(shakes, drifts)).airspeed_scale["airspeed"] == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("samples", [0, None], ids=["mute", "dead"])
 def test_a_log_is_surveyed_by_a_unit_that_feels_something(samples: int | None, tmp_path: Path) -> None:
     """By the first, of which no sample was of use, there was a traceback, and by one of zeros all went by these."""

@@ -277,6 +277,7 @@ def latency_of(late: float, period: float) -> float | None:
     return None if found is None else found.s
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("period", [2.0, 5.0])
 @pytest.mark.parametrize("late", [0.0, 0.1, 0.4, 0.65, 0.7])
 def test_a_latency_is_found_however_the_vehicle_swings(late: float, period: float) -> None:

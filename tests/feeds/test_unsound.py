@@ -67,6 +67,7 @@ def flown(
     return survey(formats.read(dataflash(found, folder / "flight.bin"), {}))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [

@@ -243,6 +243,7 @@ def test_metrics_and_record_are_written(tmp_path: Path) -> None:
     assert result.metrics["ins.aligned_s"] < 5
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("every", [1, 5])
 def test_estimators_beside_the_shown_one_are_handed_over_as_often_as_they_are_looked_at(every: int) -> None:
     class Sparse(Watcher):

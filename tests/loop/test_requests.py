@@ -496,6 +496,7 @@ def test_a_restart_begins_anew_in_the_same_folder(tmp_path: Path) -> None:
     assert "begins anew" in station.told()
 
 
+@pytest.mark.ci
 def test_after_a_restart_the_clock_begins_anew_at_the_speed_of_before() -> None:
     asked: list[Request] = [Speed(500.0), Restart()]
     director = Director([lambda: [asked.pop(0)] if asked else []], (), 1000.0, 200.0)
@@ -540,6 +541,7 @@ def test_an_end_before_the_first_row_leaves_one() -> None:
     assert result.remarks[0] == "ended on request at 0 s of 6 s"
 
 
+@pytest.mark.ci
 def test_links_are_told_the_settings_in_force() -> None:
     """Whoever changes them: at the start, after a change, and anew after a restart."""
     station = Station([(1.0, Change("SIM_WIND_SPD", 7.0)), (1.5, Speed(40.0)), (2.0, Restart())])

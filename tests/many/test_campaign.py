@@ -335,6 +335,7 @@ def test_a_draw_has_seeds_of_its_own(at_rest: Path, threads: str, tmp_path: Path
             campaign(at_rest, 2, draw=draw, workers=threads, out=tmp_path / "none")
 
 
+@pytest.mark.ci
 def test_flight_out_of_control_is_a_failure(tmp_path: Path, threads: str, monkeypatch: pytest.MonkeyPatch) -> None:
     class Falls(Kinematic):
         def __init__(self) -> None:
@@ -644,6 +645,7 @@ def test_a_run_after_an_edit_is_none_of_the_campaign(own: Path) -> None:
     assert "has been edited meanwhile" in flown.message
 
 
+@pytest.mark.ci
 def test_a_class_that_is_edited_before_it_flies_is_not_flown(
     own: Path, threads: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -884,6 +886,7 @@ def test_the_manual_is_of_shipped_scenarios(plan: Plan) -> None:
         expected.require_shipped(plan)
 
 
+@pytest.mark.ci
 def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     left: list[weakref.ref[Any]] = []
     plain = campaigns.history_of
@@ -935,6 +938,7 @@ def test_few_runs_have_no_interval(tmp_path: Path) -> None:
     assert intervals.rows[1][2:] == ["0 – 5.00", "≥ 3.00"]
 
 
+@pytest.mark.ci
 def test_runs_too_short_to_be_scored_say_so(at_rest: Path, tmp_path: Path, threads: str) -> None:
     short = ["duration_s=20", "sensors.gnss.denied=[]"]
     errors, *_, consistency = campaign_report.texts(

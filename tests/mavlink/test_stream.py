@@ -622,6 +622,7 @@ def test_time_never_runs_backwards_in_the_log(tmp_path):
     assert stamps[-1] == MIDNIGHT_US + 59 * 40_000
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("vehicles", [False, True])
 def test_a_log_is_the_same_however_many_rows_come_at_once(tmp_path, vehicles):
     """The estimator aligns, a receiver loses its fix, a barometer falls silent, legs end, a sensor is shut out."""

@@ -294,6 +294,7 @@ def test_what_happens_in_a_gap_is_claimed_however_increments_are_cut(gap_s):
     np.testing.assert_allclose(np.sqrt(widened.sum() / 3), 0.5 * gap_s**2 / (gap_s + 0.2), rtol=0.02)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("size", [77, 5000])
 @pytest.mark.parametrize(("begins", "ends"), [(8.0, 18.0), (8.02, 11.98), (8.5, 12.3), (8.05, 12.02)])
 def test_after_a_long_gap_the_level_is_found_anew(begins, ends, size):

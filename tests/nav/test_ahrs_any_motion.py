@@ -187,6 +187,7 @@ def test_a_turn_at_speed_does_not_lean_it():
     assert np.all(np.abs(phi[:, :2]) < 4 * np.sqrt(covariance.diagonal(axis1=1, axis2=2)[:, :2]))
 
 
+@pytest.mark.ci
 def test_airspeed_levels_in_a_turn():
     """100 s of turns at 3 deg/s and 50 m/s: 15 deg of bank, of which airspeed leaves less than one."""
     truth = level_flight(3.0, (50.0, 550.0))

@@ -244,6 +244,7 @@ def test_estimates_are_made_of_nothing_that_a_draft_lacks(make):
     assert all(map(same, *told))
 
 
+@pytest.mark.ci
 def test_a_silent_tube_is_stood_in_for_at_the_same_sample():
     """Just when its silence has lasted long enough, wherever a turn ends and times are rounded."""
     times, stood_in = np.arange(0.2, 18.0, 0.2).tolist(), 0

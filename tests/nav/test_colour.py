@@ -28,6 +28,7 @@ def learned(rho: float, sigma: float, seconds: float = 2000.0, rate: float = 5.0
     return float(np.mean(found[len(found) // 4 :]))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("rho", "sigma"), [(0.5, 1.0), (0.8, 0.6), (0.5, 0.8)])
 def test_it_is_that_of_sums(rho: float, sigma: float) -> None:
     """Against the variance of sums of 100 s, over their length."""

@@ -403,6 +403,7 @@ def test_cross_check_needs_independent_filters(options):
         Config(CONSUMER, three(), cross_check=True, **options)
 
 
+@pytest.mark.ci
 def test_the_single_filter_follows_the_spoofer():
     """The same ramp and sensors in one filter, whatever its gate."""
     truth, increments, one, _, others = world(260)
@@ -537,6 +538,7 @@ def test_a_weight_needs_somebody_to_compare_with_and_comes_after_the_own_policy(
     assert weights_of(reports, 33) == {"gnss": {0.5}}
 
 
+@pytest.mark.ci
 def test_a_velocity_fault_takes_the_position_of_its_receiver_along():
     """One look on every axis bad is the whole receiver bad."""
     truth, increments, one, two, others = world(120)
@@ -638,6 +640,7 @@ def learner(made):
     return make
 
 
+@pytest.mark.ci
 def test_a_condemned_axis_does_not_weaken_the_sound_ones():
     """Two kilometres north, which the detector takes out: what inflates is not asked about them."""
     _, increments, one, two, others = world(120)
@@ -688,6 +691,7 @@ def test_an_axis_left_out_teaches_nothing_and_the_others_go_on():
     assert (np.abs(ratios["bad"][:2] - 1) < 0.5).all()
 
 
+@pytest.mark.ci
 def test_both_receivers_off_for_long_are_believed_in_the_end():
     """A lasting jump of both by 100 m, as after a filter too sure of itself: given in to after `patience_s`."""
     truth, increments, one, two, others = world(120)

@@ -111,6 +111,7 @@ def test_a_receiver_led_astray_tells_no_other_attitude(kind, false):
     assert not [t for t in again if t < 20 + InsConfig(SMALL).patience_s]
 
 
+@pytest.mark.ci
 def test_a_receiver_that_is_elsewhere_is_not_believed():
     """A wrong attitude led the filter away by hundreds of metres, not by twenty kilometres, until patience ends."""
     change = lambda fix: dataclasses.replace(fix, lat=fix.lat + 3e-3)  # noqa: E731
@@ -130,6 +131,7 @@ def test_however_it_is_cut_the_same_bits(kind):
         assert (one.lat, one.lon, one.h) == (other.lat, other.lon, other.h)
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("lost", [3, 7, 11])
 def test_what_is_refused_now_and_then_is_no_doubt(lost, monkeypatch):
     """Each so many fixes one jumps, and is refused: nobody looks for an attitude once it has flown for a while."""

@@ -162,6 +162,7 @@ def test_an_infinite_variance_leaves_the_axis_out():
     assert np.isfinite(error(nothing, flight(60))).all()
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("policy", [SageHusa(), MahalanobisInflation(), Times(4.0)])
 def test_a_sensor_without_noise_keeps_its_weight(policy):
     """There is no variance to learn or to inflate: the same to the last bit as without a policy."""

@@ -79,6 +79,7 @@ def test_without_noise_it_is_exact_whatever_the_heading_and_the_biases(seed):
     assert found[1] < 1.1 * AT_BEST
 
 
+@pytest.mark.ci
 def test_it_is_as_good_as_it_says():
     """It says more than noise makes: what nobody knows of latency and scale, `AT_BEST`, is not drawn here."""
     wrong, claimed = [], []
@@ -198,6 +199,7 @@ def hovering(seconds, rng, strength=1.2):
     return Flight(*rows, *increments(*rows))
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("seed", range(3))
 def test_a_filter_without_a_compass_finds_its_heading_below_the_speed_of_the_course(seed):
     rng = np.random.default_rng(400 + seed)

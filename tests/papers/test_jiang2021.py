@@ -127,6 +127,7 @@ def test_gusts_and_their_means_against_van_loan() -> None:
     np.testing.assert_allclose(F[:, 0], expm(A)[:, 0], rtol=1e-12)
 
 
+@pytest.mark.ci
 def test_the_best_error_is_what_the_steady_covariance_says() -> None:
     """White gusts, gyros of white noise alone: P = q/2 + sqrt(q^2/4 + q r) before, P r / (P + r) after an update."""
     s = statistics(gust_correlation_s=1e-3, gust=2.0)

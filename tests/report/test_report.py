@@ -342,6 +342,7 @@ def test_estimators_are_in_the_order_of_the_scenario_whoever_speaks_first() -> N
     assert accuracy.names(run) == ["first", "second"]
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(("grown", "unit"), [(10.0, "km"), (1.0, "m")])
 def test_a_short_track_is_in_metres(grown: float, unit: str) -> None:
     run = synthetic_run.dataset(120.0, {"ins": Errors(aligned_after=0.0)})

@@ -100,6 +100,7 @@ def test_a_transponder_that_is_never_heard_shows_no_position(silent: str) -> Non
     assert (share(unheard, "dv north", "dv east", "dv down") > 0.9).all()  # by the log
 
 
+@pytest.mark.ci
 def test_a_star_tracker_shows_the_heading_at_once_and_only_while_it_is_believed() -> None:
     wrong = "{name='wrong',sensor='star_tracker',channel='down',kind='step',size=600,window=[30,50]}"
     whole = scenario("cui2022", ["duration_s=80", f"fault=[{wrong}]", "expect={}"])
@@ -207,6 +208,7 @@ def test_a_receiver_may_have_any_name() -> None:
         assert np.isfinite(found[name].seen_from()[found[name].names.index("dv down")])
 
 
+@pytest.mark.ci
 def test_of_a_recorded_flight_it_is_by_what_its_imu_felt() -> None:
     """Nobody knows the force of a recorded flight: without any, neither tilt nor wind would ever be seen."""
     flown = run(Scenario.load("recorded_flight", {"expect": {}})).dataset

@@ -26,6 +26,7 @@ STRAIGHT, TO = "{leg='straight', length_m=%g}", "{leg='straight', to={lat_deg=47
 LOITER = "{leg='loiter', radius_m=460, %s}"
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize(
     ("wind_mps", "legs", "said"),
     [
@@ -40,6 +41,7 @@ def test_a_leg_that_should_have_been_over_is_told(wind_mps: float, legs: list[st
     assert remark.startswith(f"leg 1/1 {said}")
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("leg", [STRAIGHT % 700, "{leg='climb', to_m=430}"])
 def test_a_leg_that_wind_turned_round_is_told(leg: str) -> None:
     """It keeps the course over ground, and so flew away from where it was to go, to its end."""

@@ -214,6 +214,7 @@ def test_a_unit_that_is_not_recorded_has_given_samples() -> None:
     assert not [one for one in found.remarks if "gave no sample" in one]
 
 
+@pytest.mark.ci
 def test_who_refuses_most_in_a_run_too_short_to_be_scored_is_told() -> None:
     """Nothing else said so."""
     jump = {"sensor": "gnss", "channel": "north", "kind": "step", "size": 500.0, "window": [4, 20]}
