@@ -18,7 +18,7 @@ from nav.state import State
 from nav.velocity_matching import Matched
 
 DOUBT_S = 1.0  # what is refused for so long may be right
-BELIEVED_S = 10.0  # without such for longer since it began, the filter is
+BELIEVED_S = 10.0  # after so long without a refusal, and since it began, the filter is believed
 FALSE_ALARM = 1e-4  # probability that two attitudes as good as they claim contradict each other
 REFUSED = (Outcome.OUTSIDE_GATE, Outcome.ISOLATED)
 LIMIT = chi_square_threshold(FALSE_ALARM, 3)
@@ -35,8 +35,8 @@ class HeadingRecovery:
     fixes and fields leave their gates, and what corrections remain go along wrong axes. `nav.velocity_matching` asks
     nothing of the filter. A receiver that is pulled away steadily would tell of a tilt that is not there: so a pull is
     estimated beside (`nav.alignment.PULL`). One that is farther away than a wrong attitude could have led in the time
-    is not believed, nor is any while positions are fused: then no attitude has led the filter away, and what is refused
-    is wrong. It is the receiver that the ``alignment`` was made for.
+    is not believed, nor, but for what follows, is any while positions are fused: then no attitude has led the filter
+    away, and what is refused is wrong. It is the receiver that the ``alignment`` was made for.
 
     A filter that has just begun is doubted too, though it fuses everything: what it began on was one reading of a
     compass, or a course, which bends biases and iron to itself until nothing contradicts it clearly any more.
@@ -59,6 +59,8 @@ class HeadingRecovery:
 
     def propagate(self, imu: ImuSamples) -> None:
         """Add a block of increments."""
+        if len(imu):
+            self._forget(float(imu.t[-1]))
         if self._alignment is not None:
             self._alignment.propagate(imu)
 
@@ -69,6 +71,7 @@ class HeadingRecovery:
 
     def hear(self, sample: Sample, reports: Sequence[UpdateReport]) -> None:
         """What became of a sample."""
+        self._forget(sample.t)
         if any(report.outcome in REFUSED for report in reports):
             if self._refusals.setdefault(sample.sensor, Refusals(DOUBT_S)).too_long(sample.t):
                 self._refused_at = sample.t
@@ -76,7 +79,10 @@ class HeadingRecovery:
                     self._doubted_at, self._alignment = sample.t, deepcopy(self._beginning)
         elif reports:
             self.took(sample.sensor)
-        if sample.t - self._refused_at > BELIEVED_S:
+
+    def _forget(self, t: float) -> None:
+        """Look for no attitude any more where nothing was refused for long, whenever that is noticed."""
+        if t - self._refused_at > BELIEVED_S:
             self._alignment = None
 
     def follow(self, sample: Sample) -> None:

@@ -133,7 +133,7 @@ class Smoother:
             return
         imu = _joined(self._blocks)
         starts = np.array([t for t, _ in nodes])
-        own, at, end = -1, nodes[0], max(nodes[-1].t, *imu.t[-1:])
+        own, at, end = -1, nodes[0], max([nodes[-1].t, *imu.t[-1:]])
         for t in times:
             node = int(np.searchsorted(starts, t + NOTHING)) - 1
             if node < 0 or t > end + NOTHING:
@@ -207,6 +207,8 @@ def _spread(P: Array, information: Array) -> Array:
 
 
 def _joined(blocks: Sequence[ImuSamples]) -> ImuSamples:
+    if not blocks:
+        return ImuSamples(np.empty(0), np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     return ImuSamples(*(np.concatenate([getattr(b, name) for b in blocks]) for name in ("t", "dt", "dtheta", "dv")))
 
 

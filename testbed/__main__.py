@@ -162,14 +162,14 @@ def check(
         raise UserError(f"--junit {junit}: is a folder: name the file in it")
     if junit is not None and junit.is_file() and not checks.is_junit(junit.read_bytes()):
         raise UserError(f"--junit {junit}: is there already, and is no report: give it another name")
+    if junit is not None:
+        junit.unlink(missing_ok=True)  # whatever ends this, it is not that of a run before
     folder = golden or (checks.GOLDEN if checks.GOLDEN.is_dir() else None)
     if folder is None and update:
         raise UserError(f"--update: there is no {checks.GOLDEN} here: say with --golden DIR where they go")
     if folder is not None and update:
         checks.make_folder(folder)
     todo = checks.tasks(names or checks.shipped(), RUNS / "check", folder, update)
-    if junit is not None:
-        junit.unlink(missing_ok=True)  # whatever ends this, it is not that of a run before
     with (
         output_folder(RUNS / "check"),
         interrupts.leaving(lambda: "nothing was concluded"),

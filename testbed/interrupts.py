@@ -51,12 +51,12 @@ INTERRUPTS = (Interrupted, KeyboardInterrupt)  # which are nobody's own to take
 def end_at_once() -> None:
     """From now on each of `SIGNALS` ends this process there and then, with a line: before anything is begun.
 
-    Who is forked off, as by a pool of the user's own, does not inherit that, nor what comes later.
+    Who is forked off, as by a pool of the user's own, inherits neither that nor what comes later.
     """
     global _program
     _program = True
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=left_to_others)
+        os.register_at_fork(after_in_child=_as_ever)
     for one in SIGNALS:
         if signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, _end)
@@ -88,6 +88,13 @@ def _end_alone(code: int) -> None:
         told = f"ended, though threads still ran: {', '.join(going_on)}: end them, or make them daemon threads"
         print(f"testbed: {printable(told)}", file=sys.stderr, flush=True)
     os._exit(code)
+
+
+def _as_ever() -> None:
+    """In a process that was forked: a signal ends it, without a word."""
+    signal.set_wakeup_fd(-1)
+    for one in SIGNALS:
+        signal.signal(one, signal.SIG_DFL)
 
 
 def left_to_others() -> None:

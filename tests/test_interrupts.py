@@ -294,3 +294,21 @@ def test_who_closes_the_output_takes_it_from_nobody(tmp_path: Path) -> None:
     assert ended.stdout.splitlines()[-1].startswith("record: ")
     assert "testbed: mine: its errors are not scored" in ended.stderr
     assert (tmp_path / "runs/mine" / METRICS).exists()
+
+
+FORKED = """
+import os, signal
+from testbed import interrupts
+
+interrupts.end_at_once()
+with interrupts.heeded():
+    if not (child := os.fork()):
+        os._exit(sum(signal.getsignal(one) is not signal.SIG_DFL for one in interrupts.SIGNALS))
+    print(os.waitpid(child, 0)[1])
+"""
+
+
+def test_who_is_forked_off_is_ended_by_signals_as_ever() -> None:
+    """A `multiprocessing.Pool` of the user's own ended in our traceback, or, were they ignored, not at all."""
+    done = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=True)
+    assert done.stdout == "0\n"

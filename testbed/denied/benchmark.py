@@ -154,7 +154,8 @@ def fly(plan: Plan, workers: int | None = None, tell: Tell | None = None) -> Res
             tell((done + flying) / total, text if now.workers else f"{text}  starting")
 
     if tasks:
-        with pool.opened(len(tasks), workers) as crew:
+        apart = any(one.kind != OURS for one in plan.contestants)
+        with pool.opened(len(tasks), workers, apart) as crew:
             for one in crew.work(_fly, tasks, say):
                 if one.result is None:
                     failures.append(Failure(one.task.weather.name, one.task.seed, _said(one.error)))

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from nav.samples import Array, FixType, GnssSample, ImuSamples
 from testbed.errors import UserError
@@ -278,13 +277,14 @@ def _fixes(name: str, rows: Rows, accuracy: Rows | None, notes: list[str]) -> Sa
     return fixes.samples(name, notes)
 
 
-def _heard_fixes(samples: Mapping[str, Samples]) -> list[GnssSample] | None:
-    """The fixes of all receivers, None where it has no receiver."""
+def _heard_fixes(samples: Mapping[str, Samples]) -> tuple[Array, Array] | None:
+    """Times [s] and heights [m] of the fixes of all receivers, in order; None where it has no receiver."""
     told = [one for own in samples.values() for one in own if isinstance(one, GnssSample)]
-    return [one for one in told if one.has_fix] if told else None
+    fixes = np.array(sorted((one.t, one.h) for one in told if one.has_fix)).reshape(-1, 2)
+    return (fixes[:, 0], fixes[:, 1]) if told else None
 
 
-def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: Sequence[GnssSample] | None) -> Iterator[Reference]:
+def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: tuple[Array, Array] | None) -> Iterator[Reference]:
     """What the autopilot itself thought, the best first: attitude and velocity of an EKF's first core, and position.
 
     Position and velocity from the first of ``fixes`` on: until it has heard of a receiver, what it logs of them means
@@ -293,7 +293,7 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: Sequence[Gns
     unit's are zero; one that runs for less than `LEAST_RUNNING` of the log comes last.
     """
     trims = _trims(messages.get("PARM", []))
-    since = -math.inf if fixes is None else min((one.t for one in fixes), default=math.inf)
+    since = -math.inf if fixes is None else min(fixes[0], default=math.inf)
     late = []
     for source in SOLUTIONS:
         own = [one for one in messages.get(source, []) if one]
@@ -310,7 +310,7 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: Sequence[Gns
             columns["q_nb"] = np.where(running[:, None], columns["q_nb"], np.nan)
             columns["v_n"] = np.where((running & (t >= since))[:, None], velocity, np.nan)
         found = Reference(
-            f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since, fixes or [])}
+            f"the autopilot's own solution ({source})", t, {**columns, **_places(messages, t, since, fixes)}
         )
         if running.any() and running.mean() >= LEAST_RUNNING:
             yield found
@@ -320,7 +320,7 @@ def _solutions(messages: Mapping[str, list[dict[str, Any]]], fixes: Sequence[Gns
 
 
 def _places(
-    messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float, fixes: Sequence[GnssSample]
+    messages: Mapping[str, list[dict[str, Any]]], t: Array, since: float, fixes: tuple[Array, Array] | None
 ) -> dict[str, Array]:
     """The positions that it had at the times ``t`` [s], by the first kind of message that has any from ``since`` on."""
     for name in PLACES:
@@ -329,7 +329,8 @@ def _places(
             continue
         at, kept = _times(name, place, [])
         lat, lon, h = np.radians(place["Lat"][kept]), np.radians(place["Lng"][kept]), place["Alt"][kept]
-        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, h) & _of_one_zero(at, h, fixes)
+        known = ((lat != 0) | (lon != 0)) & (at >= since) & is_flown(lat, h)
+        known &= at >= _of_one_zero_from(at[known], h[known], fixes)
         if known.sum() > 1:
             columns = zip(("lat", "lon", "h"), (lat[known], np.unwrap(lon[known]), h[known]), strict=True)
             found = {key: np.interp(t, at[known], column, left=np.nan, right=np.nan) for key, column in columns}
@@ -337,16 +338,16 @@ def _places(
     return {}
 
 
-def _of_one_zero(at: Array, h: Array, fixes: Sequence[GnssSample]) -> npt.NDArray[np.bool_]:
-    """Which heights (N,) [m] at the times ``at`` [s] count from where a receiver's do, all where most don't.
+def _of_one_zero_from(at: Array, h: Array, fixes: tuple[Array, Array] | None) -> float:
+    """The time [s] from which on heights (N,) [m] at the times ``at`` count from where a receiver's do.
 
-    Before an autopilot has found the height of its origin, they count from where it was switched on.
+    Before an autopilot has found the height of its origin, they count from where it was switched on. Where most of them
+    never come near a receiver's, there is no such time: -inf.
     """
-    if not fixes:
-        return np.ones(len(h), bool)
-    told = np.interp(at, [one.t for one in fixes], [one.h for one in fixes])
-    same: npt.NDArray[np.bool_] = np.abs(h - told) <= OTHER_ZERO
-    return same if same.mean() >= 0.5 else np.ones(len(h), bool)
+    if fixes is None or not len(fixes[0]) or not len(h):
+        return -math.inf
+    same = np.abs(h - np.interp(at, *fixes)) <= OTHER_ZERO
+    return float(at[same.argmax()]) if same.mean() >= 0.5 else -math.inf
 
 
 def _trims(parameters: Sequence[Mapping[str, Any]]) -> Array:

@@ -20,6 +20,7 @@ import time
 import tomllib
 import traceback
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,7 +86,7 @@ class Outcome:
 
     @property
     def spoilt(self) -> dict[str, tuple[str, str]]:
-        """Whose estimates are not to be judged by the others of its: what it did, and why."""
+        """Estimators of which other metrics say too little: what each did, and why."""
         lost = [name.removesuffix(LOST) for name, count in self.metrics.items() if name.endswith(LOST) and count]
         return dict.fromkeys(lost, (NO_NUMBERS, "")) | {name: ("has ended", why) for name, why in self.ended.items()}
 
@@ -175,12 +176,14 @@ class CampaignResult:
         import xarray
 
         longest = max((o.history["time"] for o in self.outcomes), key=len, default=np.zeros(0))
-        names = [name for name in (self.outcomes[0].history if self.outcomes else ()) if name != "time"]
+        names = [name for name in dict.fromkeys(name for o in self.outcomes for name in o.history) if name != "time"]
 
         def stacked(name: str) -> Array:
-            rows = [np.pad(o.history[name], (0, len(longest) - len(o.history[name])), constant_values=np.nan)
-                    for o in self.outcomes]  # fmt: skip
-            return np.array(rows)
+            rows = np.full((len(self.outcomes), len(longest)), np.nan)
+            for row, outcome in zip(rows, self.outcomes, strict=True):
+                own = outcome.history.get(name, ())
+                row[: len(own)] = own
+            return rows
 
         coordinates: dict[str, Any] = {"time": longest, "seed": ("run", [o.seed for o in self.outcomes])}
         for key in self.combinations[0].values:
@@ -321,7 +324,9 @@ def _combinations(plan: Plan) -> list[Combination]:
         if key == "seed":
             raise UserError("--vary seed: every combination is flown with many seeds already: use --runs")
         if key.partition(".")[0] == "record":
-            raise UserError(f"--vary {key}: how a record is written changes no result: give it with --set")
+            raise UserError(
+                f"--vary {key}: runs whose records have other rows are not put beside each other: use --set"
+            )
         given.require_once(key, listed)
     made = []
     for values in itertools.product(*plan.vary.values()):
@@ -417,8 +422,8 @@ def _load(folder: Path, combination: int, seed: int) -> Outcome | None:
         values = {str(name): float(value) for name, value in record["metrics"].items()}
         ended = {str(name): str(why) for name, why in record.get("ended", {}).items()}
         with np.load(io.BytesIO(stem.with_suffix(".npz").read_bytes())) as file:
-            history = {name: file[name] for name in file.files}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
+            history = {"time": file["time"]} | {name: file[name] for name in file.files}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zlib.error, zipfile.BadZipFile):
         return None
     return Outcome(combination, seed, values, history, ended)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
@@ -59,16 +60,16 @@ def varied(given: Any) -> dict[str, Sequence[str]]:
 
 def require_once(key: str, listed: Sequence[str]) -> None:
     """Raises UserError where there is no value to vary a key by, or one twice: 1 is 1.0, and 'a' is "a"."""
-    if not listed or len(set(map(_meant, listed))) < len(listed):
+    pairs = itertools.combinations(map(_meant, listed), 2)
+    if not listed or any(one == other and isinstance(one, bool) == isinstance(other, bool) for one, other in pairs):
         raise UserError(f"--vary {key}: give each value once, such as {key}=0,5,10")
 
 
-def _meant(value: str) -> str:
+def _meant(value: str) -> Any:
     try:
-        found = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        found = value
-    return repr(float(found) if type(found) is int else found)
+        return tomllib.loads(f"value = {value}")["value"]
+    except ValueError:
+        return value
 
 
 def _listed(key: str, given: Any) -> Sequence[str]:

@@ -86,8 +86,8 @@ class Pool(Protocol):
 def opened(tasks: int, workers: int | str | None = None, apart: bool = False) -> Iterator[Pool]:
     """A pool for so many tasks: that many ``workers``, one a core without, or those of a scheduler by its address.
 
-    With one worker tasks are done in this process; not where the number was not given and they are to be done
-    ``apart``, as what may end a process. Raises UserError when there is no such scheduler, or no workers.
+    With one worker tasks are done in this process, and so is a single one: only with ``workers`` of 1 where they are to
+    be done ``apart``, as what may end a process. Raises UserError when there is no such scheduler, or no workers.
     """
     if isinstance(workers, str):
         _require_scheduler(workers)
@@ -97,7 +97,7 @@ def opened(tasks: int, workers: int | str | None = None, apart: bool = False) ->
     if workers is not None and workers < 1:
         raise UserError(f"workers {workers}: give at least 1, or none for one a core")
     count = min(workers or cores(), tasks)
-    if count <= 1 and not (apart and workers is None):
+    if count <= 1 and not (apart and workers != 1):
         yield _Here()
         return
     with (

@@ -40,7 +40,7 @@ class Kept:
 
     ``share`` is that of the runs which keep it; ``most`` is what 95 % of them do not exceed, or, ``at_least``, do not
     stay below. A run that failed or lacks the metric keeps nothing, nor does one whose estimator has ended, or gave no
-    numbers where that is not expected; ``missing`` lack it, and ``failed`` have none.
+    numbers more often than expected; ``missing`` lack it, ``failed`` have none.
     """
 
     combination: int
@@ -72,7 +72,7 @@ def kept(
         own = [outcome for outcome in outcomes if outcome.combination == i]
         failed = sum(failure.combination == i for failure in failures)
         expect = combination.scenario.expect
-        for metric, bounds in expect.items() if own else ():
+        for metric, bounds in expect.items() if own or failed else ():
             for bound, at_least in ((bounds.min, True), (bounds.max, False)):
                 if bound is not None and not metric.startswith("run."):
                     worst = -math.inf if at_least else math.inf
@@ -81,9 +81,10 @@ def kept(
 
 
 def _judged(metric: str, one: Outcome, expect: Mapping[str, Bounds], worst: float) -> float:
-    """What a run is judged by: the worst where its estimator is `Outcome.spoilt`, but by a count that is expected."""
+    """What a run is judged by: the worst where its estimator has ended, or lost more estimates than expected."""
     whose = metric.partition(".")[0]
-    if whose in one.ended or (whose in one.spoilt and f"{whose}{LOST}" not in expect):
+    lost, allowed = one.metrics.get(f"{whose}{LOST}", 0.0), expect.get(f"{whose}{LOST}")
+    if whose in one.ended or (not metric.endswith(LOST) and lost and not (allowed and allowed.hold(lost))):
         return worst
     return one.metrics.get(metric, 0.0 if metric.endswith(LOST) else worst)
 

@@ -136,3 +136,9 @@ smooth = true
     assert t[-1] == data["truth/time"][-1]
     assert off["ins_smoothed"].max() < 0.3
     assert off["ins_smoothed"][-1] == off["ins"][-1]  # when it has heard no more
+
+
+def test_a_run_that_ends_as_it_aligns_has_nothing_to_look_back_on() -> None:
+    """It ended in a traceback: no increment had been used yet."""
+    overrides = [*ONE, "sensors.gnss.latency_s=0.3", "duration_s=2.3", "sensors.gnss.denied=[]"]
+    assert run(Scenario.load("loiter_gnss_outage", overrides)).dataset is not None

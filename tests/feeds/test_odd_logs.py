@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import math
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -384,9 +385,14 @@ def test_heights_from_before_an_autopilot_knew_its_origins_are_no_heights(tmp_pa
     before = found.t < 4.9
     assert np.isnan(found.columns["h"][before]).all()
     np.testing.assert_allclose(found.columns["h"][~before][2:], 500.0, atol=1e-3)
-    below = [(name, (*v[:3], v[3] - 500.0) if name == "POS" else v) for name, v in with_solution(circling())]
-    all_below = read(below, tmp_path).solution
-    assert all_below is None or np.isfinite(all_below.columns["h"]).any()  # told of otherwise
+    # what a receiver says for a while later on is no other zero, nor are heights that are all below: told of otherwise
+    for off_m, since, until in ((-500.0, 10.0, 15.0), (-500.0, 0.0, math.inf)):
+        odd = [
+            (name, (*v[:3], v[3] + off_m) if name == "POS" and us(since) <= v[0] < until * 1e6 else v)
+            for name, v in with_solution(circling())
+        ]
+        solution = read(odd, tmp_path).solution
+        assert solution is None or np.isfinite(solution.columns["h"][2:]).all()
 
 
 @pytest.mark.parametrize(("below_m", "told"), [(0.0, False), (8.0, False), (20.0, True)])

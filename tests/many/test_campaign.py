@@ -904,9 +904,11 @@ def test_a_worker_keeps_no_record_of_the_run_before(at_rest: Path, monkeypatch: 
         assert sum(one() is not None for one in left) == 1  # the last
 
 
-@pytest.mark.parametrize("listed", [["'a'", '"a"'], ["1", "1.0"], ["1e0", "1"], ["[1, 2]", "[1,2]"], []])
+@pytest.mark.parametrize(
+    "listed", [["'a'", '"a"'], ["1", "1.0"], ["1e0", "1"], ["[1, 2]", "[1,2]"], ["[1]", "[1.0]"], []]
+)
 def test_a_value_given_twice_is_refused_however_it_is_written(listed: list[str]) -> None:
-    given.require_once("estimator[0].grade", ["true", "1", "'a'", "a.b", "[1]"])
+    given.require_once("estimator[0].grade", ["true", "1", "'a'", "a.b", "[1]", "1" * 400])
     with pytest.raises(UserError, match="give each value once"):
         given.require_once("estimator[0].grade", listed)
 

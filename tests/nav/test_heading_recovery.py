@@ -160,3 +160,15 @@ def test_that_it_began_anew_is_told():
     said = [one for one in told if one.reason.startswith("the attitude was wrong: begun anew")]
     assert {one.t for one in said} == set(again)
     assert {one.outcome for one in said} == {Outcome.WITHHELD}
+
+
+@pytest.mark.parametrize("kind", ["ins", "federated"])
+def test_it_is_doubted_no_longer_where_nobody_is_heard_any_more(kind):
+    """Every step was taken by itself until the next fix, which may be far."""
+    estimator = a_filter(kind)
+    truth, rng = flight(SECONDS), np.random.default_rng(0)
+    increments, *_ = imu(truth, CONSUMER, rng)
+    estimator.start(begun(truth, 0.0))
+    fixes = [fix for fix in gnss(truth, rng, 5.0) if fix.t < 5.0]
+    feed(FusionHorizon(estimator), increments, fixes, 1.0)
+    assert not estimator.realignment.under_way

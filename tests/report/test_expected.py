@@ -31,8 +31,9 @@ def test_who_gives_no_numbers_keeps_nothing() -> None:
     """An estimator that is NaN whenever it is bad was the better for it."""
     expect = {RMS: Bounds(max=5.0)}
     assert shares(expect, {RMS: 1.0}, {RMS: 1.0, LOST: 49.0}) == {RMS: 0.5}
-    # unless that is expected, and judged by itself
+    # unless so many are expected
     assert shares(expect | {LOST: Bounds(max=50.0)}, {RMS: 1.0}, {RMS: 1.0, LOST: 49.0}) == {RMS: 1.0, LOST: 1.0}
+    assert shares(expect | {LOST: Bounds(max=0.0)}, {RMS: 1.0}, {RMS: 1.0, LOST: 49.0}) == {RMS: 0.5, LOST: 0.5}
 
 
 def test_no_estimates_lost_is_none() -> None:
@@ -43,6 +44,7 @@ def test_no_estimates_lost_is_none() -> None:
 
 def test_a_run_that_failed_keeps_nothing() -> None:
     assert shares({RMS: Bounds(max=5.0)}, {RMS: 1.0}, {RMS: 1.0}, failed=2) == {RMS: 0.5}
+    assert shares({RMS: Bounds(max=5.0)}, failed=2) == {RMS: 0.0}
 
 
 def test_how_long_runs_took_is_not_judged() -> None:
@@ -60,7 +62,7 @@ def test_whose_estimates_are_no_numbers_is_told() -> None:
     ("vary", "said"),
     [
         ({"estimator[0].name": ["'a'", "'b'"]}, "they are compared by their names"),
-        ({"record.rate_hz": ["10", "2.5"]}, "how a record is written changes no result"),
+        ({"record.rate_hz": ["10", "2.5"]}, "runs whose records have other rows"),
     ],
 )
 def test_what_can_not_be_compared_is_not_flown(vary: dict[str, list[str]], said: str, tmp_path: Path) -> None:
